@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every default lives here, once: these dataclasses are the command line, the `config.toml` and the help.
+
+The training defaults are those of the paper's authors' 2024 code, with the paper's resolution warm-up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+Background = Literal["black", "white", "random"]
+
+
+@dataclass(frozen=True)
+class OptimiserConfig:
+    """Learning rates and Adam's constants, a rate per parameter group."""
+
+    means_rate: float = 1.6e-4
+    """Rate of the means at the start, times the scene's extent."""
+    means_rate_end: float = 1.6e-6
+    """Rate of the means at `means_rate_steps`; log-linear in between."""
+    means_rate_steps: int = 30_000
+    """Steps over which the means' rate decays."""
+    sh_dc_rate: float = 2.5e-3
+    """Rate of the SH constant term."""
+    sh_rest_rate: float = 2.5e-3 / 20
+    """Rate of the higher SH bands."""
+    opacities_rate: float = 0.025
+    """Rate of the opacity logits."""
+    scales_rate: float = 5e-3
+    """Rate of the log scales."""
+    quaternions_rate: float = 1e-3
+    """Rate of the raw quaternions."""
+    beta1: float = 0.9
+    """Decay of Adam's first moment."""
+    beta2: float = 0.999
+    """Decay of Adam's second moment."""
+    epsilon: float = 1e-15
+    """Adam's epsilon."""
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Adaptive density control (Kerbl et al. 2023, section 5)."""
+
+    every: int = 100
+    """Steps between densifications; 0 turns density control off."""
+    start: int = 500
+    """First step after which Gaussians are cloned and split."""
+    stop: int = 15_000
+    """Last step at which Gaussians are cloned and split."""
+    gradient_threshold: float = 2e-4
+    """Mean norm of the screen-space position gradient (in NDC units) from which a Gaussian is densified."""
+    absolute_gradients: bool = False
+    """Use sums of absolute per-pixel gradients (AbsGS) instead; the threshold wants about 8e-4 then."""
+    dense_fraction: float = 0.01
+    """Gaussians up to this fraction of the scene's extent are cloned, larger ones split."""
+    split_factor: float = 1.6
+    """A split divides the scales by this."""
+    min_opacity: float = 0.005
+    """Gaussians less opaque are pruned."""
+    max_world_fraction: float = 0.1
+    """Gaussians larger than this fraction of the extent are pruned, after the first opacity reset."""
+    max_screen_radius: float = 20.0
+    """Gaussians that covered a larger radius in pixels are pruned, after the first opacity reset."""
+    opacity_reset_every: int = 3000
+    """Steps between opacity resets; also once at `start` where the background is white."""
+    opacity_reset_to: float = 0.01
+    """Opacity is lowered to at most this at a reset."""
+    max_gaussians: int = 10_000_000
+    """No densification beyond this number."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    iterations: int = 30_000
+    """Number of optimisation steps."""
+    seed: int = 0
+    """Seed of everything random."""
+    sh_degree: int = 3
+    """Highest spherical-harmonics degree, 0 to 3."""
+    sh_degree_every: int = 1000
+    """Steps between increases of the SH degree."""
+    dssim_weight: float = 0.2
+    """Weight of D-SSIM in the loss; L1 has the rest."""
+    background: Background = "black"
+    """Background behind the Gaussians, and behind images with alpha."""
+    warmup: tuple[int, ...] = (250, 500)
+    """Steps at which the training resolution doubles; two of them start at a quarter of the size."""
+    resolution: int = 0
+    """Longest image side for training; 0 keeps the images' size up to 1600."""
+    test_every: int = 8
+    """Every n-th view by name is held out; 0 holds out none."""
+    random_points: int = 100_000
+    """Initial Gaussians where a scene has no points."""
+    checkpoint_every: int = 1000
+    """Steps between checkpoints; 0 writes only the last and the one of Ctrl-C."""
+    eval_at: tuple[int, ...] = ()
+    """Steps at which the held-out views are evaluated, beside the end."""
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The errors that a user can meet. The command line turns them into one line and an exit status."""
+
+from __future__ import annotations
+
+
+class ClsplatError(Exception):
+    """Base of every error that is reported as one line: the work failed (exit status 1)."""
+
+    exit_status = 1
+
+
+class InputError(ClsplatError):
+    """A file, folder or argument is wrong (exit status 2). The message names it, and what was expected."""
+
+    exit_status = 2
+
+
+class DeviceError(InputError):
+    """No OpenCL device, or not the one asked for."""
+
+
+class KernelBuildError(ClsplatError):
+    """A driver refused a kernel. The message holds the device, the options and the numbered source."""
+
+
+class CapacityError(ClsplatError):
+    """A buffer would be larger than the device allows."""
