@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arrays in device memory: a shape and a dtype over a buffer, and a workspace of named ones that grow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import DTypeLike, NDArray
+
+from clsplat.errors import CapacityError
+
+if TYPE_CHECKING:
+    from clsplat.device.context import Device
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceArray:
+    """A C-contiguous array on a device. `buffer` may be larger than the shape needs."""
+
+    device: Device
+    buffer: cl.Buffer
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in use."""
+        return self.size * self.dtype.itemsize
+
+    def get(self) -> NDArray[Any]:
+        """A copy on the host; waits for the device."""
+        host = np.empty(self.shape, self.dtype)
+        if host.size:
+            cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=True)
+        return host
+
+    def set(self, values: NDArray[Any]) -> None:
+        """Copy from the host. Raises ValueError where shape or dtype differ."""
+        if values.shape != self.shape or values.dtype != self.dtype:
+            raise ValueError(f"got {values.dtype}{values.shape}, expected {self.dtype}{self.shape}")
+        if values.size:
+            cl.enqueue_copy(self.device.queue, self.buffer, np.ascontiguousarray(values), is_blocking=True)
+
+    def fill(self, value: float) -> None:
+        """Set every element."""
+        if self.size:
+            pattern = np.asarray(value, self.dtype)
+            cl.enqueue_fill_buffer(self.device.queue, self.buffer, pattern, 0, self.nbytes)
+
+    def reshaped(self, *shape: int) -> DeviceArray:
+        """The same memory in another shape, not larger."""
+        return DeviceArray(self.device, self.buffer, shape, self.dtype)
+
+
+def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:
+    """A new array, its buffer of at least `capacity` elements. Raises CapacityError over the device's limit."""
+    kind = np.dtype(dtype)
+    elements = max(int(np.prod(shape, dtype=np.int64)), capacity, 1)
+    nbytes = elements * kind.itemsize
+    limit = device.max_allocation
+    if nbytes > limit:
+        raise CapacityError(
+            f"a buffer of {nbytes / 2**20:.0f} MiB is needed and {device.name} allows {limit / 2**20:.0f} MiB: "
+            "use a smaller resolution or fewer Gaussians (--density.max-gaussians)"
+        )
+    return DeviceArray(device, cl.Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes), shape, kind)
+
+
+def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
+    """A new array with these values."""
+    array = allocate(device, values.shape, values.dtype)
+    array.set(values)
+    return array
+
+
+class Workspace:
+    """Scratch arrays by name. A name's buffer is kept from call to call and grows by half when it is too small."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._arrays: dict[str, DeviceArray] = {}
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> DeviceArray:
+        """An array whose contents are whatever the last user left there."""
+        kind = np.dtype(dtype)
+        elements = int(np.prod(shape, dtype=np.int64))
+        held = self._arrays.get(name)
+        if held is None or held.buffer.size < elements * kind.itemsize:
+            spare = 0 if held is None else min(elements * 3 // 2, self._device.max_allocation // kind.itemsize)
+            held = allocate(self._device, (elements,), kind, max(elements, spare))
+            self._arrays[name] = held
+        return DeviceArray(self._device, held.buffer, shape, kind)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return sum(array.buffer.size for array in self._arrays.values())

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chooses a device, its queue and the shape of its kernels. The only place that knows vendors' names."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+# PoCL keeps work-items apart by a loop; two CPU threads per core would only fight over its pool.
+os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
+
+import numpy as np
+import pyopencl as cl
+
+from clsplat.device.program import Kernels, build
+from clsplat.errors import DeviceError
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How kernels are shaped for a device.
+
+    lanes: pixels per vector in the blend kernels (1 on GPUs); items: work-items per work-group in kernels that
+    cooperate (1 on CPUs, where a group is one sequential loop); chunks: pieces that a scan or sort is cut into at
+    `items` == 1; digit_bits: radix sort digit.
+    """
+
+    lanes: int
+    items: int
+    chunks: int
+    digit_bits: int
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """What `clsplat devices` lists."""
+
+    index: int
+    name: str
+    platform: str
+    version: str
+    kind: str
+    compute_units: int
+    memory_bytes: int
+    shape: str
+
+
+def _all_devices() -> list[cl.Device]:
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:
+        return []
+    devices: list[cl.Device] = []
+    for platform in platforms:
+        try:
+            devices += platform.get_devices()
+        except cl.Error:
+            continue
+    return devices
+
+
+def _kind(device: cl.Device) -> str:
+    if device.type & cl.device_type.GPU:
+        return "gpu"
+    return "cpu" if device.type & cl.device_type.CPU else "other"
+
+
+def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
+    words = device.platform.version.split()
+    if "PoCL" not in words:
+        return None
+    digits = words[words.index("PoCL") + 1].split("-")[0].split("+")[0].split(".")
+    return int(digits[0]), int(digits[1])
+
+
+def default_shape(device: cl.Device) -> Shape:
+    """The shape by type and vector width; DESIGN's measurements are in docs/performance.md."""
+    if _kind(device) != "cpu":
+        return Shape(lanes=1, items=min(256, device.max_work_group_size), chunks=0, digit_bits=4)
+    lanes = 16 if device.native_vector_width_float >= 16 else 8
+    if _pocl_version(device) == (3, 0):
+        lanes = 8  # its compiler aborts on some float16 built-ins
+    return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units, digit_bits=11)
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Every OpenCL device that is visible, GPUs and CPUs, in the order of their index."""
+    infos = []
+    for index, device in enumerate(_all_devices()):
+        shape = default_shape(device)
+        infos.append(
+            DeviceInfo(
+                index=index,
+                name=device.name.strip(),
+                platform=device.platform.name.strip(),
+                version=device.platform.version.strip(),
+                kind=_kind(device),
+                compute_units=device.max_compute_units,
+                memory_bytes=device.global_mem_size,
+                shape=f"{shape.lanes} lanes x {shape.items} items",
+            )
+        )
+    return infos
+
+
+class Device:
+    """A device with its context, in-order queue, kernel shape and built kernels."""
+
+    def __init__(self, device: cl.Device, shape: Shape | None = None, *, profile: bool = False) -> None:
+        self.cl_device = device
+        self.name = device.name.strip()
+        self.driver = device.platform.version.strip()
+        self.kind = _kind(device)
+        self.shape = shape or default_shape(device)
+        self.max_allocation = int(device.max_mem_alloc_size)
+        self.context = cl.Context([device])
+        properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
+        self.queue = cl.CommandQueue(self.context, device, properties)
+        self._options = "-cl-std=CL1.2"
+        if device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
+            self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
+        self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
+        self._fma = self._probe_fma()
+
+    def kernels(self, stem: str, **defines: object) -> Kernels:
+        """The kernels of `stem`.cl in this device's shape, built at the first call."""
+        key = (stem, tuple(sorted(defines.items())))
+        found = self._kernels.get(key)
+        if found is None:
+            values = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, **self._fma, **defines}
+            found = Kernels(build(self.context, self.cl_device, stem, values, self._options))
+            self._kernels[key] = found
+        return found
+
+    def with_shape(self, **changes: int) -> Device:
+        """A device like this with another shape."""
+        return Device(self.cl_device, replace(self.shape, **changes))
+
+    def finish(self) -> None:
+        """Wait until the device has nothing to do."""
+        self.queue.finish()
+
+    def _probe_fma(self) -> dict[str, object]:
+        """Whether the compiler fuses a lone a*b + c: then that is the fast way to fma's bits."""
+        values = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, "FMA_BY_CONTRACTION": True}
+        kernels = Kernels(build(self.context, self.cl_device, "probe", values, self._options))
+        out = np.zeros(2 * self.shape.lanes, np.float32)
+        buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, out.nbytes)
+        factor = np.float32(1 + 2.0**-12)
+        kernels.probe_fma(self.queue, (1,), (1,), buffer, factor, np.float32(-(1 + 2.0**-11)))
+        cl.enqueue_copy(self.queue, out, buffer, is_blocking=True)
+        return {"FMA_BY_CONTRACTION": True} if np.all(out == np.float32(2.0**-24)) else {}
+
+    def __repr__(self) -> str:
+        return f"<Device {self.name} | {self.driver.split('  ')[0]} | {self.shape}>"
+
+
+def _matches(selector: str, info: DeviceInfo) -> bool:
+    wanted = selector.lower()
+    return wanted == info.kind or wanted in f"{info.name} {info.platform} {info.version}".lower()
+
+
+def select(selector: str | None) -> cl.Device:
+    """The device that `selector` names: an index, `cpu`, `gpu`, or a part of its name, platform or version.
+
+    Without one: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
+    """
+    devices, infos = _all_devices(), list_devices()
+    if not devices:
+        raise DeviceError("no OpenCL device found: install a driver, or the CPU one with: pip install 'pyopencl[pocl]'")
+    selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
+    if selector is None:
+        return next((d for d, i in zip(devices, infos, strict=True) if i.kind == "gpu"), devices[0])
+    if selector.isdigit() and int(selector) < len(devices):
+        return devices[int(selector)]
+    for device, info in zip(devices, infos, strict=True):
+        if not selector.isdigit() and _matches(selector, info):
+            return device
+    names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for info in infos)
+    raise DeviceError(f"--device {selector}: no such device; there are {names}")
+
+
+@lru_cache(maxsize=8)
+def _open(index: int) -> Device:
+    return Device(_all_devices()[index])
+
+
+def open_device(selector: str | None = None) -> Device:
+    """Open the device that `selector` names (see `select`); the same object for the same device."""
+    chosen: Any = select(selector)
+    return _open(_all_devices().index(chosen))

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Puts kernels on a device's queue."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from clsplat.device.buffers import DeviceArray
+from clsplat.device.context import Device
+
+_LOCAL = 64
+"""Work-items a group where they do not co-operate: enough for a GPU's wave, short enough for a CPU's chunk."""
+
+
+def _arguments(arguments: tuple[Any, ...]) -> list[Any]:
+    values: list[Any] = []
+    for argument in arguments:
+        if isinstance(argument, DeviceArray):
+            values.append(argument.buffer)
+        elif isinstance(argument, bool | int):
+            values.append(np.uint32(argument) if argument >= 0 else np.int32(argument))
+        elif isinstance(argument, float):
+            values.append(np.float32(argument))
+        else:
+            values.append(argument)
+    return values
+
+
+def launch_items(device: Device, kernel: Any, items: int, *arguments: Any) -> None:
+    """One work-item for each of `items`; the kernel guards the rounding up. Nothing for 0 items."""
+    if items > 0:
+        size = -(-items // _LOCAL) * _LOCAL
+        kernel(device.queue, (size,), (_LOCAL,), *_arguments(arguments))
+
+
+def launch_groups(device: Device, kernel: Any, groups: int, items: int, *arguments: Any) -> None:
+    """`groups` work-groups of `items`. Nothing for 0 groups."""
+    if groups > 0:
+        kernel(device.queue, (groups * items,), (items,), *_arguments(arguments))
+
+
+def launch_grid(device: Device, kernel: Any, size: tuple[int, ...], *arguments: Any) -> None:
+    """A grid of work-items that the driver may group as it likes. Nothing where a side is 0."""
+    if all(size):
+        kernel(device.queue, size, None, *_arguments(arguments))

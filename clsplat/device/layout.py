@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The layouts that host and kernels share, declared once: the kernels get them as `#define`s on top of their text."""
+
+from __future__ import annotations
+
+TILE = 16
+"""Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
+
+PAD = 16
+"""Zero columns on either side of the loss's planes, so that the horizontal window needs no bounds check."""
+
+CAMERA = (
+    *(f"R{row}{column}" for row in range(3) for column in range(3)),
+    *("T0", "T1", "T2"),
+    *("FX", "FY", "CX", "CY", "NEAR"),
+    *("XMIN", "XMAX", "YMIN", "YMAX"),
+    *("PX", "PY", "PZ"),
+)
+"""A camera as float32: `cam_from_world`, intrinsics, the limits of x/z and y/z in the Jacobian, its centre."""
+
+SPLAT = ("MX", "MY", "L11", "L12", "L22", "LOG2O", "RED", "GREEN", "BLUE", "HALF_W", "HALF_H", "DEPTH")
+"""A projected Gaussian: mean in pixels; the whitening W of docs/gradients.md times sqrt(log2(e) / 2), so that
+log2(alpha) = LOG2O - u^2 - v^2; colour; half extents in pixels of the ellipse where alpha is 1/255; camera depth."""
+
+SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
+"""Partial gradients of one (tile, Gaussian) pair; the last two only where absolute gradients are kept."""
+
+SLOT_PLAIN = SLOT.index("ABSX")
+SLOT_ABSOLUTE = len(SLOT)
+
+
+def header() -> str:
+    """The declarations as OpenCL C."""
+    lines = [f"#define TILE {TILE}", f"#define PAD {PAD}"]
+    for prefix, fields in (("CAMERA", CAMERA), ("SPLAT", SPLAT), ("SLOT", SLOT)):
+        lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]
+        lines.append(f"#define {prefix}_SIZE {len(fields)}")
+    lines.append(f"#define SLOT_PLAIN {SLOT_PLAIN}")
+    return "\n".join(lines) + "\n"

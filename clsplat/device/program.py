@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Builds kernels, once per source and set of defines."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import pyopencl as cl
+
+from clsplat.device.source import kernel_source
+from clsplat.errors import KernelBuildError
+
+
+def build(context: cl.Context, device: cl.Device, stem: str, defines: Mapping[str, object], options: str) -> cl.Program:
+    """Compile `stem`.cl. Raises KernelBuildError with the device, the options, the log and the numbered source."""
+    source = kernel_source(stem)
+    flags = [f"-D{name}" if value is True else f"-D{name}={value}" for name, value in sorted(defines.items())]
+    all_options = [*flags, *options.split()]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            return cl.Program(context, source).build(options=all_options)
+    except cl.Error as error:
+        numbered = "\n".join(f"{number:4d}  {line}" for number, line in enumerate(source.splitlines(), 1))
+        raise KernelBuildError(
+            f"{stem}.cl does not build on {device.name.strip()} with {' '.join(all_options)}:\n{error}\n{numbered}"
+        ) from error
+
+
+class Kernels:
+    """The kernels of one source file with one set of defines, by name; each kernel object is made once."""
+
+    def __init__(self, program: cl.Program) -> None:
+        self._kernels: dict[str, Any] = {kernel.function_name: kernel for kernel in program.all_kernels()}
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self._kernels[name]
+        except KeyError:
+            raise AttributeError(f"no kernel {name}; there are {', '.join(self._kernels)}") from None

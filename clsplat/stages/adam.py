@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches adam.cl on every parameter group."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_items
+from clsplat.stages.project import GROUPS, DeviceGaussians
+
+
+def adam(
+    device: Device,
+    step: int,
+    rates: Mapping[str, float],
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    parameters: DeviceGaussians,
+    gradients: DeviceGaussians,
+    first: DeviceGaussians,
+    second: DeviceGaussians,
+) -> None:
+    """Step number `step` (from 1) with a rate per group; leaves the gradients zero."""
+    kernel, lanes = device.kernels("adam").adam, device.shape.lanes
+    root = (1.0 - beta2**step) ** -0.5
+    for group in GROUPS:
+        n = parameters[group].size
+        launch_items(
+            device,
+            kernel,
+            -(-n // lanes),
+            n,
+            rates[group] / (1.0 - beta1**step),
+            root,
+            beta1,
+            beta2,
+            epsilon,
+            parameters[group],
+            gradients[group],
+            first[group],
+            second[group],
+        )

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches blend.cl and blend_grad.cl."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_groups
+from clsplat.device.layout import SLOT_ABSOLUTE, SLOT_PLAIN, TILE
+from clsplat.stages.ranges import TileLists
+
+
+@dataclass(frozen=True, eq=False)
+class Blended:
+    """Planes padded to whole tiles: image (3, rows, stride), transmittance (rows, stride), stops (rows, stride)."""
+
+    image: DeviceArray
+    transmittance: DeviceArray
+    stops: DeviceArray
+
+
+def _items(device: Device) -> int:
+    return min(device.shape.items, TILE * TILE // device.shape.lanes)
+
+
+def blend(
+    device: Device,
+    work: Workspace,
+    lists: TileLists,
+    splats: DeviceArray,
+    background: DeviceArray,
+    width: int,
+    height: int,
+) -> Blended:
+    """Blend each tile's Gaussians front to back over the background (3,)."""
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    rows, stride = tiles_y * TILE, tiles_x * TILE
+    image = work.array("image", (3, rows, stride))
+    transmittance = work.array("transmittance", (rows, stride))
+    stops = work.array("stops", (rows, stride), np.int32)
+    items = _items(device)
+    launch_groups(
+        device,
+        device.kernels("blend", ITEMS=items).blend,
+        tiles_x * tiles_y,
+        items,
+        tiles_x,
+        width,
+        height,
+        lists.ranges,
+        lists.gaussian_from_sorted,
+        splats,
+        background,
+        image,
+        transmittance,
+        stops,
+    )
+    return Blended(image, transmittance, stops)
+
+
+def blend_grad(
+    device: Device,
+    work: Workspace,
+    lists: TileLists,
+    splats: DeviceArray,
+    background: DeviceArray,
+    blended: Blended,
+    image_gradient: DeviceArray,
+    *,
+    absolute: bool = False,
+) -> DeviceArray:
+    """Partial gradients of every pair, slots (pairs, SLOT), from image_gradient (3, rows, stride)."""
+    rows, stride = blended.transmittance.shape
+    pairs = lists.gaussian_from_sorted.shape[0]
+    slots = work.array("slots", (pairs, SLOT_ABSOLUTE if absolute else SLOT_PLAIN))
+    items = _items(device)
+    defines = {"ABSOLUTE_GRADIENTS": True} if absolute else {}
+    launch_groups(
+        device,
+        device.kernels("blend_grad", ITEMS=items, **defines).blend_grad,
+        (rows // TILE) * (stride // TILE) if pairs else 0,
+        items,
+        stride // TILE,
+        rows,
+        lists.ranges,
+        lists.gaussian_from_sorted,
+        lists.pair_from_sorted,
+        splats,
+        background,
+        image_gradient,
+        blended.transmittance,
+        blended.stops,
+        slots,
+    )
+    return slots

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches density.cl: the statistics that density control reads, and the moving of rows that it orders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.device.buffers import DeviceArray, allocate, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_items
+from clsplat.stages.project import GROUPS, DeviceGaussians, group_shapes
+
+NO_ROW = np.uint32(0xFFFFFFFF)
+"""In a list of rows: a row of zeros."""
+
+
+@dataclass(frozen=True, eq=False)
+class DensityStatistics:
+    """Since the last densification, per Gaussian: gradient_sums, seen (views), radii (largest, in pixels); (n,)."""
+
+    gradient_sums: DeviceArray
+    seen: DeviceArray
+    radii: DeviceArray
+
+
+def new_statistics(device: Device, count: int) -> DensityStatistics:
+    """Zeros for `count` Gaussians."""
+    arrays = [allocate(device, (count,), np.float32) for _ in range(3)]
+    for array in arrays:
+        array.fill(0.0)
+    return DensityStatistics(*arrays)
+
+
+def add_statistics(
+    device: Device,
+    statistics: DensityStatistics,
+    camera: Camera,
+    gaussian_from_rank: DeviceArray,
+    screen: DeviceArray,
+    splats: DeviceArray,
+) -> None:
+    """Add one view: the norm of each visible mean's gradient, from pixels to NDC, as the paper's threshold wants."""
+    visible = gaussian_from_rank.shape[0]
+    launch_items(
+        device,
+        device.kernels("density").density_statistics,
+        visible,
+        visible,
+        0.5 * camera.width,
+        0.5 * camera.height,
+        gaussian_from_rank,
+        screen,
+        splats,
+        statistics.gradient_sums,
+        statistics.seen,
+        statistics.radii,
+    )
+
+
+def gather(device: Device, rows: NDArray[np.uint32], source: DeviceGaussians) -> DeviceGaussians:
+    """New arrays of which row j is row rows[j] of the source, or zeros at NO_ROW. Parameters and moments alike."""
+    count = len(rows)
+    rows_array = upload(device, rows)
+    kernel = device.kernels("density").gather_rows
+    arrays = {}
+    for name, shape in group_shapes(count, source.coefficients).items():
+        arrays[name] = allocate(device, shape, np.float32)
+        width = int(np.prod(shape[1:]))
+        if width:
+            launch_items(device, kernel, count, count, width, rows_array, source[name], arrays[name])
+    return DeviceGaussians(count, source.coefficients, arrays)
+
+
+def widen(device: Device, source: DeviceGaussians, coefficients: int) -> DeviceGaussians:
+    """The same with room for more SH coefficients, the new ones 0."""
+    arrays = dict(source.arrays)
+    rest = np.zeros((source.count, coefficients - 1, 3), np.float32)
+    rest[:, : source.coefficients - 1] = source["sh_rest"].get()
+    arrays["sh_rest"] = upload(device, rest)
+    return DeviceGaussians(source.count, coefficients, arrays)
+
+
+__all__ = ["GROUPS", "NO_ROW", "DensityStatistics", "add_statistics", "gather", "new_statistics", "widen"]

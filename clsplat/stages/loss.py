@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches loss.cl: L1 + D-SSIM and its gradient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_grid
+from clsplat.device.layout import PAD
+
+_STRIPS = 64
+"""Work-items a row on devices that are not CPUs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loss:
+    """gradient (3, rows, stride); sums (3, ...): partial sums of SSIM, of |x - y| and of its square."""
+
+    gradient: DeviceArray
+    sums: DeviceArray
+    samples: int
+    weight: float
+
+    def read(self) -> tuple[float, float]:
+        """(loss, mean squared error); waits for the device."""
+        ssim, absolute, squared = self.sums.get().reshape(3, -1).sum(axis=1, dtype=np.float64) / self.samples
+        return float((1 - self.weight) * absolute + self.weight * (1 - ssim)), float(squared)
+
+
+def loss(
+    device: Device, work: Workspace, image: DeviceArray, target: DeviceArray, width: int, height: int, weight: float
+) -> Loss:
+    """(1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero right of and below the image."""
+    _, rows, stride = image.shape
+    plane, padded = rows * stride, stride + 2 * PAD
+    strips = 1 if device.shape.items == 1 else _STRIPS
+    grid = (strips, height, 3)
+    samples = 3 * width * height
+    moments = work.array("loss_moments", (5, 3, height, padded))
+    partials = work.array("loss_partials", (3, 3, height, stride))
+    gradient = work.array("image_gradient", (3, rows, stride))
+    sums = work.array("loss_sums", (3, 3 * height * strips))
+    kernels = device.kernels("loss")
+    launch_grid(device, kernels.loss_vertical, grid, height, stride, plane, image, target, moments)
+    launch_grid(device, kernels.loss_ssim, grid, width, height, stride, plane, moments, partials, sums)
+    launch_grid(device, kernels.loss_vertical_grad, grid, height, stride, plane, partials, moments)
+    launch_grid(
+        device,
+        kernels.loss_grad,
+        grid,
+        width,
+        height,
+        stride,
+        plane,
+        (1 - weight) / samples,
+        weight / samples,
+        moments,
+        image,
+        target,
+        gradient,
+        sums,
+    )
+    return Loss(gradient, sums, samples, weight)

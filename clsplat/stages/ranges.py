@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches ranges.cl: pairs sorted by tile, and where each tile's begin and end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_items
+from clsplat.stages.duplicate import Pairs
+from clsplat.stages.sort import sort
+
+
+@dataclass(frozen=True, eq=False)
+class TileLists:
+    """ranges (tiles, 2): begin and end in the lists; gaussian_from_sorted, pair_from_sorted (pairs)."""
+
+    ranges: DeviceArray
+    gaussian_from_sorted: DeviceArray
+    pair_from_sorted: DeviceArray
+
+
+def tile_lists(device: Device, work: Workspace, pairs: Pairs, tiles: int) -> TileLists:
+    """A stable sort by tile of pairs that are in order of depth: each tile's Gaussians front to back."""
+    count = pairs.tile_keys.shape[0]
+    keys, pair_from_sorted = sort(device, work, "tile", pairs.tile_keys, max(tiles - 1, 1).bit_length())
+    ranges = work.array("ranges", (tiles, 2), np.uint32)
+    ranges.fill(0)
+    gaussian_from_sorted = work.array("gaussian_from_sorted", (count,), np.uint32)
+    launch_items(
+        device,
+        device.kernels("ranges").ranges,
+        count,
+        count,
+        keys,
+        pair_from_sorted,
+        pairs.gaussian_from_pair,
+        ranges,
+        gaussian_from_sorted,
+    )
+    return TileLists(ranges, gaussian_from_sorted, pair_from_sorted)

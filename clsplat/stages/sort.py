@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches sort_radix.cl and sort_bitonic.cl: stable sorts of uint32 keys that also give where each key came from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl as cl
+
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_groups
+from clsplat.stages.scan import chunking, scan
+
+BITONIC_MAX = 4096
+"""Keys and positions of so many fill the 32 KiB of local memory that every device has."""
+
+BITONIC_WINS = {"cpu": 512, "gpu": BITONIC_MAX, "other": BITONIC_MAX}
+"""Up to this many keys one launch of bitonic sort beats the radix sort's dozen (tools/bench_sort.py)."""
+
+
+def radix_sort(
+    device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int
+) -> tuple[DeviceArray, DeviceArray]:
+    """Sort by the lowest `bits` of the keys; (sorted keys, positions), in workspace arrays under `name`."""
+    n = keys.shape[0]
+    groups, chunk = chunking(device, n)
+    items = device.shape.items
+    kernels = device.kernels("sort_radix")
+    digit_bits = device.shape.digit_bits
+    passes = max(-(-bits // digit_bits), 1)
+    digit_bits = -(-bits // passes) or 1
+    digits = 1 << digit_bits
+    histograms = work.array("radix_histograms", (digits * groups,), np.uint32)
+    total = work.array("radix_total", (1,), np.uint32)
+    counters = cl.LocalMemory(4 * digits * items)
+    positions = keys
+    for index in range(passes):
+        shift = index * digit_bits
+        keys_out = work.array(f"{name}_keys{index % 2}", (n,), np.uint32)
+        positions_out = work.array(f"{name}_positions{index % 2}", (n,), np.uint32)
+        launch_groups(
+            device, kernels.radix_histogram, groups, items, n, chunk, shift, digits, keys, histograms, counters
+        )
+        scan(device, work, histograms, histograms, total)
+        launch_groups(
+            device,
+            kernels.radix_scatter,
+            groups,
+            items,
+            n,
+            chunk,
+            shift,
+            digits,
+            index == 0,
+            keys,
+            positions,
+            histograms,
+            keys_out,
+            positions_out,
+            counters,
+        )
+        keys, positions = keys_out, positions_out
+    return keys, positions
+
+
+def bitonic_sort(device: Device, work: Workspace, name: str, keys: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
+    """Sort at most BITONIC_MAX keys in one launch; (sorted keys, positions)."""
+    n = keys.shape[0]
+    if n > BITONIC_MAX:
+        raise ValueError(f"{n} keys: bitonic_sort takes at most {BITONIC_MAX}")
+    padded = 1 << max(n - 1, 0).bit_length()
+    keys_out = work.array(f"{name}_keys0", (n,), np.uint32)
+    positions_out = work.array(f"{name}_positions0", (n,), np.uint32)
+    local = cl.LocalMemory(4 * padded)
+    launch_groups(
+        device,
+        device.kernels("sort_bitonic").bitonic_sort,
+        1,
+        device.shape.items,
+        n,
+        padded,
+        keys,
+        keys_out,
+        positions_out,
+        local,
+        local,
+    )
+    return keys_out, positions_out
+
+
+def sort(device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int) -> tuple[DeviceArray, DeviceArray]:
+    """The quicker of the two for so many keys; `bits` is how many low bits of the keys can be set."""
+    if keys.shape[0] <= BITONIC_WINS[device.kind]:
+        return bitonic_sort(device, work, name, keys)
+    return radix_sort(device, work, name, keys, bits)

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches target.cl: a photograph into the blend's layout."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_grid
+from clsplat.device.layout import TILE
+
+
+def target(device: Device, work: Workspace, image: NDArray[Any], background: DeviceArray) -> DeviceArray:
+    """image (H, W, 3 or 4), uint8 or float32, straight alpha -> planes (3, rows, stride) over the background."""
+    height, width, channels = image.shape
+    rows, stride = -(-height // TILE) * TILE, -(-width // TILE) * TILE
+    source = work.array(f"target_{image.dtype}", image.shape, image.dtype)
+    source.set(image)
+    planes = work.array("target", (3, rows, stride))
+    kernels = device.kernels("target", **({"BYTES": True} if image.dtype == np.uint8 else {}))
+    launch_grid(
+        device, kernels.target, (stride, rows), width, height, channels, stride, rows * stride, source, background, planes
+    )
+    return planes

@@ -1,0 +1,89 @@
+// Blending front to back until alpha saturates (Kerbl et al. 2023, section 6 and algorithm 2). A group owns a tile.
+// On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each only the rows that its ellipse reaches,
+// LANES pixels at a time; on a GPU (LANES == 1) each work-item has pixels of its own. The bits are the same.
+//
+// Transmittance is kept negative in a pixel that is finished, which no test then lets continue.
+#include "shared/math.h"
+#include "shared/lanes.h"
+#include "shared/group.h"
+#include "shared/tile.h"
+#include "shared/alpha.h"
+
+// ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), background (3) -> image (3, height, width),
+// transmittance (height, width): what is left at the end; stops (height, width): the sorted index from which on the
+// pixel takes no more. Sizes are padded to whole tiles; padding is black.
+GROUP __kernel void blend(const int tiles_x, const int width, const int height, __global const uint *ranges,
+                          __global const uint *gaussian_from_sorted, __global const float *splats,
+                          __global const float *background, __global float *image, __global float *transmittance,
+                          __global int *stops) {
+  const int tile = get_group_id(0);
+  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
+  const int begin = ranges[2 * tile], end = ranges[2 * tile + 1];
+  floatL t[OWNED], red[OWNED], green[OWNED], blue[OWNED];
+  intL stop[OWNED];
+
+  int alive = 0;
+  for (int k = 0; k < OWNED; ++k) {
+    const int vector = get_local_id(0) + k * ITEMS;
+    const floatL x = (floatL)(tile_x + (vector % HALVES) * LANES) + LANE_INDEX;
+    const int inside = tile_y + vector / HALVES < height;
+    t[k] = inside ? (x < (floatL)(width) ? (floatL)(1.0f) : (floatL)(-1.0f)) : (floatL)(-1.0f);
+    red[k] = green[k] = blue[k] = (floatL)(0.0f);
+    stop[k] = t[k] > 0.0f ? (intL)(end) : (intL)(0);
+    alive += ANYL(t[k] > 0.0f);
+  }
+
+  for (int i = begin; i < end && alive > 0; ++i) {
+    __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
+    int y0, y1, h0, h1;
+    tile_box(splat, (float)tile_x, (float)tile_y, &y0, &y1, &h0, &h1);
+    const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
+    const float log2o = splat[SPLAT_LOG2O];
+    const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
+    const float mx = splat[SPLAT_MX] - ((float)tile_x + 0.5f), my = splat[SPLAT_MY] - ((float)tile_y + 0.5f);
+    floatL offset_u[HALVES];
+    for (int h = 0; h < HALVES; ++h) offset_u[h] = l11 * (mx - ((floatL)(h * LANES) + LANE_INDEX));
+    FOR_VECTORS(row, part, k) {
+      const float dy = my - (float)row;
+      const float v = l22 * dy;
+      const floatL power = log2_alpha(offset_u[part], l12 * dy, fma1(-v, v, log2o));
+      const floatL before = t[k];
+      const intL reached = (power >= LOG2_ALPHA_MIN) & (before > 0.0f);
+      if (ANYL(reached)) {
+        floatL alpha = exp2L(power);
+        alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
+        const floatL after = fmaL(-before, alpha, before);
+        const intL added = reached & (after > TRANSMITTANCE_MIN);
+        const intL ended = reached & (after <= TRANSMITTANCE_MIN);
+        const floatL weight = added ? before * alpha : (floatL)(0.0f);
+        red[k] = fmaL(weight, (floatL)(c_red), red[k]);
+        green[k] = fmaL(weight, (floatL)(c_green), green[k]);
+        blue[k] = fmaL(weight, (floatL)(c_blue), blue[k]);
+        t[k] = added ? after : before;
+        if (ANYL(ended)) {
+          t[k] = ended ? -before : t[k];
+          stop[k] = ended ? (intL)(i) : stop[k];
+          if (!ANYL(t[k] > 0.0f)) --alive;
+        }
+      }
+    }
+  }
+
+  const size_t stride = (size_t)tiles_x * TILE;
+  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
+  for (int k = 0; k < OWNED; ++k) {
+    const int vector = get_local_id(0) + k * ITEMS;
+    const size_t pixel = stride * (tile_y + vector / HALVES) + tile_x + (vector % HALVES) * LANES;
+    const intL shown = (stop[k] > 0) | (t[k] > 0.0f);
+    const floatL left = shown ? fabs(t[k]) : (floatL)(0.0f);
+    STOREL(fmaL(left, (floatL)(background[0]), red[k]), image + pixel);
+    STOREL(fmaL(left, (floatL)(background[1]), green[k]), image + plane + pixel);
+    STOREL(fmaL(left, (floatL)(background[2]), blue[k]), image + 2 * plane + pixel);
+    STOREL(fabs(t[k]), transmittance + pixel);
+#if LANES == 1
+    stops[pixel] = stop[k];
+#else
+    CAT(vstore, LANES)(stop[k], 0, stops + pixel);
+#endif
+  }
+}

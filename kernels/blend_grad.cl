@@ -1,0 +1,173 @@
+// The gradient of blending, back to front (docs/gradients.md, equations 14 to 22). A group owns a tile and writes one
+// slot of partial sums for each of its (tile, Gaussian) pairs, at the pair's own place: no atomics.
+//
+// Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
+// after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
+// moments of g = alpha * dL/dalpha; they are taken about the tile's centre, where no ellipse is far off in units of its
+// own width, and moved to (u, v) at the end.
+#include "shared/math.h"
+#include "shared/lanes.h"
+#include "shared/group.h"
+#include "shared/tile.h"
+#include "shared/alpha.h"
+
+#define CENTRE (0.5f * TILE - 0.5f)
+#ifdef ABSOLUTE_GRADIENTS
+#define SLOT_STRIDE SLOT_SIZE
+#else
+#define SLOT_STRIDE SLOT_PLAIN
+#endif
+
+#if ITEMS > 1
+// slot[field] = the sum of value over the group, in a fixed tree.
+static inline void group_sums(float *values, __local float *scratch, __global float *slot) {
+  const int item = get_local_id(0);
+  for (int field = 0; field < SLOT_STRIDE; ++field) scratch[field * ITEMS + item] = values[field];
+  for (int step = ITEMS / 2; step > 0; step /= 2) {
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item < step)
+      for (int field = 0; field < SLOT_STRIDE; ++field)
+        scratch[field * ITEMS + item] += scratch[field * ITEMS + item + step];
+  }
+  barrier(CLK_LOCAL_MEM_FENCE);
+  for (int field = item; field < SLOT_STRIDE; field += ITEMS) slot[field] = scratch[field * ITEMS];
+  barrier(CLK_LOCAL_MEM_FENCE);
+}
+#endif
+
+// As blend, its transmittance and stops, image_gradient (3, height, width), pair_from_sorted (pairs)
+// -> slots (pairs, SLOT_STRIDE), every one of them.
+GROUP __kernel void blend_grad(const int tiles_x, const int height, __global const uint *ranges,
+                               __global const uint *gaussian_from_sorted, __global const uint *pair_from_sorted,
+                               __global const float *splats, __global const float *background,
+                               __global const float *image_gradient, __global const float *transmittance,
+                               __global const int *stops, __global float *slots) {
+#if ITEMS > 1
+  __local float scratch[SLOT_STRIDE * ITEMS];
+  __local int group_last;
+#endif
+  const int tile = get_group_id(0);
+  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
+  const int begin = ranges[2 * tile], end = ranges[2 * tile + 1];
+  const size_t stride = (size_t)tiles_x * TILE;
+  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
+
+  floatL t[OWNED], behind[OWNED], g_red[OWNED], g_green[OWNED], g_blue[OWNED];
+  intL stop[OWNED];
+  int last = begin;
+  for (int k = 0; k < OWNED; ++k) {
+    const int vector = get_local_id(0) + k * ITEMS;
+    const size_t pixel = stride * (tile_y + vector / HALVES) + tile_x + (vector % HALVES) * LANES;
+    t[k] = LOADL(transmittance + pixel);
+    g_red[k] = LOADL(image_gradient + pixel);
+    g_green[k] = LOADL(image_gradient + plane + pixel);
+    g_blue[k] = LOADL(image_gradient + 2 * plane + pixel);
+    behind[k] = t[k] * (g_red[k] * background[0] + g_green[k] * background[1] + g_blue[k] * background[2]);
+#if LANES == 1
+    stop[k] = stops[pixel];
+    last = max(last, stop[k]);
+#else
+    stop[k] = CAT(vload, LANES)(0, stops + pixel);
+    for (int lane = 0; lane < LANES; ++lane) last = max(last, stops[pixel + lane]);
+#endif
+  }
+#if ITEMS > 1
+  if (get_local_id(0) == 0) group_last = begin;
+  barrier(CLK_LOCAL_MEM_FENCE);
+  atomic_max(&group_last, last);
+  barrier(CLK_LOCAL_MEM_FENCE);
+  last = group_last;
+#endif
+
+  for (int i = last + (int)get_local_id(0); i < end; i += ITEMS) {
+    __global float *slot = slots + (size_t)SLOT_STRIDE * pair_from_sorted[i];
+    for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = 0.0f;
+  }
+
+  for (int i = last - 1; i >= begin; --i) {
+    __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
+    __global float *slot = slots + (size_t)SLOT_STRIDE * pair_from_sorted[i];
+    int y0, y1, h0, h1;
+    tile_box(splat, (float)tile_x, (float)tile_y, &y0, &y1, &h0, &h1);
+    const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
+    const float log2o = splat[SPLAT_LOG2O];
+    const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
+    const float mx = splat[SPLAT_MX] - ((float)tile_x + 0.5f), my = splat[SPLAT_MY] - ((float)tile_y + 0.5f);
+    floatL offset_u[HALVES], s0[HALVES], s1[HALVES], s2[HALVES];
+    for (int h = 0; h < HALVES; ++h) {
+      offset_u[h] = l11 * (mx - ((floatL)(h * LANES) + LANE_INDEX));
+      s0[h] = s1[h] = s2[h] = (floatL)(0.0f);
+    }
+    floatL d_red = (floatL)(0.0f), d_green = (floatL)(0.0f), d_blue = (floatL)(0.0f);
+#ifdef ABSOLUTE_GRADIENTS
+    floatL abs_x = (floatL)(0.0f), abs_y = (floatL)(0.0f);
+#endif
+    FOR_VECTORS(row, part, k) {
+      const float dy = my - (float)row;
+      const float v = l22 * dy;
+      const floatL power = log2_alpha(offset_u[part], l12 * dy, fma1(-v, v, log2o));
+      const intL reached = (power >= LOG2_ALPHA_MIN) & ((intL)(i) < stop[k]);
+      if (ANYL(reached)) {
+        const floatL uncapped = reached ? exp2L(power) : (floatL)(0.0f);
+        const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
+        const floatL inverse = 1.0f / (1.0f - alpha);
+        const floatL before = t[k] * inverse;
+        const floatL shade = fmaL(g_red[k], (floatL)(c_red), fmaL(g_green[k], (floatL)(c_green), g_blue[k] * c_blue));
+        const floatL weight = alpha * before;
+        const floatL d_alpha = fmaL(before, shade, -(behind[k] * inverse));
+        floatL g = alpha * d_alpha;
+        g = uncapped < ALPHA_MAX ? g : (floatL)(0.0f);
+        behind[k] = fmaL(weight, shade, behind[k]);
+        t[k] = before;
+        d_red = fmaL(weight, g_red[k], d_red);
+        d_green = fmaL(weight, g_green[k], d_green);
+        d_blue = fmaL(weight, g_blue[k], d_blue);
+        const float y = (float)row - CENTRE;
+        const floatL gy = g * y;
+        s0[part] += g;
+        s1[part] += gy;
+        s2[part] = fmaL(gy, (floatL)(y), s2[part]);
+#ifdef ABSOLUTE_GRADIENTS
+        const floatL u = offset_u[part] + l12 * dy;
+        abs_x += fabs(g * (l11 * u));
+        abs_y += fabs(g * fmaL((floatL)(l12), u, (floatL)(l22 * v)));
+#endif
+      }
+    }
+
+    // (20) to (22): u = uc - l12 y, v = vc - l22 y with y from the tile's centre row.
+    const float uy = l12 * (my - CENTRE), vc = l22 * (my - CENTRE);
+    floatL m0 = (floatL)(0.0f), m1 = m0, mu = m0, muu = m0, mu1 = m0, m2 = m0;
+    for (int h = 0; h < HALVES; ++h) {
+      const floatL uc = offset_u[h] + uy;
+      m0 += s0[h];
+      m1 += s1[h];
+      m2 += s2[h];
+      const floatL first = fmaL(uc, s0[h], -(l12 * s1[h]));
+      mu += first;
+      const floatL cross = fmaL(uc, s1[h], -(l12 * s2[h]));
+      mu1 += cross;
+      muu += fmaL(uc, first, -(l12 * cross));
+    }
+    float values[SLOT_STRIDE];
+    const float g = sumL(m0), g1 = sumL(m1), g2 = sumL(m2), gu = sumL(mu), gu1 = sumL(mu1);
+    values[SLOT_G] = g;
+    values[SLOT_GU] = gu;
+    values[SLOT_GV] = fma1(vc, g, -(l22 * g1));
+    values[SLOT_GUU] = sumL(muu);
+    values[SLOT_GUV] = fma1(vc, gu, -(l22 * gu1));
+    values[SLOT_GVV] = fma1(vc * vc, g, fma1(-2.0f * vc * l22, g1, l22 * l22 * g2));
+    values[SLOT_RED] = sumL(d_red);
+    values[SLOT_GREEN] = sumL(d_green);
+    values[SLOT_BLUE] = sumL(d_blue);
+#ifdef ABSOLUTE_GRADIENTS
+    values[SLOT_ABSX] = sumL(abs_x);
+    values[SLOT_ABSY] = sumL(abs_y);
+#endif
+#if ITEMS == 1
+    for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = values[field];
+#else
+    group_sums(values, scratch, slot);
+#endif
+  }
+}

@@ -1,0 +1,48 @@
+// From visible Gaussians to one (tile, Gaussian) pair for each tile that an ellipse reaches, in order of depth, so that
+// a stable sort by tile alone leaves each tile's Gaussians front to back.
+#include "shared/math.h"
+#include "shared/tile.h"
+
+// tile_counts (n), rank (n): scan of the visible -> gaussian_from_visible, depth_keys (visible). A positive float's bits
+// sort as it does.
+__kernel void compact_visible(const uint n, __global const uint *tile_counts, __global const uint *ranks,
+                              __global const float *splats, __global uint *gaussian_from_visible,
+                              __global uint *depth_keys) {
+  const uint i = get_global_id(0);
+  if (i >= n || tile_counts[i] == 0) return;
+  gaussian_from_visible[ranks[i]] = i;
+  depth_keys[ranks[i]] = as_uint(splats[(size_t)SPLAT_SIZE * i + SPLAT_DEPTH]);
+}
+
+// order (visible): by depth -> gaussian_from_rank, counts (visible)
+__kernel void order_counts(const uint visible, __global const uint *order, __global const uint *gaussian_from_visible,
+                           __global const uint *tile_counts, __global uint *gaussian_from_rank,
+                           __global uint *counts) {
+  const uint rank = get_global_id(0);
+  if (rank >= visible) return;
+  const uint i = gaussian_from_visible[order[rank]];
+  gaussian_from_rank[rank] = i;
+  counts[rank] = tile_counts[i];
+}
+
+// offsets (visible): scan of the counts -> tile_keys, gaussian_from_pair (pairs)
+__kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y,
+                        __global const uint *gaussian_from_rank, __global const uint *offsets,
+                        __global const float *splats, __global uint *tile_keys, __global uint *gaussian_from_pair) {
+  const uint rank = get_global_id(0);
+  if (rank >= visible) return;
+  const uint i = gaussian_from_rank[rank];
+  const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i);
+  const int y0 = first_cell(e.my - e.half_h, (float)TILE, tiles_y);
+  const int y1 = end_cell(e.my + e.half_h, (float)TILE, tiles_y);
+  uint pair = offsets[rank];
+  for (int ty = y0; ty < y1; ++ty) {
+    int x0, x1;
+    tile_span(&e, ty, tiles_x, &x0, &x1);
+    for (int tx = x0; tx < x1; ++tx) {
+      tile_keys[pair] = ty * tiles_x + tx;
+      gaussian_from_pair[pair] = i;
+      ++pair;
+    }
+  }
+}

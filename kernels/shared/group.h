@@ -1,0 +1,34 @@
+// What a work-group does together. At ITEMS == 1 a group is one sequential work-item and nothing is left of this.
+#ifndef ITEMS
+#error "ITEMS must be defined: work-items per group, 1 on CPUs"
+#endif
+#if ITEMS == 1
+#define BARRIER_LOCAL()
+#define BARRIER_GLOBAL()
+#else
+#define BARRIER_LOCAL() barrier(CLK_LOCAL_MEM_FENCE)
+#define BARRIER_GLOBAL() barrier(CLK_GLOBAL_MEM_FENCE)
+#endif
+#define GROUP __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
+
+// The sum of the values of the items before this one; *total gets the sum of all. scratch holds ITEMS elements.
+static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint *total) {
+#if ITEMS == 1
+  *total = value;
+  return 0;
+#else
+  const uint item = get_local_id(0);
+  scratch[item] = value;
+  barrier(CLK_LOCAL_MEM_FENCE);
+  for (uint step = 1; step < ITEMS; step *= 2) {
+    const uint add = item >= step ? scratch[item - step] : 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    scratch[item] += add;
+    barrier(CLK_LOCAL_MEM_FENCE);
+  }
+  *total = scratch[ITEMS - 1];
+  const uint before = item > 0 ? scratch[item - 1] : 0;
+  barrier(CLK_LOCAL_MEM_FENCE);
+  return before;
+#endif
+}

@@ -1,0 +1,76 @@
+// floatL: LANES neighbouring pixels of a row, one name for float, float8 and float16. Masks are intL, all bits of a
+// lane set or none (LANES > 1) or 0 and 1 (LANES == 1), as the comparison operators give them.
+#ifndef LANES
+#error "LANES must be defined: pixels per vector, 1, 4, 8 or 16"
+#endif
+#define CAT_(a, b) a##b
+#define CAT(a, b) CAT_(a, b)
+#if LANES == 1
+typedef float floatL;
+typedef int intL;
+#define AS_INTL(x) as_int(x)
+#define AS_FLOATL(x) as_float(x)
+#define LOADL(p) (*(p))
+#define STOREL(x, p) (*(p) = (x))
+#define ANYL(m) ((m) != 0)
+#define ALLL(m) ((m) != 0)
+#define LANE_INDEX 0.0f
+#else
+typedef CAT(float, LANES) floatL;
+typedef CAT(int, LANES) intL;
+#define AS_INTL(x) CAT(as_int, LANES)(x)
+#define AS_FLOATL(x) CAT(as_float, LANES)(x)
+#define LOADL(p) CAT(vload, LANES)(0, p)
+#define STOREL(x, p) CAT(vstore, LANES)(x, 0, p)
+#define ANYL(m) any(m)
+#define ALLL(m) all(m)
+#if LANES == 4
+#define LANE_INDEX ((floatL)(0, 1, 2, 3))
+#elif LANES == 8
+#define LANE_INDEX ((floatL)(0, 1, 2, 3, 4, 5, 6, 7))
+#else
+#define LANE_INDEX ((floatL)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#endif
+#endif
+
+static inline floatL fmaL(floatL a, floatL b, floatL c) {
+#ifdef FMA_BY_CONTRACTION
+#pragma OPENCL FP_CONTRACT ON
+  return a * b + c;
+#else
+  return fma(a, b, c);
+#endif
+}
+
+// The sum of the lanes in a fixed order: pairs at distance L/2, L/4, ... 1.
+static inline float sumL(floatL x) {
+#if LANES == 16
+  const float8 a = x.lo + x.hi;
+  const float4 b = a.lo + a.hi;
+  const float2 c = b.lo + b.hi;
+  return c.x + c.y;
+#elif LANES == 8
+  const float4 b = x.lo + x.hi;
+  const float2 c = b.lo + b.hi;
+  return c.x + c.y;
+#elif LANES == 4
+  const float2 c = x.lo + x.hi;
+  return c.x + c.y;
+#else
+  return x;
+#endif
+}
+
+// 2^x for x in [-126, 1], relative error under 1e-7: round to the nearest integer with the magic number 1.5 * 2^23,
+// degree 6 minimax on [-1/2, 1/2], exponent by integer addition. A lane under -126 is some finite number.
+static inline floatL exp2L(floatL x) {
+  const floatL t = x + 12582912.0f;
+  const floatL f = x - (t - 12582912.0f);
+  floatL p = fmaL(f, (floatL)(1.53534157e-4f), (floatL)(1.33988768e-3f));
+  p = fmaL(p, f, (floatL)(9.61844087e-3f));
+  p = fmaL(p, f, (floatL)(5.55032884e-2f));
+  p = fmaL(p, f, (floatL)(2.40226510e-1f));
+  p = fmaL(p, f, (floatL)(6.93147182e-1f));
+  p = fmaL(p, f, (floatL)(1.0f));
+  return AS_FLOATL(AS_INTL(p) + (AS_INTL(t) << 23));
+}

@@ -1,0 +1,51 @@
+// Real spherical harmonics to degree 3, signs and order of Kerbl et al. 2023; basis[k] at the unit direction (x, y, z).
+
+static inline void sh_basis(int coefficients, float x, float y, float z, float *basis) {
+  basis[0] = 0.28209479177387814f;
+  if (coefficients < 4) return;
+  basis[1] = -0.4886025119029199f * y;
+  basis[2] = 0.4886025119029199f * z;
+  basis[3] = -0.4886025119029199f * x;
+  if (coefficients < 9) return;
+  const float xx = x * x, yy = y * y, zz = z * z;
+  basis[4] = 1.0925484305920792f * x * y;
+  basis[5] = -1.0925484305920792f * y * z;
+  basis[6] = 0.31539156525252005f * (2.0f * zz - xx - yy);
+  basis[7] = -1.0925484305920792f * x * z;
+  basis[8] = 0.5462742152960396f * (xx - yy);
+  if (coefficients < 16) return;
+  basis[9] = -0.5900435899266435f * y * (3.0f * xx - yy);
+  basis[10] = 2.890611442640554f * x * y * z;
+  basis[11] = -0.4570457994644658f * y * (4.0f * zz - xx - yy);
+  basis[12] = 0.3731763325901154f * z * (2.0f * zz - 3.0f * xx - 3.0f * yy);
+  basis[13] = -0.4570457994644658f * x * (4.0f * zz - xx - yy);
+  basis[14] = 1.445305721320277f * z * (xx - yy);
+  basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
+}
+
+// d[3]: sum over k of weight[k] times the gradient of basis[k] by (x, y, z).
+static inline void sh_direction_gradient(int coefficients, float x, float y, float z, const float *weight, float *d) {
+  d[0] = d[1] = d[2] = 0.0f;
+  if (coefficients < 4) return;
+  d[0] = -0.4886025119029199f * weight[3];
+  d[1] = -0.4886025119029199f * weight[1];
+  d[2] = 0.4886025119029199f * weight[2];
+  if (coefficients < 9) return;
+  const float c4 = 1.0925484305920792f, c6 = 0.31539156525252005f, c8 = 0.5462742152960396f;
+  d[0] += c4 * y * weight[4] - 2.0f * c6 * x * weight[6] - c4 * z * weight[7] + 2.0f * c8 * x * weight[8];
+  d[1] += c4 * x * weight[4] - c4 * z * weight[5] - 2.0f * c6 * y * weight[6] - 2.0f * c8 * y * weight[8];
+  d[2] += -c4 * y * weight[5] + 4.0f * c6 * z * weight[6] - c4 * x * weight[7];
+  if (coefficients < 16) return;
+  const float xx = x * x, yy = y * y, zz = z * z;
+  const float c9 = 0.5900435899266435f, c10 = 2.890611442640554f, c11 = 0.4570457994644658f;
+  const float c12 = 0.3731763325901154f, c14 = 1.445305721320277f;
+  d[0] += -6.0f * c9 * x * y * weight[9] + c10 * y * z * weight[10] + 2.0f * c11 * x * y * weight[11] -
+          6.0f * c12 * x * z * weight[12] - c11 * (4.0f * zz - 3.0f * xx - yy) * weight[13] +
+          2.0f * c14 * x * z * weight[14] - 3.0f * c9 * (xx - yy) * weight[15];
+  d[1] += -3.0f * c9 * (xx - yy) * weight[9] + c10 * x * z * weight[10] -
+          c11 * (4.0f * zz - xx - 3.0f * yy) * weight[11] - 6.0f * c12 * y * z * weight[12] +
+          2.0f * c11 * x * y * weight[13] - 2.0f * c14 * y * z * weight[14] + 6.0f * c9 * x * y * weight[15];
+  d[2] += c10 * x * y * weight[10] - 8.0f * c11 * y * z * weight[11] +
+          3.0f * c12 * (2.0f * zz - xx - yy) * weight[12] - 8.0f * c11 * x * z * weight[13] +
+          c14 * (xx - yy) * weight[14];
+}

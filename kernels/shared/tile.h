@@ -1,0 +1,59 @@
+// The one place that says which tiles a projected Gaussian reaches. Counting and emitting both call it: were they to
+// disagree by one tile, the emitted pairs would overrun or leave holes in the arrays that the count sized.
+
+// Slack in pixels over what float32 loses here; a tile too many only costs time, one too few would show.
+#define TILE_SLACK 0.01f
+
+typedef struct {
+  float mx, my, l11, l12, l22, half_w, half_h;
+  float budget;  // u^2 + v^2 where alpha is 1/255
+  float tangent; // dy / dx from the mean to the ellipse's rightmost point, times half_w
+} Ellipse;
+
+static inline Ellipse ellipse_of(__global const float *splat) {
+  Ellipse e;
+  e.mx = splat[SPLAT_MX];
+  e.my = splat[SPLAT_MY];
+  e.l11 = splat[SPLAT_L11];
+  e.l12 = splat[SPLAT_L12];
+  e.l22 = splat[SPLAT_L22];
+  e.half_w = splat[SPLAT_HALF_W];
+  e.half_h = splat[SPLAT_HALF_H];
+  e.budget = splat[SPLAT_LOG2O] - LOG2_ALPHA_MIN;
+  e.tangent = -e.l12 * e.l11 / (e.l22 * e.l22 + e.l12 * e.l12) * e.half_w;
+  return e;
+}
+
+// First index of the tiles (or rows, at size 1) whose last pixel centre is at or after `low`, within [0, count].
+static inline int first_cell(float low, float size, int count) {
+  const float cell = ceil((low - TILE_SLACK - (size - 0.5f)) / size);
+  return cell > 0.0f ? (cell < (float)count ? (int)cell : count) : 0;
+}
+
+// One past the last index of those whose first pixel centre is at or before `high`, within [0, count].
+static inline int end_cell(float high, float size, int count) {
+  const float cell = floor((high + TILE_SLACK - 0.5f) / size) + 1.0f;
+  return cell > 0.0f ? (cell < (float)count ? (int)cell : count) : 0;
+}
+
+// The right edge of the ellipse, from the mean, over the offsets [d0, d1] in y; the left edge by symmetry.
+static inline float right_edge(const Ellipse *e, float d0, float d1) {
+  if (e->tangent >= d0 && e->tangent <= d1) return e->half_w;
+  const float dy = e->tangent < d0 ? d0 : d1;
+  const float rest = e->budget - e->l22 * e->l22 * dy * dy;
+  return (-e->l12 * dy + sqrt(rest > 0.0f ? rest : 0.0f)) / e->l11;
+}
+
+// The tiles [*x0, *x1) that the ellipse reaches in tile row ty.
+static inline void tile_span(const Ellipse *e, int ty, int tiles_x, int *x0, int *x1) {
+  float d0 = (float)(ty * TILE) + 0.5f - TILE_SLACK - e->my;
+  float d1 = (float)(ty * TILE + TILE) - 0.5f + TILE_SLACK - e->my;
+  d0 = d0 > -e->half_h ? d0 : -e->half_h;
+  d1 = d1 < e->half_h ? d1 : e->half_h;
+  if (!(d0 <= d1)) d0 = d1 = (d0 > e->half_h ? e->half_h : -e->half_h);
+  const float right = right_edge(e, d0, d1);
+  const float left = right_edge(e, -d1, -d0);
+  *x0 = first_cell(e->mx - left, (float)TILE, tiles_x);
+  *x1 = end_cell(e->mx + right, (float)TILE, tiles_x);
+  if (*x1 < *x0) *x1 = *x0;
+}

@@ -1,0 +1,38 @@
+// Bitonic sort of a short array by one group in local memory, in a single launch: what a radix sort's dozen launches
+// cost more than. Ties go by value, which makes it stable where values are positions.
+#include "shared/math.h"
+#include "shared/group.h"
+
+// keys (n) in; keys_out, values_out (n): sorted, the value being the position in keys. local arrays (padded), padded a
+// power of two and at least n.
+GROUP __kernel void bitonic_sort(const uint n, const uint padded, __global const uint *keys, __global uint *keys_out,
+                                 __global uint *values_out, __local uint *k, __local uint *v) {
+  const uint item = get_local_id(0);
+  for (uint i = item; i < padded; i += ITEMS) {
+    k[i] = i < n ? keys[i] : 0xffffffff;
+    v[i] = i;
+  }
+  BARRIER_LOCAL();
+  for (uint block = 2; block <= padded; block *= 2) {
+    for (uint step = block / 2; step > 0; step /= 2) {
+      for (uint pair = item; pair < padded / 2; pair += ITEMS) {
+        const uint a = 2 * pair - (pair & (step - 1));
+        const uint b = a + step;
+        const int descending = (a & block) != 0;
+        const int greater = k[a] > k[b] || (k[a] == k[b] && v[a] > v[b]);
+        if (greater != descending) {
+          const uint key = k[a], value = v[a];
+          k[a] = k[b];
+          v[a] = v[b];
+          k[b] = key;
+          v[b] = value;
+        }
+      }
+      BARRIER_LOCAL();
+    }
+  }
+  for (uint i = item; i < n; i += ITEMS) {
+    keys_out[i] = k[i];
+    values_out[i] = v[i];
+  }
+}
