@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""3D Gaussian Splatting on any OpenCL device.
+
+    scene = clsplat.load_scene("photos/")
+    gaussians = clsplat.train(scene, clsplat.TrainConfig(iterations=7000))
+    gaussians.save("model.ply")
+    image = clsplat.render(gaussians, scene.views[0].camera).image
+
+The public names are loaded when they are first used, so that `import clsplat` and `clsplat --help` are quick.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from clsplat.camera import Camera as Camera
+    from clsplat.config import TrainConfig as TrainConfig
+    from clsplat.gaussians import Gaussians as Gaussians
+    from clsplat.rendering import render as render
+    from clsplat.scene import load_scene as load_scene
+    from clsplat.training import train as train
+
+    __version__: str
+
+__all__ = ["Camera", "Gaussians", "TrainConfig", "__version__", "load_scene", "render", "train"]
+
+_MODULES = {
+    "Camera": "clsplat.camera",
+    "Gaussians": "clsplat.gaussians",
+    "TrainConfig": "clsplat.config",
+    "load_scene": "clsplat.scene",
+    "render": "clsplat.rendering",
+    "train": "clsplat.training",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            value: Any = version("clsplat")
+        except PackageNotFoundError:  # a checkout on the path that is not installed
+            value = "0+unknown"
+    elif name in _MODULES:
+        value = getattr(import_module(_MODULES[name]), name)
+    else:
+        raise AttributeError(f"module 'clsplat' has no attribute {name!r}")
+    globals()[name] = value
+    return value

@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from clsplat.errors import InputError
+
 Background = Literal["black", "white", "random"]
 
 
@@ -62,8 +64,8 @@ class DensityConfig:
     """Gaussians less opaque are pruned."""
     max_world_fraction: float = 0.1
     """Gaussians larger than this fraction of the extent are pruned, after the first opacity reset."""
-    max_screen_radius: float = 20.0
-    """Gaussians that covered a larger radius in pixels are pruned, after the first opacity reset."""
+    max_screen_radius: float = 0.0
+    """Gaussians that covered a larger radius in pixels are pruned, after the first opacity reset; 0 prunes none."""
     opacity_reset_every: int = 3000
     """Steps between opacity resets; also once at `start` where the background is white."""
     opacity_reset_to: float = 0.01
@@ -102,3 +104,21 @@ class TrainConfig:
     """Steps at which the held-out views are evaluated, beside the end."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
+
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"--sh-degree {self.sh_degree}: expected 0 to 3")
+        if not 0 <= self.dssim_weight <= 1:
+            raise InputError(f"--dssim-weight {self.dssim_weight}: expected 0 to 1")
+        for name in ("iterations", "sh_degree_every", "random_points"):
+            if getattr(self, name) < 1:
+                raise InputError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected at least 1")
+        for name in ("seed", "resolution", "test_every", "checkpoint_every"):
+            if getattr(self, name) < 0:
+                raise InputError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected at least 0")
+        for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):
+            if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
+                raise InputError(f"--{name} {','.join(map(str, steps))}: expected steps from 1 up, in order")
+        if not self.density.split_factor > 1:
+            raise InputError(f"--density.split-factor {self.density.split_factor}: expected more than 1")

@@ -42,6 +42,10 @@ def launch_groups(device: Device, kernel: Any, groups: int, items: int, *argumen
 
 
 def launch_grid(device: Device, kernel: Any, size: tuple[int, ...], *arguments: Any) -> None:
-    """A grid of work-items that the driver may group as it likes. Nothing where a side is 0."""
+    """A grid of work-items: a row of it is a group's loop on a CPU, which the driver would else make one group of all.
+
+    Nothing where a side is 0.
+    """
     if all(size):
-        kernel(device.queue, size, None, *_arguments(arguments))
+        local = (size[0], *(1 for _ in size[1:])) if device.kind == "cpu" and size[0] <= 1024 else None
+        kernel(device.queue, size, local, *_arguments(arguments))

@@ -13,17 +13,16 @@ typedef int intL;
 #define LOADL(p) (*(p))
 #define STOREL(x, p) (*(p) = (x))
 #define ANYL(m) ((m) != 0)
-#define ALLL(m) ((m) != 0)
 #define LANE_INDEX 0.0f
 #else
 typedef CAT(float, LANES) floatL;
 typedef CAT(int, LANES) intL;
 #define AS_INTL(x) CAT(as_int, LANES)(x)
 #define AS_FLOATL(x) CAT(as_float, LANES)(x)
-#define LOADL(p) CAT(vload, LANES)(0, p)
-#define STOREL(x, p) CAT(vstore, LANES)(x, 0, p)
-#define ANYL(m) any(m)
-#define ALLL(m) all(m)
+typedef floatL floatU __attribute__((aligned(4))); // vload and vstore are slow calls in PoCL 3.0
+#define LOADL(p) (*(__global const floatU *)(p))
+#define STOREL(x, p) (*(__global floatU *)(p) = (x))
+#define ANYL(m) any_lane(m)
 #if LANES == 4
 #define LANE_INDEX ((floatL)(0, 1, 2, 3))
 #elif LANES == 8
@@ -31,6 +30,25 @@ typedef CAT(int, LANES) intL;
 #else
 #define LANE_INDEX ((floatL)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #endif
+#endif
+
+#if LANES > 1
+// any() is a call that some drivers do not inline.
+static inline int any_lane(intL m) {
+#if LANES == 16
+  const int8 a = m.lo | m.hi;
+#else
+#define a m
+#endif
+#if LANES == 4
+  const long2 b = as_long2(a);
+#else
+  const long4 c = as_long4(a);
+  const long2 b = c.lo | c.hi;
+#endif
+#undef a
+  return (b.x | b.y) != 0;
+}
 #endif
 
 static inline floatL fmaL(floatL a, floatL b, floatL c) {
