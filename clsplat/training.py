@@ -115,8 +115,13 @@ class Trainer:
         self.statistics = new_statistics(self.device, count)
 
     def train_step(self) -> Loss:
-        """One view: forward, loss, backward, Adam, density control (Kerbl et al. 2023, algorithm 1)."""
+        """Density control as the last step left it to do, then one view: forward, loss, backward, Adam.
+
+        Kerbl et al. 2023, algorithm 1, but for where the loop is cut: a model is looked at, kept or finished before
+        its Gaussians are split or made transparent, not just after.
+        """
         config, device, work = self.config, self.device, self.rasterizer.work
+        self._control_density()
         self.step += 1
         self._raise_sh_degree()
         view, factor = self._next_view(), self._factor()
@@ -150,7 +155,6 @@ class Trainer:
             self.first,
             self.second,
         )
-        self._control_density()
         return result
 
     def rates(self) -> dict[str, float]:
@@ -193,6 +197,8 @@ class Trainer:
 
     def _control_density(self) -> None:
         config = self.config.density
+        if self.step == 0:
+            return
         if density.is_due(config, self.step):
             self._densify()
         if density.is_reset_due(config, self.step, white=self.config.background == "white"):

@@ -23,14 +23,18 @@ class Shape:
     """How kernels are shaped for a device.
 
     lanes: pixels per vector in the blend kernels (1 on GPUs); items: work-items per work-group in kernels that
-    cooperate (1 on CPUs, where a group is one sequential loop); chunks: pieces that a scan or sort is cut into at
-    `items` == 1; digit_bits: radix sort digit.
+    co-operate (1 on CPUs, where a group is one sequential loop); chunks: pieces that a scan or sort is cut into at
+    `items` == 1.
     """
 
     lanes: int
     items: int
     chunks: int
-    digit_bits: int
+
+    @property
+    def digit_bits(self) -> int:
+        """Radix sort digit: a counter per digit and item has to fit local memory."""
+        return 11 if self.items == 1 else 4
 
 
 @dataclass(frozen=True)
@@ -78,11 +82,11 @@ def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
 def default_shape(device: cl.Device) -> Shape:
     """The shape by type and vector width; DESIGN's measurements are in docs/performance.md."""
     if _kind(device) != "cpu":
-        return Shape(lanes=1, items=min(256, device.max_work_group_size), chunks=0, digit_bits=4)
+        return Shape(lanes=1, items=min(256, device.max_work_group_size), chunks=0)
     lanes = 16 if device.native_vector_width_float >= 16 else 8
     if _pocl_version(device) == (3, 0):
         lanes = 8  # its compiler aborts on some float16 built-ins
-    return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units, digit_bits=11)
+    return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units)
 
 
 def list_devices() -> list[DeviceInfo]:

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every OpenCL driver of the machine, as a parameter of the tests that run kernels."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
+from opencl_drivers import use_every_driver
+
+use_every_driver()
+
+from clsplat.device.context import Device, list_devices, open_device
+
+INFOS = list_devices()
+
+
+def _label(index: int) -> str:
+    words = INFOS[index].version.replace("+", " ").split()
+    number = words[words.index("PoCL") + 1] if "PoCL" in words else words[1]
+    return f"{INFOS[index].platform.split()[0]}-{number}"
+
+
+@pytest.fixture(scope="session", params=range(len(INFOS)), ids=_label)
+def device(request: pytest.FixtureRequest) -> Device:
+    """Each driver in turn, in its own shape."""
+    return open_device(str(request.param))
+
+
+SHAPES = ((1, 1), (1, 64), (8, 1), (8, 16))
+"""(lanes, items): the scalar loop, a GPU's shape, a CPU's, and a mixture. 16 lanes abort PoCL 3.0's compiler."""
+
+
+@pytest.fixture(scope="session", params=SHAPES, ids=lambda shape: f"{shape[0]}x{shape[1]}")
+def shaped_device(device: Device, request: pytest.FixtureRequest) -> Device:
+    """Each driver in each kernel shape."""
+    lanes, items = request.param
+    return device.with_shape(lanes=lanes, items=items)

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The project's own elementary functions (shared/math.h, shared/lanes.h) through probe.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import allocate, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_grid
+
+
+def probe(device: Device, x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """exp1, log2_1, sigmoid1 and exp2L of x, (4, n)."""
+    n = len(x)
+    out = allocate(device, (4, n), np.float32)
+    launch_grid(device, device.kernels("probe").probe_elementary, (n,), upload(device, x), out, n)
+    result: NDArray[np.float32] = out.get()
+    return result
+
+
+def relative(got: NDArray[np.float32], expected: NDArray[np.float64]) -> float:
+    return float(np.max(np.abs(got - expected) / np.abs(expected)))
+
+
+def test_exponential(shaped_device: Device) -> None:
+    x = np.linspace(-87, 87, 20_001, dtype=np.float32)
+    # 2 ulp: one of the polynomial, one of the reduction.
+    assert relative(probe(shaped_device, x)[0], np.exp(x.astype(np.float64))) < 2.4e-7
+
+
+def test_logarithm(shaped_device: Device) -> None:
+    x = np.random.default_rng(0).uniform(1e-3, 1, 20_000).astype(np.float32)
+    expected = np.log2(x.astype(np.float64))
+    # Absolute near 1, where log2 goes through 0; opacities are what it is used on.
+    assert np.max(np.abs(probe(shaped_device, x)[1] - expected) / np.maximum(np.abs(expected), 1)) < 2.4e-7
+
+
+def test_sigmoid(shaped_device: Device) -> None:
+    x = np.linspace(-80, 80, 20_001, dtype=np.float32)
+    assert relative(probe(shaped_device, x)[2], 1 / (1 + np.exp(-x.astype(np.float64)))) < 3.6e-7
+
+
+def test_power_of_two(shaped_device: Device) -> None:
+    x = np.linspace(-8.5, 0, 20_001, dtype=np.float32)
+    assert relative(probe(shaped_device, x)[3], np.exp2(x.astype(np.float64))) < 2e-7
+
+
+def test_the_same_bits_in_every_shape(device: Device) -> None:
+    x = np.linspace(-8, 8, 4001, dtype=np.float32)
+    frames = [probe(device.with_shape(lanes=lanes), x) for lanes in (1, 4, 8)]
+    for other in frames[1:]:
+        np.testing.assert_array_equal(frames[0].view(np.uint32), other.view(np.uint32))
+
+
+def test_multiply_add_has_one_rounding(shaped_device: Device) -> None:
+    lanes = shaped_device.shape.lanes
+    out = allocate(shaped_device, (2 * lanes,), np.float32)
+    factor = float(np.float32(1 + 2.0**-12))
+    launch_grid(shaped_device, shaped_device.kernels("probe").probe_fma, (1,), out, factor, -(1 + 2.0**-11))
+    np.testing.assert_array_equal(out.get(), np.float32(2.0**-24))

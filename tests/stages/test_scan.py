@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""scan.cl against NumPy, at sizes around a group's and a chunk's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clsplat.device.buffers import Workspace, allocate, upload
+from clsplat.device.context import Device
+from clsplat.stages.scan import scan, total
+
+SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 16 * 64 - 1, 16 * 64 + 1, 8 * 1024 + 1, 100_003)
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("as_flags", [False, True])
+def test_exclusive_prefix_sum(shaped_device: Device, n: int, as_flags: bool) -> None:
+    values = np.random.default_rng(n).integers(0, 4, n).astype(np.uint32)
+    work = Workspace(shaped_device)
+    out = upload(shaped_device, np.full(n, 0xFFFFFFFF, np.uint32))
+    sum_array = allocate(shaped_device, (1,), np.uint32)
+    scan(shaped_device, work, upload(shaped_device, values), out, sum_array, as_flags=as_flags)
+    counted = (values > 0).astype(np.uint32) if as_flags else values
+    np.testing.assert_array_equal(out.get(), np.concatenate([[0], np.cumsum(counted)[:-1]]))
+    assert sum_array.get()[0] == counted.sum()
+
+
+def test_scan_in_place_and_total(shaped_device: Device) -> None:
+    values = np.arange(5000, dtype=np.uint32)
+    work = Workspace(shaped_device)
+    array, out = upload(shaped_device, values), allocate(shaped_device, (1,), np.uint32)
+    total(shaped_device, work, array, out)
+    assert out.get()[0] == values.sum()
+    scan(shaped_device, work, array, array, out)
+    np.testing.assert_array_equal(array.get(), np.cumsum(values) - values)
+
+
+def test_nothing_to_scan(shaped_device: Device) -> None:
+    out = upload(shaped_device, np.full(1, 7, np.uint32))
+    scan(shaped_device, Workspace(shaped_device), allocate(shaped_device, (0,), np.uint32), out, out)
+    assert out.get()[0] == 0

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Both sorts alone against NumPy's stable sort: seam sizes, equal keys, extremes, few bits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
+from clsplat.stages.sort import BITONIC_MAX, BITONIC_WINS, bitonic_sort, radix_sort, sort
+
+SIZES = (0, 1, 2, 63, 64, 65, 127, 128, 129, 1023, 1024, 1025, 4096)
+RADIX_SIZES = (*SIZES, 8 * 1024 + 1, 70_001)
+
+
+def check(keys: NDArray[np.uint32], result: tuple[NDArray[np.uint32], NDArray[np.uint32]]) -> None:
+    expected = np.argsort(keys, kind="stable")
+    np.testing.assert_array_equal(result[1], expected)
+    np.testing.assert_array_equal(result[0], keys[expected])
+
+
+def radix(device: Device, keys: NDArray[np.uint32], bits: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    out = radix_sort(device, Workspace(device), "test", upload(device, keys), bits)
+    return out[0].get(), out[1].get()
+
+
+def bitonic(device: Device, keys: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    out = bitonic_sort(device, Workspace(device), "test", upload(device, keys))
+    return out[0].get(), out[1].get()
+
+
+@pytest.mark.parametrize("n", RADIX_SIZES)
+def test_radix_random(shaped_device: Device, n: int) -> None:
+    keys = np.random.default_rng(n).integers(0, 2**32, n, dtype=np.uint32)
+    check(keys, radix(shaped_device, keys, 32))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_bitonic_random(shaped_device: Device, n: int) -> None:
+    keys = np.random.default_rng(n).integers(0, 2**32, n, dtype=np.uint32)
+    check(keys, bitonic(shaped_device, keys))
+
+
+@pytest.mark.parametrize("bits", [1, 4, 5, 11, 12, 22, 23, 31])
+def test_radix_few_bits_is_stable(shaped_device: Device, bits: int) -> None:
+    keys = np.random.default_rng(bits).integers(0, 2**bits, 5000, dtype=np.uint32)
+    check(keys, radix(shaped_device, keys, bits))
+
+
+@pytest.mark.parametrize("value", [0, 1, 0x7FFFFFFF, 0xFFFFFFFF])
+def test_equal_keys_keep_their_order(shaped_device: Device, value: int) -> None:
+    keys = np.full(1500, value, np.uint32)
+    check(keys, radix(shaped_device, keys, 32))
+    check(keys, bitonic(shaped_device, keys))
+
+
+def test_positive_floats_sort_as_their_bits(shaped_device: Device) -> None:
+    depths = np.random.default_rng(0).lognormal(0, 5, 3000).astype(np.float32)
+    check(depths.view(np.uint32), radix(shaped_device, depths.view(np.uint32), 31))
+
+
+def test_sort_takes_the_one_that_wins(device: Device) -> None:
+    for n in (BITONIC_WINS[device.kind], BITONIC_WINS[device.kind] + 1):
+        keys = np.random.default_rng(n).integers(0, 1000, n, dtype=np.uint32)
+        out = sort(device, Workspace(device), "test", upload(device, keys), 10)
+        check(keys, (out[0].get(), out[1].get()))
+
+
+def test_bitonic_refuses_more_than_local_memory_holds(device: Device) -> None:
+    with pytest.raises(ValueError, match="at most"):
+        bitonic(device, np.zeros(BITONIC_MAX + 1, np.uint32))
