@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
+
+MAX_SH_DEGREE = 3
 
 
 @dataclass(eq=False)
@@ -33,3 +36,37 @@ class Gaussians:
     def sh_degree(self) -> int:
         """0 to 3."""
         return round(float(np.sqrt(self.sh.shape[1]))) - 1
+
+    def check(self) -> None:
+        """Raise ValueError naming the array whose dtype or shape is not as the class says."""
+        count = len(self.means)
+        coefficients = self.sh.shape[1] if self.sh.ndim == 3 else 0
+        if coefficients not in [(degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1)]:
+            raise ValueError(f"sh has shape {self.sh.shape}, expected (N, 1, 4, 9 or 16, 3)")
+        shapes = {
+            "means": (count, 3),
+            "quaternions": (count, 4),
+            "log_scales": (count, 3),
+            "opacity_logits": (count,),
+            "sh": (count, coefficients, 3),
+        }
+        for name, shape in shapes.items():
+            array: Float32 = getattr(self, name)
+            if array.dtype != np.float32 or array.shape != shape:
+                raise ValueError(f"{name} is {array.dtype} {array.shape}, expected float32 {shape}")
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Gaussians:
+        """Read a 3DGS PLY, see `clsplat.ply.read`. Raises InputError naming the file and the trouble."""
+        from clsplat.ply import read
+
+        return read(path)
+
+    def save(self, path: str | os.PathLike[str], *, sh_degree: int | None = None) -> None:
+        """Write the 3DGS PLY that every tool reads, atomically, see `clsplat.ply.write`.
+
+        sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given.
+        """
+        from clsplat.ply import write
+
+        write(path, self, sh_degree=sh_degree)

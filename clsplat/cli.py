@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: what each verb takes. What it does is in `clsplat.verbs`, the training's defaults in `config`.
+
+Exit status: 0 done, 1 the work failed, 2 the call or its input is wrong, 130 interrupted. Trouble is one line on
+standard error; CLSPLAT_DEBUG=1 shows the traceback as well.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast, get_args, get_origin
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
+
+from clsplat.config import TrainConfig
+from clsplat.errors import ClsplatError
+
+Flag = Annotated[bool, FlagCreatePairsOff]
+Output = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
+Device = Annotated[str | None, arg(metavar="DEVICE")]
+
+
+@dataclass(frozen=True)
+class Devices:
+    """List the OpenCL devices."""
+
+    json: Flag = False
+    """Print a JSON array instead of the table."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable."""
+
+    output: Output
+    """Folder for everything the demo makes."""
+    device: Device = None
+    """OpenCL device: an index of `clsplat devices`, cpu, gpu, or a part of its name. The best one if not given."""
+    json: Flag = False
+    """Print the evaluation as JSON on standard output."""
+
+
+@dataclass(frozen=True)
+class Sfm:
+    """Turn a folder of photos into a scene: COLMAP's cameras and points, and the undistorted images."""
+
+    photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
+    """Folder with the photos; sub-folders are searched too."""
+    output: Output
+    """Folder for the scene."""
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Match every pair of photos, or neighbours in the order of their names only (for video frames); auto is every
+    pair up to 100 photos."""
+    camera_model: Annotated[str, arg(metavar="MODEL")] = "OPENCV"
+    """COLMAP's model of the lens; the scene's images are undistorted with it."""
+    threads: Annotated[int | None, arg(metavar="INT")] = None
+    """CPU threads; all cores if not given."""
+    seed: int = 0
+    """Seed of the robust estimators."""
+    overwrite: Flag = False
+    """Replace a scene in the output folder that was made of other photos."""
+    json: Flag = False
+    """Print what was recovered as JSON, as in the scene's sfm.json."""
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a scene. Ctrl-C writes a checkpoint first; --resume goes on from the latest.
+
+    With --resume the settings of the run hold, and a flag that is given changes one.
+    """
+
+    output: Output
+    """Folder for the run: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/, test/."""
+    scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None
+    """Folder with the scene: COLMAP, Blender, nerfstudio or instant-ngp. With --resume it need not be given."""
+    resume: Flag = False
+    """Go on with the run in the output folder."""
+    overwrite: Flag = False
+    """Replace the run in the output folder."""
+    device: Device = None
+    """OpenCL device: an index of `clsplat devices`, cpu, gpu, or a part of its name. The best one if not given."""
+    json: Flag = False
+    """Print the final evaluation as JSON on standard output."""
+    config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS where the extra is installed.
+
+    Given a run, eval.json and test/ are written anew.
+    """
+
+    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
+    """A run's folder or a model file."""
+    scene: Annotated[Path | None, arg(metavar="SCENE")] = None
+    """Folder with the scene; the one the run was trained on if not given."""
+    test_every: Annotated[int | None, arg(metavar="INT")] = None
+    """Every n-th view by name is held out; as the run has it, or 8."""
+    resolution: Annotated[int | None, arg(metavar="INT")] = None
+    """Longest image side; as the run has it, or 0: the images' size up to 1600."""
+    background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
+    """Background behind the Gaussians and behind images with alpha; as the run has it, or black."""
+    device: Device = None
+    """OpenCL device: an index of `clsplat devices`, cpu, gpu, or a part of its name. The best one if not given."""
+    json: Flag = False
+    """Print the result as JSON, as in eval.json."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a model from the cameras of a COLMAP model, an image for each of its images."""
+
+    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
+    """A run's folder or a model file."""
+    cameras: Annotated[Path, arg(metavar="SPARSE_DIR")]
+    """Folder with cameras and images, bin or txt, of a COLMAP model."""
+    output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
+    """Where the images go, such as 'out/{name}.exr': {name} is the image's name without extension, with its
+    sub-folders. The extension chooses 8-bit .png or float .exr."""
+    background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
+    """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
+    alpha: Flag = False
+    """Write alpha too, and no background: premultiplied in EXR, straight in PNG."""
+    width: Annotated[int | None, arg(metavar="INT")] = None
+    """Width in pixels; follows from the height, or from the camera, if not given."""
+    height: Annotated[int | None, arg(metavar="INT")] = None
+    """Height in pixels; follows from the width, or from the camera, if not given."""
+    scale: float = 1.0
+    """Size relative to the camera's, where neither width nor height is given."""
+    device: Device = None
+    """OpenCL device: an index of `clsplat devices`, cpu, gpu, or a part of its name. The best one if not given."""
+    json: Flag = False
+    """Print the images written as JSON: name, path, width, height, seconds."""
+
+
+Verb = Devices | Demo | Sfm | Train | Eval | Render
+Commands = (
+    Annotated[Devices, subcommand("devices")]
+    | Annotated[Demo, subcommand("demo")]
+    | Annotated[Sfm, subcommand("sfm")]
+    | Annotated[Train, subcommand("train")]
+    | Annotated[Eval, subcommand("eval")]
+    | Annotated[Render, subcommand("render")]
+)
+DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command line, `sys.argv` if none is given; returns the exit status."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = os.environ.get("CLSPLAT_DEBUG", "") not in ("", "0")
+    with warnings.catch_warnings():
+        warnings.showwarning = cast("Any", _show_warning)
+        if not debug:
+            warnings.simplefilter("ignore")
+        warnings.filterwarnings("always", category=UserWarning, module=r"clsplat\b|__main__")
+        try:
+            if arguments == ["--version"]:
+                import clsplat
+
+                print(f"clsplat {clsplat.__version__}")
+                return 0
+            from clsplat import verbs
+
+            return verbs.run(parse(arguments))
+        except SystemExit as error:  # --help, or a wrong call that has been reported
+            return error.code if isinstance(error.code, int) else 1
+        except KeyboardInterrupt:
+            if debug:
+                traceback.print_exc()
+            print("clsplat: interrupted", file=sys.stderr)
+            return 130
+        except BrokenPipeError:  # the reader of our output has gone, as `| head` does
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
+        except (ClsplatError, OSError, MemoryError) as error:
+            if debug:
+                traceback.print_exc()
+            print(f"clsplat: error: {one_line(error)}", file=sys.stderr)
+            return error.exit_status if isinstance(error, ClsplatError) else 1
+
+
+def parse(arguments: Sequence[str]) -> Verb:
+    """The verb that the command line asks for. Raises SystemExit, with the trouble reported, as argparse does."""
+    verb: Verb = _tyro(Commands, arguments, prog="clsplat", description=DESCRIPTION)
+    if isinstance(verb, Train) and verb.resume:
+        from clsplat.runs import Run, check_output
+
+        check_output(verb.output, resume=True, overwrite=verb.overwrite)
+        # Once more, with the run's settings as the defaults: only flags that are given differ from them.
+        earlier = Run.open(verb.output)
+        default = replace(verb, config=earlier.config, resume=False, overwrite=False)
+        verb = replace(_tyro(Train, arguments[1:], prog="clsplat train", default=default), resume=True)
+    return verb
+
+
+def _tyro(kind: Any, arguments: Sequence[str], **options: Any) -> Any:
+    """`tyro.cli` with our lists, and its report of a wrong call made one line."""
+    report = io.StringIO()
+    helping = not {"-h", "--help"}.isdisjoint(arguments)
+    try:
+        with _comma_separated(), contextlib.redirect_stderr(report), _columns(None if helping else 10_000):
+            return tyro.cli(kind, args=list(arguments), **options)
+    except SystemExit as error:
+        if error.code == 2:
+            print(f"clsplat: error: {_unboxed(report.getvalue())}", file=sys.stderr)
+        else:
+            sys.stderr.write(report.getvalue())
+        raise
+
+
+def _comma_separated() -> tyro.constructors.ConstructorRegistry:
+    """Lists of steps are written 500,1000,2000; tyro by itself wants spaces."""
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.primitive_rule
+    def steps(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        if get_origin(info.type) is not tuple or not set(get_args(info.type)) <= {int, Ellipsis}:
+            return None
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="STEP,STEP,...",
+            instance_from_str=lambda words: _steps(words[0]),
+            is_instance=lambda value: isinstance(value, tuple),
+            str_from_instance=lambda value: [",".join(map(str, value))],
+        )
+
+    return registry
+
+
+def _steps(text: str) -> tuple[int, ...]:
+    try:
+        steps = tuple(int(word) for word in text.split(",") if word.strip())
+    except ValueError:
+        raise ValueError(f"{text!r} is not a list of steps, expected such as 500,1000,2000") from None
+    return steps
+
+
+@contextlib.contextmanager
+def _columns(count: int | None) -> Iterator[None]:
+    """Make the terminal look `count` columns wide: a report to be joined to one line must not be wrapped first."""
+    before = os.environ.get("COLUMNS")
+    if count is not None:
+        os.environ["COLUMNS"] = str(count)
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ["COLUMNS"] = before
+        elif count is not None:
+            del os.environ["COLUMNS"]
+
+
+def _unboxed(report: str) -> str:
+    """The message of one of tyro's boxes as one line: its frame and its further advice taken off."""
+    words: list[str] = []
+    for line in report.splitlines():
+        text = line.strip("│ ").strip()
+        if text.startswith("╭") or not text:
+            continue
+        if text.startswith(("─", "╰")):
+            break
+        words.append(text)
+    return " ".join(" ".join(words).split()) or "the call is wrong, see clsplat --help"
+
+
+def one_line(error: BaseException) -> str:
+    """The error's message without line breaks."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _show_warning(message: Warning | str, *_: Any) -> None:
+    """In place of `warnings.showwarning`, which would print the line of code as well."""
+    print(f"clsplat: warning: {' '.join(str(message).split())}", file=sys.stderr)

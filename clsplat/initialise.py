@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Gaussians that training starts from: one a point, isotropic, as wide as the way to its neighbours."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.errors import InputError
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+INITIAL_OPACITY = 0.1
+MIN_SQUARED_DISTANCE = 1e-7
+"""The authors' floor under the mean squared distance, world units squared: keeps points that coincide alive."""
+NEIGHBOURS = 3
+
+Float64 = NDArray[np.float64]
+
+
+def from_points(points: ArrayLike, colors: ArrayLike, *, sh_degree: int) -> Gaussians:
+    """One Gaussian a point.
+
+    points (N, 3), world units; colors (N, 3), float in [0, 1] or uint8; sh_degree 0 to 3: the higher coefficients
+    are there and 0. The standard deviation is the root of the mean squared distance to the three nearest other
+    points (fewer where there are fewer; a lone point gets the floor). Opacity 0.1, quaternions 1 0 0 0.
+    Raises InputError for no points or points that are not finite, ValueError for wrong shapes.
+    """
+    xyz = np.asarray(points, np.float64)
+    rgb: NDArray[Any] = np.asarray(colors)
+    if rgb.dtype == np.uint8:
+        rgb = rgb / 255.0
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape:
+        raise ValueError(f"points {xyz.shape} and colors {rgb.shape}: expected (N, 3) both")
+    if not 0 <= sh_degree <= MAX_SH_DEGREE:
+        raise ValueError(f"sh_degree {sh_degree}: expected 0 to {MAX_SH_DEGREE}")
+    count = len(xyz)
+    if count == 0:
+        raise InputError("no points to start from, expected at least one")
+    if not np.isfinite(xyz).all():
+        raise InputError(f"point {int(np.argmin(np.isfinite(xyz).all(axis=1)))} is not finite")
+
+    log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), MIN_SQUARED_DISTANCE))
+    quaternions = np.zeros((count, 4), np.float32)
+    quaternions[:, 0] = 1
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
+    sh[:, 0] = (rgb - 0.5) / SH_C0
+    return Gaussians(
+        means=np.ascontiguousarray(xyz, np.float32),
+        quaternions=quaternions,
+        log_scales=np.repeat(log_scales.astype(np.float32)[:, None], 3, axis=1),
+        opacity_logits=np.full(count, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), np.float32),
+        sh=sh,
+    )
+
+
+def mean_squared_distance(points: Float64) -> Float64:
+    """Mean squared distance to the three nearest other points, (N,); points (N, 3). 0 for a lone point.
+
+    A point that coincides with others counts them as neighbours at distance 0, as the authors' code does.
+    """
+    neighbours = min(NEIGHBOURS, len(points) - 1)
+    if neighbours == 0:
+        return np.zeros(len(points))
+    tree: Any = import_module("scipy.spatial").cKDTree(points)  # scipy has no types
+    distances, _ = tree.query(points, k=neighbours + 1)
+    # Sorted, so the first is 0: the point itself or one at the same place, which is the same distance.
+    mean: Float64 = np.mean(np.square(distances[:, 1:]), axis=1)
+    return mean
+
+
+def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """Points uniform in a box and their colours, for a scene without points.
+
+    low, high (3,): the box's corners, world units. Returns points (count, 3) and colors (count, 3): grey with the
+    authors' trace of noise.
+    """
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    points = low + rng.random((count, 3)) * (high - low)
+    colors = 0.5 + SH_C0 * rng.random((count, 3)) / 255
+    return points, colors

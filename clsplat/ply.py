@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The 3DGS model file: a PLY with one vertex a Gaussian, as the paper's authors wrote it and every tool reads it.
+
+Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. f_rest is channel-major: all higher
+coefficients of red, then of green, then of blue. Files are streamed in blocks of rows, so that reading or writing
+costs the model's own memory and little more.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError
+from clsplat.files import atomic_writer
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+
+BLOCK_ROWS = 1 << 15
+MAX_HEADER_LINES = 10_000
+
+TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+POSITION = ("x", "y", "z")
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALE = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+REQUIRED = (*POSITION, *DC, "opacity", *SCALE, *ROTATION)
+
+
+@dataclass
+class Element:
+    """An element of the header: rows of `properties`, (name, NumPy type without byte order), "" for a list."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def has_list(self) -> bool:
+        return any(code == "" for _, code in self.properties)
+
+
+@dataclass
+class Header:
+    """format: "ascii" or a key of BYTE_ORDERS; size: the header's length in bytes, `end_header` included."""
+
+    format: str
+    elements: list[Element]
+    size: int
+
+    def row_type(self, element: Element) -> np.dtype[Any]:
+        """The packed record of one row of a binary file."""
+        order = BYTE_ORDERS[self.format]
+        return np.dtype([(name, order + code) for name, code in element.properties])
+
+
+def read(path: str | os.PathLike[str]) -> Gaussians:
+    """Read a 3DGS PLY: ascii or binary of either byte order, properties in any order, of any numeric type.
+
+    SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45). Other properties are ignored. Bytes after the
+    data give a warning. Raises InputError, one line with the path: not a PLY, truncated, a property missing, values
+    that are not finite, no Gaussians, no such file.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            header = read_header(file, path)
+            vertex, skipped = _vertex_element(header, path)
+            rest = _check_properties(vertex, path)
+            if vertex.count == 0:
+                raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
+            if header.format == "ascii":
+                blocks = _ascii_blocks(file, header, vertex, skipped, path)
+            else:
+                blocks = _binary_blocks(file, header, vertex, skipped, path)
+            return _assemble(blocks, vertex.count, rest, path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file, expected a 3DGS PLY") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder, expected a 3DGS PLY") from None
+
+
+def write(path: str | os.PathLike[str], gaussians: Gaussians, *, sh_degree: int | None = None) -> None:
+    """Write a binary little-endian 3DGS PLY of float32, atomically; the same Gaussians give the same bytes.
+
+    sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given. Raises ValueError
+    where it is lower than the model's, or an array is not as `Gaussians` says.
+    """
+    gaussians.check()
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    if not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
+        raise ValueError(f"sh_degree {degree}: expected {gaussians.sh_degree} (the model's) to {MAX_SH_DEGREE}")
+    stored, padded = gaussians.sh.shape[1] - 1, (degree + 1) ** 2 - 1
+    rest_names = [f"f_rest_{index}" for index in range(3 * padded)]
+    names = [*POSITION, "nx", "ny", "nz", *DC, *rest_names, "opacity", *SCALE, *ROTATION]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    lines += [f"property float {name}" for name in names] + ["end_header", ""]
+    with atomic_writer(path) as file:
+        file.write("\n".join(lines).encode("ascii"))
+        for start in range(0, len(gaussians), BLOCK_ROWS):
+            rows = slice(start, start + BLOCK_ROWS)
+            sh = gaussians.sh[rows]
+            block = np.zeros((len(sh), len(names)), "<f4")
+            block[:, 0:3] = gaussians.means[rows]
+            block[:, 6:9] = sh[:, 0]
+            rest = block[:, 9 : 9 + 3 * padded]
+            for channel in range(3):
+                rest[:, channel * padded : channel * padded + stored] = sh[:, 1:, channel]
+            block[:, -8] = gaussians.opacity_logits[rows]
+            block[:, -7:-4] = gaussians.log_scales[rows]
+            block[:, -4:] = gaussians.quaternions[rows]
+            file.write(block.data)
+
+
+def read_header(file: BinaryIO, path: Path) -> Header:
+    """Read the header and leave `file` at the first byte after it. Raises InputError."""
+    if file.read(3) != b"ply" or file.readline(16).strip():
+        raise InputError(f"{path}: not a PLY file (it does not begin with a line 'ply')")
+    form = ""
+    elements: list[Element] = []
+    for _ in range(MAX_HEADER_LINES):
+        line = file.readline(4096)
+        if not line.endswith(b"\n"):
+            break
+        words = line.decode("ascii", "replace").split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words == ["end_header"]:
+            if form not in ("ascii", *BYTE_ORDERS):
+                expected = "ascii, binary_little_endian or binary_big_endian"
+                raise InputError(f"{path}: PLY header has the format {form or 'missing'!r}, expected {expected}")
+            return Header(form, elements, file.tell())
+        try:
+            match words:
+                case ["format", name, _]:
+                    form = name
+                case ["element", name, count]:
+                    elements.append(Element(name, _count(count)))
+                case ["property", "list", _, _, name]:
+                    elements[-1].properties.append((name, ""))
+                case ["property", kind, name]:
+                    elements[-1].properties.append((name, TYPES[kind]))
+                case _:
+                    raise ValueError
+        except (ValueError, KeyError, IndexError):
+            raise InputError(f"{path}: PLY header has a line that is none: {' '.join(words)[:80]!r}") from None
+    raise InputError(f"{path}: PLY header is truncated or damaged (no line 'end_header')")
+
+
+def _count(text: str) -> int:
+    count = int(text)
+    if count < 0:
+        raise ValueError
+    return count
+
+
+def _vertex_element(header: Header, path: Path) -> tuple[Element, list[Element]]:
+    """The vertex element and those stored before it."""
+    names = [element.name for element in header.elements]
+    if "vertex" not in names:
+        found = ", ".join(names) or "none"
+        raise InputError(f"{path}: PLY has no element 'vertex' (elements: {found})")
+    at = names.index("vertex")
+    return header.elements[at], header.elements[:at]
+
+
+def _check_properties(vertex: Element, path: Path) -> int:
+    """The number of f_rest properties. Raises InputError where the layout is not a 3DGS model's."""
+    names = [name for name, _ in vertex.properties]
+    if "packed_position" in names:
+        raise InputError(f"{path}: a compressed PLY (packed_position), expected the 3DGS layout with x y z f_dc_*")
+    missing = [name for name in REQUIRED if name not in names]
+    if missing:
+        noun = "property" if len(missing) == 1 else "properties"
+        raise InputError(f"{path}: PLY lacks the {noun} {' '.join(missing)}, expected a 3DGS model")
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
+        raise InputError(f"{path}: PLY has the property {double[0]} twice")
+    if vertex.has_list:
+        raise InputError(f"{path}: PLY has a list property in its vertices, expected numbers only")
+    rest = sum(name.startswith("f_rest_") for name in names)
+    counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 1)]
+    if rest not in counts:
+        raise InputError(f"{path}: PLY has {rest} f_rest properties, expected {', '.join(map(str, counts))}")
+    for index in range(rest):
+        if f"f_rest_{index}" not in names:
+            raise InputError(f"{path}: PLY lacks the property f_rest_{index}, though it has {rest} of f_rest")
+    return rest
+
+
+Block = dict[str, NDArray[Any]]
+
+
+def _binary_blocks(
+    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path
+) -> Iterator[Block]:
+    """Columns by name, a block of rows at a time. The sizes are checked before anything is allocated for them."""
+    start = header.size
+    for element in skipped:
+        if element.has_list:
+            raise InputError(f"{path}: PLY has lists (element {element.name!r}) before its vertices, not supported")
+        start += element.count * header.row_type(element).itemsize
+    row = header.row_type(vertex)
+    need, have = vertex.count * row.itemsize, max(0, os.fstat(file.fileno()).st_size - start)
+    if have < need:
+        whole = have // row.itemsize
+        raise InputError(
+            f"{path}: truncated: {vertex.count} Gaussians need {need} bytes, {have} are there ({whole} Gaussians)"
+        )
+    if have > need and header.elements[-1] is vertex:
+        warnings.warn(f"{path}: {have - need} bytes after the last Gaussian ignored", stacklevel=4)
+    file.seek(start)
+    for first in range(0, vertex.count, BLOCK_ROWS):
+        count = min(BLOCK_ROWS, vertex.count - first)
+        data = file.read(count * row.itemsize)
+        if len(data) != count * row.itemsize:
+            raise InputError(f"{path}: truncated while it was read")
+        rows = np.frombuffer(data, row)
+        yield {name: rows[name] for name, _ in vertex.properties}
+
+
+def _ascii_blocks(
+    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path
+) -> Iterator[Block]:
+    """Columns by name as float64, a block of lines at a time."""
+    lines = (line for line in file if not line.isspace())
+    for element in skipped:
+        for _ in islice(lines, element.count):
+            pass
+    width = len(vertex.properties)
+    for first in range(0, vertex.count, BLOCK_ROWS):
+        count = min(BLOCK_ROWS, vertex.count - first)
+        rows = [line.split() for line in islice(lines, count)]
+        for index, words in enumerate(rows):
+            if len(words) != width:
+                raise InputError(f"{path}: Gaussian {first + index} has {len(words)} values, expected {width}")
+        if len(rows) < count:
+            raise InputError(f"{path}: truncated: {vertex.count} Gaussians expected, {first + len(rows)} are there")
+        try:
+            table = np.array(rows, dtype="S").astype(np.float64)
+        except ValueError as error:
+            raise InputError(f"{path}: a value after Gaussian {first} is no number ({error})") from None
+        yield {name: table[:, index] for index, (name, _) in enumerate(vertex.properties)}
+    if header.elements[-1] is vertex and next(lines, None) is not None:
+        warnings.warn(f"{path}: text after the last Gaussian ignored", stacklevel=4)
+
+
+def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gaussians:
+    """Gather the columns into arrays and refuse values that are not finite."""
+    higher = rest // 3
+    # The first block is read before anything is allocated: an ascii file's count is only a claim.
+    first_block = next(blocks)
+    means, scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    quaternions, opacities = np.empty((count, 4), np.float32), np.empty(count, np.float32)
+    sh = np.empty((count, 1 + higher, 3), np.float32)
+    columns: dict[str, NDArray[np.float32]] = {"opacity": opacities}
+    for names, array in ((POSITION, means), (SCALE, scales), (ROTATION, quaternions), (DC, sh[:, 0])):
+        columns.update({name: array[:, index] for index, name in enumerate(names)})
+    for index in range(rest):
+        columns[f"f_rest_{index}"] = sh[:, 1 + index % higher, index // higher]
+
+    start, bad_positions, first_bad = 0, 0, -1
+    other: tuple[int, str] | None = None
+    block: Block | None = first_block
+    while block is not None:
+        stop = start + len(block["x"])
+        bad = np.zeros(stop - start, bool)
+        for name, column in columns.items():
+            with np.errstate(over="ignore", invalid="ignore"):  # a double beyond float32 becomes inf, refused below
+                column[start:stop] = block[name]
+            not_finite = ~np.isfinite(column[start:stop])
+            if name in POSITION:
+                bad |= not_finite
+            elif other is None and not_finite.any():
+                other = (start + int(not_finite.argmax()), name)
+        if bad.any():
+            first_bad = first_bad if bad_positions else start + int(bad.argmax())
+            bad_positions += int(bad.sum())
+        start, block = stop, next(blocks, None)
+
+    if bad_positions:
+        raise InputError(
+            f"{path}: {bad_positions} of {count} Gaussians have a position that is not finite, the first is {first_bad}"
+        )
+    if other is not None:
+        raise InputError(f"{path}: {other[1]} of Gaussian {other[0]} is not finite")
+    return Gaussians(means, quaternions, scales, opacities, sh)

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Progress on standard error: a live bar on a terminal, a plain line every ten seconds elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Protocol, TextIO
+
+PLAIN_INTERVAL = 10.0
+"""Seconds between plain lines."""
+SMOOTHING = 0.1
+"""Weight of the newest report in the shown PSNR and loss, which jump from view to view."""
+
+
+class StepReport(Protocol):
+    """What is shown of a training step, `clsplat.training.StepReport` for one; seconds of training so far."""
+
+    @property
+    def step(self) -> int: ...
+    @property
+    def loss(self) -> float: ...
+    @property
+    def psnr(self) -> float: ...
+    @property
+    def gaussians(self) -> int: ...
+    @property
+    def seconds(self) -> float: ...
+
+
+class TrainProgress:
+    """A context manager; call it with each `StepReport`, every step or now and then.
+
+    total: the last step; stream: standard error unless given; clock: seconds, for tests.
+    """
+
+    def __init__(self, total: int, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self.total, self.clock = total, clock
+        self.stream = stream if stream is not None else sys.stderr
+        self.first: StepReport | None = None
+        self.last: StepReport | None = None
+        self.loss, self.psnr = 0.0, 0.0
+        self.printed_at, self.printed_step = clock(), -1
+        self.live: Progress | None = None
+        if self.stream.isatty():
+            columns = (TextColumn("{task.fields[numbers]}"), BarColumn(bar_width=None), TimeRemainingColumn())
+            console = Console(file=self.stream)
+            self.live = Progress(*columns, console=console, refresh_per_second=4, speed_estimate_period=60)
+            self.task = self.live.add_task("train", total=total, numbers=f"step 0/{total}")
+
+    def __enter__(self) -> TrainProgress:  # noqa: PYI034  # Self came with 3.11
+        if self.live is not None:
+            self.live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.live is not None:
+            self.live.stop()
+        elif self.last is not None and self.last.step != self.printed_step:
+            self._print_line()
+
+    def __call__(self, report: StepReport) -> None:
+        if self.first is None:
+            self.first = report
+            self.loss, self.psnr = report.loss, report.psnr
+        self.last = report
+        self.loss += SMOOTHING * (report.loss - self.loss)
+        self.psnr += SMOOTHING * (report.psnr - self.psnr)
+        if self.live is not None:
+            self.live.update(self.task, completed=report.step, numbers=self._numbers())
+        elif self.clock() - self.printed_at >= PLAIN_INTERVAL:
+            self._print_line()
+
+    def rate(self) -> float:
+        """Steps a second since the first report; 0 before there are two."""
+        if self.first is None or self.last is None or self.last.seconds <= self.first.seconds:
+            return 0.0
+        return (self.last.step - self.first.step) / (self.last.seconds - self.first.seconds)
+
+    def _numbers(self) -> str:
+        assert self.last is not None
+        return (
+            f"step {self.last.step}/{self.total}  loss {self.loss:.4f}  PSNR {self.psnr:.2f}  "
+            f"{self.last.gaussians:,} Gaussians  {self.rate():.1f} it/s"
+        )
+
+    def _print_line(self) -> None:
+        assert self.last is not None
+        rate = self.rate()
+        left = duration((self.total - self.last.step) / rate) if rate > 0 else "?"
+        print(f"{self._numbers()}  {left} left", file=self.stream, flush=True)
+        self.printed_at, self.printed_step = self.clock(), self.last.step
+
+
+class StageProgress:
+    """For work in named stages: call it with the stage and the fraction done, or None where that is unknown."""
+
+    def __init__(self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+        self.stream = stream if stream is not None else sys.stderr
+        self.clock = clock
+        self.stage, self.printed_at = "", clock()
+
+    def __call__(self, stage: str, fraction: float | None = None) -> None:
+        now = self.clock()
+        if stage != self.stage or now - self.printed_at >= PLAIN_INTERVAL or fraction == 1.0:
+            text = stage if fraction is None else f"{stage} {100 * fraction:.0f} %"
+            print(text, file=self.stream, flush=True)
+            self.stage, self.printed_at = stage, now
+
+
+def duration(seconds: float) -> str:
+    """h:mm:ss or m:ss."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One step of Adam: float64 twin of kernels/adam.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+
+
+def adam(
+    parameters: Float64,
+    gradients: Float64,
+    first: Float64,
+    second: Float64,
+    step: int,
+    rate: float,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-15,
+) -> tuple[Float64, Float64, Float64]:
+    """Eq. (42): new parameters and both moments, arrays of one shape; step counts from 1."""
+    first = beta1 * first + (1 - beta1) * gradients
+    second = beta2 * second + (1 - beta2) * gradients**2
+    mean = first / (1 - beta1**step)
+    spread = np.sqrt(second / (1 - beta2**step))
+    return parameters - rate * mean / (spread + epsilon), first, second

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blending front to back and its gradient, without tiles: float64 twin of kernels/blend*.cl.
+
+Equation numbers are those of docs/gradients.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.reference.project import ALPHA_MIN, Projected
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+ALPHA_MAX = 0.99
+TRANSMITTANCE_MIN = 1e-4
+
+BOX_SLACK = 0.1
+"""Added to the reach q <= 2 ln(255 o) of a Gaussian's box, so that alphas down to 5 % under 1/255 are looked at
+and margins up to that are true."""
+
+
+@dataclass(frozen=True, eq=False)
+class Blended:
+    """image (H, W, 3); transmittance (H, W), what is left for the background; last (H, W), position in `order` of
+    the last Gaussian that was added, -1 for none; count (H, W), how many were added; margin (H, W), the smallest
+    relative distance of a decision to its threshold (alpha to 1/255 and to 0.99, T to 1e-4), cut at 0.05, or None.
+    """
+
+    image: Float64
+    transmittance: Float64
+    last: Int64
+    count: Int64
+    margin: Float64 | None
+
+
+@dataclass(frozen=True, eq=False)
+class BlendGradients:
+    """means2d (N, 2), abs_means2d (N, 2): per pixel of displacement, the latter the sum of the absolute values of
+    every image pixel's part; conics (N, 3): by a, b, c; opacities (N,); colors (N, 3)."""
+
+    means2d: Float64
+    abs_means2d: Float64
+    conics: Float64
+    opacities: Float64
+    colors: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """One Gaussian on the pixels of its box: rows, columns of the image; dx (1, w), dy (h, 1), pixel centre minus
+    mean; falloff (h, w) = exp(-q / 2); raw (h, w) = opacity times falloff, not yet clamped."""
+
+    rows: slice
+    columns: slice
+    dx: Float64
+    dy: Float64
+    falloff: Float64
+    raw: Float64
+
+
+def footprint(projected: Projected, gaussian: int, width: int, height: int) -> Footprint | None:
+    """Eqs. (9), (14) on the box that alpha >= 1/255 can reach, None where that misses the image."""
+    opacity = projected.opacities[gaussian]
+    reach = 2 * np.log(opacity / ALPHA_MIN) + BOX_SLACK
+    half = np.sqrt(reach * projected.covariances[gaussian, [0, 2]])
+    mean = projected.means2d[gaussian]
+    size = np.array([width, height])
+    # clipped as floats: a mean far off the image need not fit an integer
+    first = np.clip(np.ceil(mean - half - 0.5), 0, size).astype(np.int64)
+    stop = np.clip(np.floor(mean + half - 0.5) + 1, 0, size).astype(np.int64)
+    if (first >= stop).any():
+        return None
+    dx = np.arange(first[0], stop[0])[None, :] + 0.5 - mean[0]
+    dy = np.arange(first[1], stop[1])[:, None] + 0.5 - mean[1]
+    a, b, c = projected.conics[gaussian]
+    falloff = np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+    return Footprint(slice(first[1], stop[1]), slice(first[0], stop[0]), dx, dy, falloff, opacity * falloff)
+
+
+def blend(
+    projected: Projected,
+    order: Int64,
+    width: int,
+    height: int,
+    background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
+    margins: bool = False,
+) -> Blended:
+    """Eqs. (14) to (16): `order` (M,) lists the rows of `projected` front to back."""
+    image = np.zeros((height, width, 3))
+    transmittance = np.ones((height, width))
+    alive = np.ones((height, width), np.bool_)
+    last = np.full((height, width), -1, np.int64)
+    count = np.zeros((height, width), np.int64)
+    margin = np.full((height, width), BOX_SLACK / 2)
+    for position, gaussian in enumerate(order):
+        splat = footprint(projected, int(gaussian), width, height)
+        if splat is None:
+            continue
+        box = (splat.rows, splat.columns)
+        if not alive[box].any():
+            continue
+        alpha = np.minimum(ALPHA_MAX, splat.raw)
+        seen = alive[box] & (alpha >= ALPHA_MIN)
+        after = transmittance[box] * (1 - alpha)
+        added = seen & (after > TRANSMITTANCE_MIN)
+        if margins:
+            distance = np.abs(splat.raw / ALPHA_MIN - 1)
+            distance = np.minimum(distance, np.abs(splat.raw / ALPHA_MAX - 1))
+            distance = np.minimum(distance, np.where(seen, np.abs(after / TRANSMITTANCE_MIN - 1), np.inf))
+            margin[box] = np.where(alive[box], np.minimum(margin[box], distance), margin[box])
+        weight = np.where(added, transmittance[box] * alpha, 0.0)
+        image[box] += weight[:, :, None] * projected.colors[gaussian]
+        transmittance[box] = np.where(added, after, transmittance[box])
+        last[box] = np.where(added, position, last[box])
+        count[box] += added
+        alive[box] &= added | ~seen
+    image += transmittance[:, :, None] * np.asarray(background, np.float64)
+    return Blended(image, transmittance, last, count, margin if margins else None)
+
+
+def blend_grad(
+    projected: Projected,
+    order: Int64,
+    width: int,
+    height: int,
+    background: Sequence[float] | Float64,
+    d_image: Float64,
+) -> BlendGradients:
+    """Eqs. (22) to (29), back to front: d_image (H, W, 3) is dL/dC."""
+    forward = blend(projected, order, width, height, background)
+    transmittance = forward.transmittance.copy()
+    behind = np.broadcast_to(np.asarray(background, np.float64), (height, width, 3)).copy()
+    number = len(projected.depths)
+    gradients = BlendGradients(
+        means2d=np.zeros((number, 2)),
+        abs_means2d=np.zeros((number, 2)),
+        conics=np.zeros((number, 3)),
+        opacities=np.zeros(number),
+        colors=np.zeros((number, 3)),
+    )
+    for position in range(len(order) - 1, -1, -1):
+        gaussian = int(order[position])
+        splat = footprint(projected, gaussian, width, height)
+        if splat is None:
+            continue
+        box = (splat.rows, splat.columns)
+        alpha = np.minimum(ALPHA_MAX, splat.raw)
+        added = (alpha >= ALPHA_MIN) & (position <= forward.last[box])
+        if not added.any():
+            continue
+        alpha = np.where(added, alpha, 0.0)
+        color = projected.colors[gaussian]
+        transmittance[box] /= 1 - alpha  # now the transmittance in front of this Gaussian
+        weight = transmittance[box] * alpha
+        d_alpha = transmittance[box] * (d_image[box] * (color - behind[box])).sum(axis=2)
+        gradients.colors[gaussian] = (weight[:, :, None] * d_image[box]).sum(axis=(0, 1))
+        behind[box] += alpha[:, :, None] * (color - behind[box])
+
+        free = added & (splat.raw <= ALPHA_MAX)  # under the clamp alpha moves with its Gaussian
+        g = np.where(free, d_alpha * alpha, 0.0)
+        dx, dy = splat.dx, splat.dy
+        a, b, c = projected.conics[gaussian]
+        by_x, by_y = g * (a * dx + b * dy), g * (b * dx + c * dy)
+        gradients.means2d[gaussian] = by_x.sum(), by_y.sum()
+        gradients.abs_means2d[gaussian] = np.abs(by_x).sum(), np.abs(by_y).sum()
+        gradients.conics[gaussian] = (
+            -0.5 * (g * dx * dx).sum(),
+            -(g * dx * dy).sum(),
+            -0.5 * (g * dy * dy).sum(),
+        )
+        gradients.opacities[gaussian] = np.where(free, d_alpha * splat.falloff, 0.0).sum()
+    return gradients

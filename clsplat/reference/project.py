@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Projection of Gaussians to the image plane, and its gradient: float64 twin of kernels/project*.cl.
+
+Equation numbers are those of docs/gradients.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.reference.sh import sh_basis, sh_basis_grad
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+ALPHA_MIN = 1.0 / 255.0
+LOW_PASS = 0.3
+FRUSTUM_MARGIN = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """N Gaussians on the image plane; rows that are not visible are zero.
+
+    means2d (N, 2): pixels; covariances (N, 3): sxx, sxy, syy in px^2; conics (N, 3): a, b, c of the inverse,
+    q = a dx^2 + 2 b dx dy + c dy^2; whitening (N, 3): l11, l12, l22 of eq. (8); half_extents (N, 2): pixels, of
+    the box in which alpha reaches 1/255; depths (N,): z in the camera; opacities (N,): 0 to 1; colors (N, 3);
+    visible (N,): passed eq. (13). A visible Gaussian may still lie wholly off the image.
+    """
+
+    means2d: Float64
+    covariances: Float64
+    conics: Float64
+    whitening: Float64
+    half_extents: Float64
+    depths: Float64
+    opacities: Float64
+    colors: Float64
+    visible: Bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Geometry:
+    """What projection and its gradient share: p (N, 3) in the camera, ratios (N, 2) clamped x/z and y/z,
+    unclamped (N, 2) bool, jacobian (N, 2, 3), rotations (N, 3, 3) and scales (N, 3) of the Gaussians, and
+    half (N, 2, 3) = M of eq. (5)."""
+
+    p: Float64
+    ratios: Float64
+    unclamped: Bool
+    jacobian: Float64
+    rotations: Float64
+    scales: Float64
+    half: Float64
+
+
+def rotation_matrices(quaternions: Float64) -> Float64:
+    """R(q / |q|): raw quaternions (N, 4), w x y z -> (N, 3, 3). A zero quaternion gives NaN."""
+    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+
+
+def frustum_limits(camera: Camera) -> Float64:
+    """Lower and upper bound of x/z and y/z in the Jacobian, ((x, y), (x, y)): eq. (3)."""
+    size = np.array([camera.width, camera.height], np.float64)
+    focal = np.array([camera.fx, camera.fy], np.float64)
+    centre = np.array([camera.cx, camera.cy], np.float64)
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
+    return np.stack([-centre / focal - margin, (size - centre) / focal + margin])
+
+
+def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> _Geometry:
+    """Eqs. (1), (3), (4), (5)."""
+    p = means @ camera.rotation.T + camera.translation
+    z = p[:, 2]
+    raw = p[:, :2] / z[:, None]
+    low, high = frustum_limits(camera)
+    ratios = np.clip(raw, low, high)
+    jacobian = np.zeros((len(p), 2, 3))
+    jacobian[:, 0, 0] = camera.fx / z
+    jacobian[:, 1, 1] = camera.fy / z
+    jacobian[:, 0, 2] = -camera.fx * ratios[:, 0] / z
+    jacobian[:, 1, 2] = -camera.fy * ratios[:, 1] / z
+    rotations = rotation_matrices(quaternions)
+    scales = np.exp(log_scales)
+    half = jacobian @ camera.rotation @ (rotations * scales[:, None, :])
+    return _Geometry(p, ratios, (raw > low) & (raw < high), jacobian, rotations, scales, half)
+
+
+def view_directions(means: Float64, camera: Camera) -> tuple[Float64, Float64]:
+    """Unit vectors from the camera to the means (N, 3), and the distances (N, 1)."""
+    offsets = means - camera.position
+    distances: Float64 = np.linalg.norm(offsets, axis=1, keepdims=True)
+    return offsets / distances, distances
+
+
+def project(
+    means: Float64,
+    quaternions: Float64,
+    log_scales: Float64,
+    opacity_logits: Float64,
+    sh: Float64,
+    camera: Camera,
+    sh_degree: int,
+) -> Projected:
+    """Eqs. (1) to (13): arrays as in `Gaussians`, float64; sh_degree is the one in use, bands above it are unread."""
+    with np.errstate(all="ignore"):  # what overflows or divides by zero is culled below
+        geometry = _geometry(means, quaternions, log_scales, camera)
+        z = geometry.p[:, 2]
+        focal = np.array([camera.fx, camera.fy])
+        means2d = focal * geometry.p[:, :2] / z[:, None] + np.array([camera.cx, camera.cy])
+
+        m1, m2 = geometry.half[:, 0], geometry.half[:, 1]
+        length1, length2 = (m1 * m1).sum(axis=1), (m2 * m2).sum(axis=1)
+        sxx, sxy, syy = length1 + LOW_PASS, (m1 * m2).sum(axis=1), length2 + LOW_PASS
+        cross = np.cross(m1, m2)
+        det = (cross * cross).sum(axis=1) + LOW_PASS * (length1 + length2) + LOW_PASS**2
+        l11 = np.sqrt(syy / det)
+        whitening = np.stack([l11, -(sxy / syy) * l11, 1 / np.sqrt(syy)], axis=1)
+        conics = np.stack([syy / det, -sxy / det, sxx / det], axis=1)
+
+        opacities = 1 / (1 + np.exp(-opacity_logits))
+        reach = 2 * np.log(opacities / ALPHA_MIN)
+        half_extents = np.sqrt(reach[:, None] * np.stack([sxx, syy], axis=1))
+
+        directions, _ = view_directions(means, camera)
+        basis = sh_basis(directions, sh_degree)
+        colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]))
+
+        visible = (z > camera.near) & (opacities > ALPHA_MIN) & (det > 0)
+        for values in (means2d, whitening, conics, half_extents, colors):
+            visible &= np.isfinite(values).all(axis=1)
+
+    def shown(values: Float64) -> Float64:
+        mask = visible if values.ndim == 1 else visible[:, None]
+        return np.where(mask, values, 0.0)
+
+    return Projected(
+        means2d=shown(means2d),
+        covariances=shown(np.stack([sxx, sxy, syy], axis=1)),
+        conics=shown(conics),
+        whitening=shown(whitening),
+        half_extents=shown(half_extents),
+        depths=shown(z),
+        opacities=shown(opacities),
+        colors=shown(colors),
+        visible=visible,
+    )
+
+
+def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
+    """Eq. (30), dL/dSigma = -A G A with A the conic matrix: (N, 3), (N, 3) -> (N, 3).
+
+    d_conics is the derivative by the three numbers a, b, c (b stands twice in the matrix). The result is xx, xy, yy
+    of the symmetric matrix G with dL = sum_ij G_ij dSigma_ij, so dL/dsxy as one number is twice its xy.
+    """
+    a, b, c = conics.T
+    matrix = np.stack([np.stack([a, b], axis=1), np.stack([b, c], axis=1)], axis=1)
+    d_a, d_b, d_c = d_conics.T
+    gradient = np.stack([np.stack([d_a, d_b / 2], axis=1), np.stack([d_b / 2, d_c], axis=1)], axis=1)
+    result = -matrix @ gradient @ matrix
+    return np.stack([result[:, 0, 0], result[:, 0, 1], result[:, 1, 1]], axis=1)
+
+
+def conic_grad(covariances: Float64, d_covariances: Float64) -> Float64:
+    """The way back from `covariance_grad`: dL/d(a, b, c) from dL/dSigma, both (N, 3)."""
+    as_numbers = np.array([1.0, 2.0, 1.0])  # the off-diagonal entry stands twice
+    d_conics: Float64 = covariance_grad(covariances, d_covariances * as_numbers) * as_numbers
+    return d_conics
+
+
+def _quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
+    """Eqs. (34), (35): raw quaternions (N, 4), dL/dR (N, 3, 3) -> dL/dq (N, 4), orthogonal to q."""
+    norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    unit = quaternions / norms
+    w, x, y, z = unit.T
+    g = d_rotations.transpose(1, 2, 0)
+    d_unit = 2 * np.stack(
+        [
+            x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]),
+            w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - 2 * x * (g[1, 1] + g[2, 2]),
+            w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) - 2 * y * (g[0, 0] + g[2, 2]),
+            w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - 2 * z * (g[0, 0] + g[1, 1]),
+        ],
+        axis=1,
+    )
+    gradient: Float64 = (d_unit - unit * (unit * d_unit).sum(axis=1, keepdims=True)) / norms
+    return gradient
+
+
+def project_grad(
+    means: Float64,
+    quaternions: Float64,
+    log_scales: Float64,
+    opacity_logits: Float64,
+    sh: Float64,
+    camera: Camera,
+    sh_degree: int,
+    d_means2d: Float64,
+    d_conics: Float64,
+    d_opacities: Float64,
+    d_colors: Float64,
+) -> dict[str, Float64]:
+    """Eqs. (30) to (41): gradients by the five parameter arrays, keyed by their names; zero where culled.
+
+    d_means2d (N, 2), d_conics (N, 3) by a, b, c, d_opacities (N,), d_colors (N, 3).
+    """
+    projected = project(means, quaternions, log_scales, opacity_logits, sh, camera, sh_degree)
+    rows = np.flatnonzero(projected.visible)
+    geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
+    x, y, z = geometry.p.T
+
+    gxx, gxy, gyy = covariance_grad(projected.conics[rows], d_conics[rows]).T
+    d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
+    d_half = 2 * d_covariance @ geometry.half  # (31)
+
+    factor = geometry.rotations * geometry.scales[:, None, :]
+    d_jacobian = d_half @ (camera.rotation @ factor).transpose(0, 2, 1)  # (32)
+    d_factor = (geometry.jacobian @ camera.rotation).transpose(0, 2, 1) @ d_half  # (32)
+    d_log_scales = (d_factor * factor).sum(axis=1)  # (33)
+    d_quaternions = _quaternion_grad(quaternions[rows], d_factor * geometry.scales[:, None, :])
+
+    # (36): the Jacobian's entries by z and by the clamped ratios; a clamped ratio does not move with the mean
+    d00, d02, d11, d12 = d_jacobian[:, 0, 0], d_jacobian[:, 0, 2], d_jacobian[:, 1, 1], d_jacobian[:, 1, 2]
+    d_z = (-camera.fx * d00 + camera.fx * geometry.ratios[:, 0] * d02) / z**2
+    d_z += (-camera.fy * d11 + camera.fy * geometry.ratios[:, 1] * d12) / z**2
+    d_ratio_x = np.where(geometry.unclamped[:, 0], -camera.fx * d02 / z, 0.0)
+    d_ratio_y = np.where(geometry.unclamped[:, 1], -camera.fy * d12 / z, 0.0)
+    # (37): the mean itself is projected unclamped
+    d_ratio_x = d_ratio_x + camera.fx * d_means2d[rows, 0]
+    d_ratio_y = d_ratio_y + camera.fy * d_means2d[rows, 1]
+    d_z -= (d_ratio_x * x + d_ratio_y * y) / z**2
+    d_p = np.stack([d_ratio_x / z, d_ratio_y / z, d_z], axis=1)
+
+    directions, distances = view_directions(means[rows], camera)
+    basis = sh_basis(directions, sh_degree)
+    count = basis.shape[1]
+    d_value = np.where(projected.colors[rows] > 0, d_colors[rows], 0.0)  # (39)
+    d_directions = np.einsum("nkd,nkc,nc->nd", sh_basis_grad(directions, sh_degree), sh[rows, :count], d_value)
+    radial = (directions * d_directions).sum(axis=1, keepdims=True)
+    d_means = d_p @ camera.rotation + (d_directions - directions * radial) / distances  # (38), (40)
+
+    opacities = projected.opacities[rows]
+    gradients = {
+        "means": np.zeros_like(means),
+        "quaternions": np.zeros_like(quaternions),
+        "log_scales": np.zeros_like(log_scales),
+        "opacity_logits": np.zeros_like(opacity_logits),
+        "sh": np.zeros_like(sh),
+    }
+    gradients["means"][rows] = d_means
+    gradients["quaternions"][rows] = d_quaternions
+    gradients["log_scales"][rows] = d_log_scales
+    gradients["opacity_logits"][rows] = d_opacities[rows] * opacities * (1 - opacities)  # (41)
+    gradients["sh"][rows, :count] = basis[:, :, None] * d_value[:, None, :]
+    return gradients

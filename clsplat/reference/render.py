@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole forward pass and its gradient in float64: what the kernels are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.gaussians import Gaussians
+from clsplat.reference.blend import Blended, blend, blend_grad
+from clsplat.reference.project import Projected, project, project_grad
+from clsplat.reference.sort import depth_order
+
+Float64 = NDArray[np.float64]
+BLACK = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Forward:
+    """Everything the forward pass made: `order` (M,) lists the visible rows front to back."""
+
+    projected: Projected
+    order: NDArray[np.int64]
+    blended: Blended
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """parameters: by the name of the array in `Gaussians`, same shapes; means2d and abs_means2d (N, 2): by the
+    mean on the image, in pixels, for density control; visible (N,)."""
+
+    parameters: dict[str, Float64]
+    means2d: Float64
+    abs_means2d: Float64
+    visible: NDArray[np.bool_]
+
+
+def parameters(gaussians: Gaussians) -> dict[str, Float64]:
+    """The five arrays by name, in float64."""
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    return {name: np.asarray(getattr(gaussians, name), np.float64) for name in names}
+
+
+def forward(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Sequence[float] | Float64 = BLACK,
+    sh_degree: int | None = None,
+    margins: bool = False,
+) -> Forward:
+    """Project, sort, blend; sh_degree None uses all bands there are."""
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    projected = project(**parameters(gaussians), camera=camera, sh_degree=degree)
+    order = depth_order(projected.depths, projected.visible)
+    return Forward(projected, order, blend(projected, order, camera.width, camera.height, background, margins))
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Sequence[float] | Float64 = BLACK,
+    sh_degree: int | None = None,
+) -> tuple[Float64, Float64]:
+    """image (H, W, 3) over the background, alpha (H, W) = 1 - transmittance."""
+    blended = forward(gaussians, camera, background, sh_degree).blended
+    return blended.image, 1 - blended.transmittance
+
+
+def render_grad(
+    gaussians: Gaussians,
+    camera: Camera,
+    d_image: Float64,
+    background: Sequence[float] | Float64 = BLACK,
+    sh_degree: int | None = None,
+) -> Gradients:
+    """Gradients of a loss with dL/dimage = d_image (H, W, 3)."""
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    arrays = parameters(gaussians)
+    projected = project(**arrays, camera=camera, sh_degree=degree)
+    order = depth_order(projected.depths, projected.visible)
+    screen = blend_grad(projected, order, camera.width, camera.height, background, d_image)
+    by_parameter = project_grad(
+        **arrays,
+        camera=camera,
+        sh_degree=degree,
+        d_means2d=screen.means2d,
+        d_conics=screen.conics,
+        d_opacities=screen.opacities,
+        d_colors=screen.colors,
+    )
+    return Gradients(by_parameter, screen.means2d, screen.abs_means2d, projected.visible)

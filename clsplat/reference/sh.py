@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real spherical harmonics up to degree 3, with the constants and signs of 3D Gaussian Splatting files."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+C3 = (
+    -0.5900435899266435,
+    2.890611442640554,
+    -0.4570457994644658,
+    0.3731763325901154,
+    -0.4570457994644658,
+    1.445305721320277,
+    -0.5900435899266435,
+)
+
+
+def sh_basis(directions: Float64, degree: int) -> Float64:
+    """Y_k of eq. (12): directions (N, 3), unit vectors from the camera to the mean -> (N, (degree + 1)^2)."""
+    x, y, z = directions.T
+    columns = [np.full_like(x, C0)]
+    if degree >= 1:
+        columns += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        columns += [
+            C2[0] * x * y,
+            C2[1] * y * z,
+            C2[2] * (2 * z * z - x * x - y * y),
+            C2[3] * x * z,
+            C2[4] * (x * x - y * y),
+        ]
+    if degree >= 3:
+        columns += [
+            C3[0] * y * (3 * x * x - y * y),
+            C3[1] * x * y * z,
+            C3[2] * y * (4 * z * z - x * x - y * y),
+            C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            C3[4] * x * (4 * z * z - x * x - y * y),
+            C3[5] * z * (x * x - y * y),
+            C3[6] * x * (x * x - 3 * y * y),
+        ]
+    return np.stack(columns, axis=1)
+
+
+def sh_basis_grad(directions: Float64, degree: int) -> Float64:
+    """dY_k / d(x, y, z) with x, y, z taken as free: (N, 3) -> (N, (degree + 1)^2, 3).
+
+    The polynomials of `sh_basis` are continued off the unit sphere as they are written; any other continuation
+    differs along the direction only, which eq. (40) projects out.
+    """
+    x, y, z = directions.T
+    zero = np.zeros_like(x)
+    one = np.ones_like(x)
+    rows = [(zero, zero, zero)]
+    if degree >= 1:
+        rows += [(zero, -C1 * one, zero), (zero, zero, C1 * one), (-C1 * one, zero, zero)]
+    if degree >= 2:
+        rows += [
+            (C2[0] * y, C2[0] * x, zero),
+            (zero, C2[1] * z, C2[1] * y),
+            (-2 * C2[2] * x, -2 * C2[2] * y, 4 * C2[2] * z),
+            (C2[3] * z, zero, C2[3] * x),
+            (2 * C2[4] * x, -2 * C2[4] * y, zero),
+        ]
+    if degree >= 3:
+        rows += [
+            (6 * C3[0] * x * y, 3 * C3[0] * (x * x - y * y), zero),
+            (C3[1] * y * z, C3[1] * x * z, C3[1] * x * y),
+            (-2 * C3[2] * x * y, C3[2] * (4 * z * z - x * x - 3 * y * y), 8 * C3[2] * y * z),
+            (-6 * C3[3] * x * z, -6 * C3[3] * y * z, C3[3] * (6 * z * z - 3 * x * x - 3 * y * y)),
+            (C3[4] * (4 * z * z - 3 * x * x - y * y), -2 * C3[4] * x * y, 8 * C3[4] * x * z),
+            (2 * C3[5] * x * z, -2 * C3[5] * y * z, C3[5] * (x * x - y * y)),
+            (3 * C3[6] * (x * x - y * y), -6 * C3[6] * x * y, zero),
+        ]
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)

@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The order in which Gaussians are blended: float64 twin of kernels/sort*.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+
+
+def depth_order(depths: Float64, visible: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Indices of the visible Gaussians front to back: by depth rounded to float32, ties by index.
+
+    depths (N,), z in the camera. Kernels compute depths in float32; where theirs differ in the last bit from the
+    rounded ones, pass theirs, or neighbours in depth may swap.
+    """
+    rows = np.flatnonzero(visible)
+    keys = depths[rows].astype(np.float32)
+    return rows[np.argsort(keys, kind="stable")]

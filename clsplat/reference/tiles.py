@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which tiles a Gaussian reaches, by looking at every pixel: float64 twin of the tile test in kernels/."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.reference.blend import ALPHA_MAX, footprint
+from clsplat.reference.project import ALPHA_MIN, Projected
+
+Int64 = NDArray[np.int64]
+
+
+def touched_tiles(
+    projected: Projected, width: int, height: int, tile: int = 16, threshold: float = ALPHA_MIN
+) -> list[Int64]:
+    """Per Gaussian the tiles, ascending and row-major, that hold a pixel centre with alpha >= threshold.
+
+    The kernels' tile set must be a superset of this: a missing tile is a hole in the image, a spare one costs only
+    time. They test the ellipse against the tile's rectangle of pixel centres, which it may cut between two centres.
+    A float32 test can also round the other way within about 1e-5 of the threshold: compare at
+    threshold = ALPHA_MIN * (1 + 1e-5).
+    """
+    tiles_x = -(-width // tile)
+    result = []
+    for gaussian, visible in enumerate(projected.visible):
+        splat = footprint(projected, gaussian, width, height) if visible else None
+        if splat is None:
+            result.append(np.zeros(0, np.int64))
+            continue
+        rows, columns = np.nonzero(np.minimum(ALPHA_MAX, splat.raw) >= threshold)
+        tiles = (rows + splat.rows.start) // tile * tiles_x + (columns + splat.columns.start) // tile
+        result.append(np.unique(tiles).astype(np.int64))
+    return result
+
+
+def tile_counts(projected: Projected, width: int, height: int, tile: int = 16) -> Int64:
+    """How many tiles each Gaussian reaches, (N,); a lower bound for the kernels' counts."""
+    return np.array([len(tiles) for tiles in touched_tiles(projected, width, height, tile)], np.int64)

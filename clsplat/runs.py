@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run folder: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/, test/ (held-out renders)."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+import clsplat
+from clsplat.config import TrainConfig
+from clsplat.errors import ClsplatError, InputError
+from clsplat.files import TEMPORARY_SUFFIX, atomic_write, atomic_writer
+from clsplat.gaussians import Gaussians
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+KEPT_CHECKPOINTS = 2
+STATE_KEY = "state.json"
+"""The member of a checkpoint that holds its state, as JSON bytes; no array may have this name."""
+
+Arrays = dict[str, NDArray[Any]]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """step: optimisation steps done; arrays by name; state: JSON values."""
+
+    step: int
+    arrays: Arrays
+    state: dict[str, Any]
+
+
+class Run:
+    """A run folder. Make one with `Run.create`, open one that is there with `Run.open`."""
+
+    def __init__(self, path: Path, config: TrainConfig, scene: Path | None, *, resuming: bool = False) -> None:
+        self.path, self.config, self.scene, self.resuming = path, config, scene, resuming
+        self.config_path = path / "config.toml"
+        self.model_path = path / "model.ply"
+        self.metrics_path = path / "metrics.jsonl"
+        self.eval_path = path / "eval.json"
+        self.checkpoints_path = path / "checkpoints"
+        self.test_path = path / "test"
+
+    @classmethod
+    def create(
+        cls,
+        path: str | os.PathLike[str],
+        config: TrainConfig,
+        *,
+        scene: str | os.PathLike[str] | None = None,
+        resume: bool = False,
+        overwrite: bool = False,
+    ) -> Run:
+        """Make the folder and its config.toml; `scene` is recorded there as an absolute path.
+
+        resume: go on in a run that is there, with `config` (see `check_resumed`); overwrite: remove the files of the
+        run that is there, and nothing else. Raises InputError where `check_output` does.
+        """
+        path = Path(path)
+        check_output(path, resume=resume, overwrite=overwrite)
+        if resume:
+            earlier = cls.open(path)
+            check_resumed(earlier, config)
+            scene = scene or earlier.scene
+        elif overwrite and is_run(path):
+            for file in owned_files(path):
+                file.unlink()
+        run = cls(path, config, Path(scene).absolute() if scene is not None else None, resuming=resume)
+        run.checkpoints_path.mkdir(parents=True, exist_ok=True)
+        atomic_write(run.config_path, config_text(config, run.scene).encode())
+        return run
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str]) -> Run:
+        """A run that is there. Raises InputError where it is none or its config.toml is wrong."""
+        path = Path(path)
+        if not path.is_dir():
+            raise InputError(f"{path}: no such folder, expected a run")
+        if not is_run(path):
+            raise InputError(f"{path}: not a run (no config.toml of clsplat in it)")
+        config, scene = read_config(path / "config.toml")
+        return cls(path, config, scene)
+
+    def save_model(self, gaussians: Gaussians) -> None:
+        """Write model.ply."""
+        gaussians.save(self.model_path)
+
+    def write_eval(self, result: Mapping[str, Any]) -> None:
+        """Write eval.json."""
+        atomic_write(self.eval_path, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
+
+    def model_record(self) -> dict[str, Any]:
+        """`step` and `seconds` of model.ply, where they are known.
+
+        From eval.json, which is written with the model: a run that was resumed and stopped has later metrics.
+        """
+        with suppress(OSError, ValueError):
+            record = json.loads(self.eval_path.read_text("utf-8"))
+            if isinstance(record, dict) and isinstance(record.get("step"), int):
+                return record
+        return next(reversed(self.read_metrics()), {})
+
+    def append_metrics(self, record: Mapping[str, Any]) -> None:
+        """Add a line to metrics.jsonl, out of the program at once. Raises ClsplatError for a number not finite."""
+        try:
+            line = json.dumps(record, allow_nan=False)
+        except ValueError:
+            raise ClsplatError(f"training diverged at step {record.get('step')}: {dict(record)}") from None
+        with open(self.metrics_path, "a", encoding="utf-8") as file:
+            file.write(line + "\n")
+
+    def read_metrics(self) -> list[dict[str, Any]]:
+        """The records of metrics.jsonl; a cut last line, as a crash leaves it, is left out."""
+        return [record for _, record in self._metrics_lines()]
+
+    def truncate_metrics(self, step: int) -> None:
+        """Drop the records of later steps, and a cut last line."""
+        if self.metrics_path.exists():
+            kept = [line for line, record in self._metrics_lines() if record.get("step", 0) <= step]
+            atomic_write(self.metrics_path, "".join(line + "\n" for line in kept).encode())
+
+    def _metrics_lines(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        with suppress(FileNotFoundError):
+            for line in self.metrics_path.read_text("utf-8", errors="replace").splitlines():
+                with suppress(ValueError):
+                    record = json.loads(line)
+                    if isinstance(record, dict):
+                        yield line, record
+
+    def save_checkpoint(self, step: int, arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Path:
+        """Write checkpoints/step-STEP.npz atomically and keep the latest two.
+
+        arrays: any dtype but object; state: what JSON holds. Checkpoints of later steps are removed: training has
+        gone back before them.
+        """
+        if STATE_KEY in arrays:
+            raise ValueError(f"no array of a checkpoint may be called {STATE_KEY}")
+        text = json.dumps({"version": clsplat.__version__, "step": step, "state": dict(state)})
+        self.checkpoints_path.mkdir(parents=True, exist_ok=True)
+        path = self.checkpoints_path / f"step-{step:07d}.npz"
+        members: Arrays = {STATE_KEY: np.frombuffer(text.encode(), np.uint8), **arrays}
+        with atomic_writer(path) as file:
+            np.savez(file, allow_pickle=False, **members)
+        earlier = [(s, p) for s, p in self.checkpoints() if s <= step]
+        keep = {p for _, p in earlier[-KEPT_CHECKPOINTS:]}
+        for _, other in self.checkpoints():
+            if other not in keep:
+                other.unlink()
+        return path
+
+    def checkpoints(self) -> list[tuple[int, Path]]:
+        """Step and path of every checkpoint, by step."""
+        found = [(re.fullmatch(r"step-(\d+)\.npz", path.name), path) for path in self.checkpoints_path.glob("*.npz")]
+        return sorted((int(match[1]), path) for match, path in found if match)
+
+    def load_latest_checkpoint(self) -> Checkpoint | None:
+        """The latest checkpoint that is whole; None where there is none at all.
+
+        A damaged one gives a warning and the one before it is taken; with none left, InputError. In a run that
+        resumes, metrics.jsonl is cut back to the checkpoint's step.
+        """
+        found = self.checkpoints()
+        checkpoint: Checkpoint | None = None
+        for _, path in reversed(found):
+            try:
+                checkpoint = _read_checkpoint(path)
+                break
+            except (OSError, ValueError, KeyError, EOFError, _bad_zip()) as error:
+                warnings.warn(f"{path}: checkpoint is damaged and was passed over ({error})", stacklevel=2)
+        if found and checkpoint is None:
+            raise InputError(f"{self.checkpoints_path}: no checkpoint there is whole, use --overwrite to start again")
+        if self.resuming:
+            self.truncate_metrics(checkpoint.step if checkpoint else 0)
+        return checkpoint
+
+
+def _bad_zip() -> type[Exception]:
+    from zipfile import BadZipFile
+
+    return BadZipFile
+
+
+def _read_checkpoint(path: Path) -> Checkpoint:
+    with np.load(path, allow_pickle=False) as archive:
+        arrays: Arrays = {name: archive[name] for name in archive.files}
+    record = json.loads(arrays.pop(STATE_KEY).tobytes())
+    return Checkpoint(int(record["step"]), arrays, record["state"])
+
+
+def is_run(path: Path) -> bool:
+    """Whether the folder holds a config.toml that clsplat wrote."""
+    try:
+        with open(path / "config.toml", encoding="utf-8", errors="replace") as file:
+            return any(line.startswith("clsplat = ") for line in file)
+    except OSError:
+        return False
+
+
+def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
+    """Raise InputError where a run may not be put at `path`. Writes nothing."""
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite exclude each other")
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file, expected a folder for the run")
+    if resume and not is_run(path):
+        raise InputError(f"{path}: no run to resume there (no config.toml of clsplat)")
+    if is_run(path):
+        if not (resume or overwrite):
+            raise InputError(f"{path}: is already a run, use --resume to go on with it or --overwrite to replace it")
+    elif path.is_dir():
+        foreign = sorted(entry.name for entry in path.iterdir() if not entry.name.startswith("."))
+        if foreign:
+            raise InputError(f"{path}: holds other files ({foreign[0]}) and is no run, expected an empty or new folder")
+
+
+def owned_files(path: Path) -> list[Path]:
+    """The files in a run's folder that clsplat wrote, and that --overwrite may therefore remove."""
+    patterns = ("checkpoints/step-*.npz", "test/**/*.png", "**/.*" + TEMPORARY_SUFFIX)
+    # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
+    names = ("model.ply", "metrics.jsonl", "eval.json", "report.html", "config.toml")
+    found = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
+    return [file for file in found if file.is_file() or file.is_symlink()]
+
+
+def check_resumed(earlier: Run, config: TrainConfig) -> None:
+    """Raise InputError where `config` changes what a run cannot change on its way."""
+    for name in ("sh_degree", "seed", "test_every"):
+        was, now = getattr(earlier.config, name), getattr(config, name)
+        if was != now:
+            raise InputError(f"{earlier.config_path}: {name} is {was} there, a resumed run cannot change it to {now}")
+
+
+def config_text(config: TrainConfig, scene: Path | None) -> str:
+    """The content of config.toml."""
+    document: dict[str, Any] = {"clsplat": clsplat.__version__}
+    if scene is not None:
+        document["scene"] = str(scene)
+    document["train"] = asdict(config)
+    return tomli_w.dumps(document)
+
+
+def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
+    """The configuration and the scene's path. Raises InputError naming the file and the key that is wrong."""
+    try:
+        document = tomllib.loads(path.read_text("utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path}: not readable as TOML ({error})") from None
+    for key in document:
+        if key not in ("clsplat", "scene", "train"):
+            raise InputError(f"{path}: unknown key {key!r}, expected clsplat, scene or train")
+    scene = document.get("scene")
+    config = _from_table(TrainConfig, document.get("train", {}), path, "train")
+    return config, Path(scene) if isinstance(scene, str) else None
+
+
+def _from_table(cls: type[T], table: Any, path: Path, where: str) -> T:
+    """An instance of the dataclass `cls`; keys that are not there keep their defaults."""
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: {where} is {table!r}, expected a table")
+    types = get_type_hints(cls)
+    names = [f.name for f in fields(cls)]  # type: ignore[arg-type]  # every caller passes a dataclass
+    values = {}
+    for key, value in table.items():
+        if key not in names:
+            raise InputError(f"{path}: unknown key '{where}.{key}', expected one of {', '.join(names)}")
+        if is_dataclass(types[key]):
+            values[key] = _from_table(types[key], value, path, f"{where}.{key}")
+        else:
+            values[key] = _value(types[key], value, f"{path}: {where}.{key}")
+    return cls(**values)
+
+
+def _value(kind: Any, value: Any, what: str) -> Any:
+    """`value`, as TOML gives it, for a field of type `kind`."""
+    if get_origin(kind) is Literal:
+        if value in get_args(kind):
+            return value
+        raise InputError(f"{what} is {value!r}, expected one of {', '.join(map(str, get_args(kind)))}")
+    if get_origin(kind) is tuple:
+        if isinstance(value, list):
+            return tuple(_value(get_args(kind)[0], item, what) for item in value)
+    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    elif type(value) is kind:
+        return value
+    raise InputError(f"{what} is {value!r}, expected {getattr(kind, '__name__', kind)}")

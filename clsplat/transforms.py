@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading transforms.json of Blender synthetic (NeRF), nerfstudio and instant-ngp data sets.
+
+Poses there are `world_from_camera` with OpenGL's camera axes (x right, y up, z backward). Here the camera's axes
+become COLMAP's; the world stays as the file has it. So instant-ngp's `scale`, `offset` and `aabb_scale`, which place
+the scene in its own unit cube, touch no pose (they only bound the volume of random points), and nerfstudio's
+`applied_transform` is not undone: its sparse points have been through it as well.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat import ply
+from clsplat.errors import InputError
+from clsplat.images import EXTENSIONS, image_size, require_images
+from clsplat.undistort import Lens, check_lens
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+NGP_SCALE, NGP_OFFSET = 0.33, 0.5
+"""instant-ngp's defaults: its position is scale times the file's, plus offset."""
+PERSPECTIVE = ("", "PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYE = ("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+EXPORT_AGAIN = "export the data set anew or add it"
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture of a data set: name, file, lens at the file's listed size, and `cam_from_world`.
+
+    rotation (3, 3), translation (3,), float64; split: "train", "test", or None where the data set has no own split.
+    """
+
+    name: str
+    path: Path
+    lens: Lens
+    rotation: Float64
+    translation: Float64
+    split: str | None = None
+
+
+@dataclass(eq=False)
+class Transforms:
+    """What the files say. points (N, 3) and colors (N, 3) in [0, 1] are nerfstudio's sparse points, if any.
+
+    box: instant-ngp's volume, the corners (low, high), world units, or None.
+    """
+
+    frames: list[Frame]
+    points: Float64 = field(default_factory=lambda: np.empty((0, 3)))
+    colors: Float32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    box: tuple[Float64, Float64] | None = None
+    warnings: list[str] = field(default_factory=list)
+
+
+def read_transforms(path: Path) -> Transforms:
+    """Read one transforms.json.
+
+    Intrinsics may stand in the file or in each frame: `fl_x fl_y` or `camera_angle_x camera_angle_y`, `cx cy` (the
+    middle if absent), `w h` (the picture's own size if absent), `k1 k2 k3 k4 p1 p2`, `camera_model` or `is_fisheye`.
+    `file_path` is relative to the file, with or without extension. nerfstudio's `ply_file_path` and its
+    `train_filenames`, `val_filenames` and `test_filenames` are honoured. Raises InputError that names the file and the
+    key for JSON that does not parse, a key that is missing or of the wrong kind, and listed pictures that are missing.
+    """
+    document = _load(path)
+    frames = document.get("frames")
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(f"{path}: has no 'frames' (a list of pictures with their poses); {EXPORT_AGAIN}")
+    readers = [_Keys(path, index, frame, document) for index, frame in enumerate(frames)]
+    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
+    require_images(files, path)
+
+    held_out = _held_out(document)
+    result = Transforms([])
+    for keys, file in zip(readers, files, strict=True):
+        listed = keys.text("file_path")
+        split = None if held_out is None else "test" if _plain(listed) in held_out else "train"
+        lens = _lens(keys, file)
+        rotation, translation = _pose(keys)
+        name = str(PurePosixPath(_plain(listed)).with_suffix(file.suffix)) if file.suffix else _plain(listed)
+        if not _plain(listed).endswith(file.suffix):  # no extension in the list: a dot in the stem is part of it
+            name = _plain(listed) + file.suffix
+        result.frames.append(Frame(name, file, lens, rotation, translation, split))
+    names = [frame.name for frame in result.frames]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{path}: lists {twice} twice, expected each picture once; remove one of the frames")
+    if any("mask_path" in frame for frame in frames):
+        result.warnings.append(f"{path}: 'mask_path' is ignored, masks are not supported")
+    result.box = _ngp_box(_Keys(path, None, {}, document))
+    _read_points(path, document, result)
+    return result
+
+
+def read_blender(folder: Path) -> Transforms:
+    """Read transforms_train.json and, if there, transforms_test.json, the data set's own split (val is left out).
+
+    Raises InputError as `read_transforms`.
+    """
+    train = read_transforms(folder / "transforms_train.json")
+    held_out = folder / "transforms_test.json"
+    if not held_out.is_file():
+        return train
+    test = read_transforms(held_out)
+    frames = []
+    for split, part in (("train", train), ("test", test)):
+        frames += [Frame(f.name, f.path, f.lens, f.rotation, f.translation, split) for f in part.frames]
+    names = {frame.name for frame in train.frames}
+    for frame in test.frames:
+        if frame.name in names:
+            raise InputError(f"{held_out}: lists {frame.name}, which is a training picture too; remove one of them")
+    return Transforms(frames, train.points, train.colors, train.box, train.warnings + test.warnings)
+
+
+class _Keys:
+    """Values of one frame, or of the file where the frame does not have them."""
+
+    def __init__(self, path: Path, index: int | None, frame: dict[str, Any], document: dict[str, Any]) -> None:
+        self.path, self.frame, self.document = path, frame, document
+        self.where = str(path) if index is None else f"{path}: frame {index}"
+
+    def get(self, key: str) -> Any:
+        value = self.frame.get(key)
+        return self.document.get(key) if value is None else value
+
+    def text(self, key: str) -> str:
+        value = self.get(key)
+        if not isinstance(value, str) or not value.strip():
+            found = f"has no '{key}'" if value is None else f"'{key}' is {_short(value)}, expected text"
+            raise InputError(f"{self.where}: {found}; {EXPORT_AGAIN}")
+        return value
+
+    def number(self, key: str) -> float | None:
+        value = self.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise InputError(f"{self.where}: '{key}' is {_short(value)}, expected a number")
+        return float(value)
+
+
+def _short(value: object) -> str:
+    return repr(value)[:60]
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file, expected a transforms.json") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is not JSON: {error}; expected a transforms.json") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: holds no JSON object, expected one with 'frames'")
+    return document
+
+
+def _plain(listed: str) -> str:
+    """A file_path as a name: forward slashes, nothing like "./" or "../" before it."""
+    parts = PurePosixPath(os.path.normpath(listed.replace("\\", "/")).replace(os.sep, "/")).parts
+    return "/".join(part for part in parts if part not in ("..", "/"))
+
+
+def _find_file(folder: Path, listed: str) -> Path:
+    """The picture; one that does not exist is returned as it is listed."""
+    path = Path(os.path.normpath(folder / listed.replace("\\", "/")))
+    if path.is_file():
+        return path
+    for extension in (*EXTENSIONS, *(extension.upper() for extension in EXTENSIONS)):
+        candidate = path.with_name(path.name + extension)
+        if candidate.is_file():
+            return candidate
+    return path
+
+
+def _held_out(document: dict[str, Any]) -> set[str] | None:
+    """nerfstudio's own split: the names of test_filenames, or of val_filenames where there are none to test."""
+    for key in ("test_filenames", "val_filenames"):
+        names = document.get(key)
+        if isinstance(names, list) and names:
+            return {_plain(name) for name in names if isinstance(name, str)}
+    return None
+
+
+def _lens(keys: _Keys, file: Path) -> Lens:
+    width, height = keys.number("w"), keys.number("h")
+    if width is None or height is None:
+        width, height = image_size(file, orient=False)
+    fx = _focal(keys, "fl_x", "camera_angle_x", width)
+    fy = _focal(keys, "fl_y", "camera_angle_y", height)
+    if fx is None and fy is None:
+        raise InputError(
+            f"{keys.where}: has neither 'fl_x' nor 'camera_angle_x', expected the focal length in pixels or the "
+            "horizontal angle of view in radians; add one of them to the file"
+        )
+    cx, cy = keys.number("cx"), keys.number("cy")
+    core = [
+        fx if fx is not None else fy,
+        fy if fy is not None else fx,
+        cx if cx is not None else width / 2,
+        cy if cy is not None else height / 2,
+    ]
+    model, extra = _distortion(keys)
+    params = tuple(float(value) for value in (*core, *extra) if value is not None)
+    return check_lens(Lens(model, round(width), round(height), params), keys.where)
+
+
+def _focal(keys: _Keys, focal: str, angle: str, size: float) -> float | None:
+    if (value := keys.number(focal)) is not None:
+        return value
+    if (value := keys.number(angle)) is None:
+        return None
+    if not 0 < value < math.pi:
+        raise InputError(f"{keys.where}: '{angle}' is {value}, expected an angle between 0 and pi, in radians")
+    return 0.5 * size / math.tan(0.5 * value)
+
+
+def _distortion(keys: _Keys) -> tuple[str, list[float]]:
+    """COLMAP's model and its coefficients."""
+    model = keys.get("camera_model") or ""
+    k1, k2, k3, k4, k5, k6, p1, p2 = (
+        keys.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+    )
+    if model in FISHEYE or keys.get("is_fisheye") is True:
+        return "OPENCV_FISHEYE", [k1, k2, k3, k4]
+    if model not in PERSPECTIVE:
+        listed = ", ".join(name for name in (*PERSPECTIVE, *FISHEYE) if name)
+        raise InputError(f"{keys.where}: unknown 'camera_model' {_short(model)}, expected one of {listed}")
+    if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
+        return "PINHOLE", []
+    if k4 and model != "FULL_OPENCV":
+        # nerfstudio means a term in r^8 by it, OpenCV one in a denominator
+        raise InputError(
+            f"{keys.where}: 'k4' is {k4} in a perspective camera, expected 0; undistort the pictures first"
+        )
+    if k3 or k4 or k5 or k6:
+        return "FULL_OPENCV", [k1, k2, p1, p2, k3, k4, k5, k6]
+    return "OPENCV", [k1, k2, p1, p2]
+
+
+def _pose(keys: _Keys) -> tuple[Float64, Float64]:
+    given = keys.frame.get("transform_matrix")
+    if given is None:
+        raise InputError(f"{keys.where}: has no 'transform_matrix' (the 4 x 4 pose); {EXPORT_AGAIN}")
+    try:
+        matrix = np.array(given, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        raise InputError(f"{keys.where}: 'transform_matrix' is {_short(given)}, expected 4 x 4 finite numbers")
+    # A scaled camera object leaves its scale in the matrix; a camera has none.
+    determinant = float(np.linalg.det(matrix[:3, :3]))
+    axes = matrix[:3, :3] / np.cbrt(determinant) if determinant > 0 else np.zeros((3, 3))
+    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-2:
+        raise InputError(
+            f"{keys.where}: 'transform_matrix' has no rotation in it (determinant {determinant:.3g}), expected "
+            "world_from_camera in OpenGL's axes; check how it was exported"
+        )
+    u, _, v = np.linalg.svd(axes)
+    cam_from_world: Float64 = (u @ v @ COLMAP_FROM_OPENGL).T
+    return cam_from_world, -cam_from_world @ matrix[:3, 3]
+
+
+def _ngp_box(keys: _Keys) -> tuple[Float64, Float64] | None:
+    side = keys.number("aabb_scale")
+    if side is None or side <= 0:
+        return None
+    scale, offset = keys.get("scale"), keys.get("offset")
+    try:
+        shift = np.broadcast_to(np.array(NGP_OFFSET if offset is None else offset, np.float64), 3)
+        factor = float(NGP_SCALE if scale is None else scale)
+    except (TypeError, ValueError):
+        raise InputError(f"{keys.where}: 'scale' or 'offset' is not of numbers, expected one and three") from None
+    if not (factor > 0 and np.isfinite(shift).all()):
+        raise InputError(f"{keys.where}: 'scale' is {factor}, 'offset' {shift.tolist()}, expected a scale above 0")
+    return (0.5 - side / 2 - shift) / factor, (0.5 + side / 2 - shift) / factor
+
+
+def _read_points(path: Path, document: dict[str, Any], result: Transforms) -> None:
+    listed = document.get("ply_file_path")
+    if not isinstance(listed, str):
+        return
+    cloud = path.parent / listed
+    if cloud.is_file():
+        result.points, result.colors = read_point_cloud(cloud)
+    else:
+        result.warnings.append(f"{path}: its points 'ply_file_path' are missing: {cloud}; using random ones")
+
+
+def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
+    """Positions (N, 3) float64 and colours (N, 3) float32 in [0, 1] of a PLY, grey where it has no colours.
+
+    Raises InputError for a file that is none, cut short, without x y z, or with positions that are not finite.
+    """
+    with open(path, "rb") as file:
+        header = ply.read_header(file, path)
+        vertex = header.elements[0] if header.elements else None
+        if vertex is None or vertex.name != "vertex" or vertex.has_list:
+            raise InputError(f"{path}: begins with no plain vertices, expected a point cloud")
+        names = [name for name, _ in vertex.properties]
+        if missing := [name for name in "xyz" if name not in names]:
+            raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
+        body = file.read()
+    if header.format == "ascii":
+        rows = body.split(b"\n")[: vertex.count]
+        try:
+            table = np.array([row.split()[: len(names)] for row in rows], np.float64).reshape(vertex.count, len(names))
+        except ValueError:
+            raise InputError(f"{path}: truncated or corrupt: has not {vertex.count} whole rows") from None
+        columns = dict(zip(names, table.T, strict=True))
+    else:
+        kind = header.row_type(vertex)
+        if len(body) < vertex.count * kind.itemsize:
+            raise InputError(f"{path}: truncated: {len(body)} bytes of points, expected {vertex.count * kind.itemsize}")
+        records = np.frombuffer(body, kind, vertex.count)
+        columns = {name: records[name] for name in names}
+    points = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: holds positions that are not finite")
+    colors = np.full(points.shape, 0.5, np.float32)
+    if all(name in columns for name in ("red", "green", "blue")):
+        integer = dict(vertex.properties)["red"][0] in "iu"
+        colors = np.stack([columns[name] for name in ("red", "green", "blue")], axis=1).astype(np.float32)
+        colors = np.clip(colors / np.float32(255 if integer else 1), 0, 1)
+    return points, colors

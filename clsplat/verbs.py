@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each verb of the command line does. What computes is imported when it is needed: --help must be quick."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+from clsplat.cli import Demo, Devices, Eval, Render, Sfm, Train, Verb
+from clsplat.errors import DeviceError, InputError
+
+if TYPE_CHECKING:
+    from clsplat.camera import Camera
+    from clsplat.device.context import Device
+    from clsplat.gaussians import Gaussians
+    from clsplat.runs import Run
+    from clsplat.scene import Scene
+
+IMAGE_EXTENSIONS = (".png", ".exr")
+Colour = tuple[float, float, float]
+
+
+def run(verb: Verb) -> int:
+    """Do it; returns the exit status. Raises ClsplatError, OSError, KeyboardInterrupt."""
+    match verb:
+        case Devices():
+            return devices(verb)
+        case Demo():
+            return demo(verb)
+        case Sfm():
+            return sfm(verb)
+        case Train():
+            return train(verb)
+        case Eval():
+            return evaluate(verb)
+        case Render():
+            return render(verb)
+
+
+def devices(verb: Devices) -> int:
+    """Print the table of devices."""
+    from clsplat.device.context import list_devices
+
+    found = list_devices()
+    if not found:
+        raise DeviceError("no OpenCL device found, expected a driver such as pip install 'pyopencl[pocl]' brings")
+    if verb.json:
+        print(json.dumps([asdict(info) for info in found], indent=2))
+        return 0
+    header = ("", "name", "kind", "units", "memory", "platform", "version", "shape")
+    rows = [
+        (
+            str(info.index),
+            info.name,
+            info.kind,
+            str(info.compute_units),
+            f"{info.memory_bytes / 2**30:.1f} GiB",
+            info.platform,
+            info.version.split("  ")[0],  # PoCL lists its build options after two spaces
+            info.shape,
+        )
+        for info in found
+    ]
+    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
+    for row in [header, *rows]:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    return 0
+
+
+def demo(verb: Demo) -> int:
+    """The whole pipeline on a scene of its own."""
+    from clsplat.demo import run_demo
+
+    result = run_demo(verb.output, device=verb.device)
+    if verb.json:
+        print(json.dumps(result, indent=2))
+    return 0
+
+
+def sfm(verb: Sfm) -> int:
+    """Photos to a COLMAP scene."""
+    from clsplat.progress import StageProgress
+    from clsplat.sfm import RECORD, reconstruct
+
+    if not verb.photos.is_dir():
+        raise InputError(f"{verb.photos}: no such folder, expected one with photos")
+    if verb.threads is not None and verb.threads < 1:
+        raise InputError(f"--threads {verb.threads}: expected at least 1")
+    reconstruct(
+        verb.photos,
+        verb.output,
+        matching=verb.matching,
+        camera_model=verb.camera_model,
+        threads=verb.threads,
+        seed=verb.seed,
+        overwrite=verb.overwrite,
+        progress=StageProgress(),
+    )
+    if verb.json:
+        print((verb.output / RECORD).read_text().rstrip())
+    print(f"scene in {verb.output}; next: clsplat train {verb.output} -o RUN", file=sys.stderr)
+    return 0
+
+
+def train(verb: Train) -> int:
+    """Scene to run. Everything that can be wrong with the call is found before the run's folder is touched."""
+    from clsplat.device.context import open_device
+    from clsplat.runs import Run, check_output, check_resumed
+
+    check_output(verb.output, resume=verb.resume, overwrite=verb.overwrite)
+    verb.config.check()
+    source = verb.scene
+    if verb.resume:
+        earlier = Run.open(verb.output)
+        check_resumed(earlier, verb.config)
+        source = source or earlier.scene
+    if source is None:
+        raise InputError("SCENE is missing, expected the folder of the scene to train on")
+    device = open_device(verb.device)
+    scene = _load_scene(source, verb.config.resolution, verb.config.test_every)
+    run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
+    try:
+        _train_verb(scene, run, device)
+    except KeyboardInterrupt:
+        steps = run.checkpoints()
+        at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
+        print(f"clsplat: interrupted {at}; go on with: clsplat train -o {run.path} --resume", file=sys.stderr)
+        return 130
+    result = json.loads(run.eval_path.read_text()) if run.eval_path.exists() else None
+    if verb.json:
+        print(json.dumps(result, indent=2))
+    elif result is not None:
+        _print_summary(result)
+    print(f"model in {run.model_path}", file=sys.stderr)
+    return 0
+
+
+def _train_verb(scene: Scene, run: Run, device: Device) -> Gaussians:
+    """The one place that calls the trainer."""
+    from clsplat.progress import TrainProgress
+    from clsplat.training import train as run_training
+
+    with TrainProgress(run.config.iterations) as progress:
+        return run_training(scene, run.config, device=device, run=run, resume=run.resuming, on_step=progress)
+
+
+def evaluate(verb: Eval) -> int:
+    """Model and scene to numbers."""
+    from clsplat.config import TrainConfig
+    from clsplat.device.context import open_device
+    from clsplat.evaluate import background_colour
+    from clsplat.evaluate import evaluate as measure
+    from clsplat.metrics import lpips_missing
+    from clsplat.rendering import Renderer
+    from clsplat.runs import Run, is_run
+
+    given_run = Run.open(verb.model) if verb.model.is_dir() else None
+    trained = given_run or (Run.open(verb.model.parent) if is_run(verb.model.parent) else None)
+    gaussians = _load_model(verb.model)
+    config = trained.config if trained else TrainConfig()
+    source = verb.scene or (trained.scene if trained else None)
+    if source is None:
+        raise InputError(f"{verb.model}: the scene it was trained on is not known, expected --scene SCENE")
+    resolution = config.resolution if verb.resolution is None else verb.resolution
+    test_every = config.test_every if verb.test_every is None else verb.test_every
+    renderer = Renderer(open_device(verb.device))
+    scene = _load_scene(source, resolution, test_every)
+    views = [view for view in scene.views if view.split == "test"]
+    if not views:
+        raise InputError(f"{source}: no view is held out with --test-every {test_every}")
+
+    background = background_colour(verb.background or config.background)
+    trained_for = given_run.model_record() if given_run else {}
+    result = measure(
+        lambda view: renderer.render(gaussians, view.camera, background).image,
+        views,
+        background,
+        given_run.test_path if given_run else None,
+        step=trained_for.get("step"),
+        gaussians=len(gaussians),
+        seconds=trained_for.get("seconds"),
+    )
+    if given_run:
+        given_run.write_eval(result)
+    if verb.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    for view in result["views"]:
+        print(f"{view['name']}  {_scores(view)}")
+    _print_summary(result)
+    if reason := lpips_missing():
+        print(f"no LPIPS: {reason}", file=sys.stderr)
+    return 0
+
+
+def render(verb: Render) -> int:
+    """Model and cameras to images. All names and sizes are checked before the first is rendered."""
+    from clsplat.colmap import read_cameras
+    from clsplat.device.context import open_device
+    from clsplat.images import write_image
+    from clsplat.rendering import Renderer
+
+    extension = PurePosixPath(verb.output).suffix.lower()
+    if extension not in IMAGE_EXTENSIONS:
+        raise InputError(f"{verb.output}: has the extension {extension or 'none'!r}, expected .png or .exr")
+    if verb.alpha and verb.background is not None:
+        raise InputError("--alpha and --background exclude each other: with alpha there is no background")
+    background = parse_colour(verb.background or "black")
+    resize = resizer(verb.width, verb.height, verb.scale)
+    if not verb.cameras.is_dir():
+        raise InputError(f"{verb.cameras}: no such folder, expected a COLMAP model (cameras and images, bin or txt)")
+    cameras = {name: resize(camera) for name, camera in read_cameras(verb.cameras).items()}
+    if not cameras:
+        raise InputError(f"{verb.cameras}: has no images, expected at least one")
+    paths = output_paths(verb.output, list(cameras))
+    gaussians = _load_model(verb.model)
+    renderer = Renderer(open_device(verb.device))
+
+    written = []
+    for name, camera in cameras.items():
+        start = time.monotonic()
+        result = renderer.render(gaussians, camera, background)
+        path = paths[name]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        image = with_alpha(result.image, result.alpha, straight=extension == ".png") if verb.alpha else result.image
+        write_image(path, image)
+        seconds = time.monotonic() - start
+        record = {"name": name, "path": str(path), "width": camera.width, "height": camera.height, "seconds": seconds}
+        written.append(record)
+        if not verb.json:
+            print(f"{path}  {camera.width}x{camera.height}  {seconds:.2f} s")
+    if verb.json:
+        print(json.dumps(written, indent=2))
+    return 0
+
+
+def with_alpha(image: Any, alpha: Any, *, straight: bool) -> Any:
+    """(H, W, 4) float32 from an image (H, W, 3) over black, which is premultiplied, and its alpha (H, W)."""
+    import numpy as np
+
+    opacity = np.asarray(alpha, np.float32)[:, :, None]
+    colour = np.asarray(image, np.float32)
+    if straight:
+        colour = np.divide(colour, opacity, out=np.zeros_like(colour), where=opacity > 0)
+    return np.concatenate([colour, opacity], axis=2)
+
+
+def parse_colour(text: str) -> Colour:
+    """black, white or three numbers from 0 to 1. Raises InputError."""
+    named: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    if text in named:
+        return named[text]
+    try:
+        red, green, blue = (float(word) for word in text.split(","))
+    except ValueError:
+        red = green = blue = -1.0
+    if not (0 <= red <= 1 and 0 <= green <= 1 and 0 <= blue <= 1):
+        raise InputError(f"--background {text}: expected black, white or three numbers from 0 to 1 such as 0.2,0.2,0.3")
+    return red, green, blue
+
+
+def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Camera], Camera]:
+    """A camera's size after --width, --height and --scale. Raises InputError for sizes that make no sense."""
+    for flag, value in (("--width", width), ("--height", height), ("--scale", scale)):
+        if value is not None and not 0 < value < float("inf"):
+            raise InputError(f"{flag} {value}: expected a number above 0")
+    if scale != 1 and (width or height):
+        raise InputError("--scale and --width or --height exclude each other")
+
+    def resize(camera: Camera) -> Camera:
+        across, down = width, height
+        if across is None:
+            across = round(camera.width * (down / camera.height if down else scale))
+        if down is None:
+            down = round(camera.height * (across / camera.width if width else scale))
+        if (across, down) == (camera.width, camera.height):
+            return camera
+        return camera.resized(max(1, across), max(1, down))
+
+    return resize
+
+
+def output_paths(pattern: str, names: list[str]) -> dict[str, Path]:
+    """The file of every image name. Raises InputError where two would be one, or one would leave the folder."""
+    if "{name}" not in pattern and len(names) > 1:
+        raise InputError(f"{pattern}: has no {{name}} in it, expected one to tell {len(names)} cameras apart")
+    paths: dict[str, Path] = {}
+    taken: dict[Path, str] = {}
+    for name in names:
+        pure = PurePosixPath(name)
+        if pure.is_absolute() or ".." in pure.parts:
+            raise InputError(f"image name {name!r} leads out of the output folder")
+        path = Path(pattern.replace("{name}", str(pure.with_suffix(""))))
+        if path in taken:
+            raise InputError(f"{path}: would be both {taken[path]} and {name}")
+        taken[path] = name
+        paths[name] = path
+    return paths
+
+
+def _load_model(path: Path) -> Gaussians:
+    """The Gaussians of a run or of a model file."""
+    from clsplat.gaussians import Gaussians
+    from clsplat.runs import Run
+
+    if not path.is_dir():
+        return Gaussians.load(path)
+    trained = Run.open(path)
+    if not trained.model_path.exists():
+        raise InputError(f"{trained.model_path}: no such file, the run has not written its model yet")
+    return Gaussians.load(trained.model_path)
+
+
+def _load_scene(path: Path, resolution: int, test_every: int) -> Scene:
+    """The scene, its warnings printed."""
+    from clsplat.scene import load_scene
+
+    scene = load_scene(path, resolution=resolution, test_every=test_every)
+    for warning in scene.warnings:
+        print(f"clsplat: warning: {warning}", file=sys.stderr)
+    return scene
+
+
+def _scores(record: dict[str, Any]) -> str:
+    names = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.4f}", "lpips": "LPIPS {:.4f}"}
+    return "  ".join(text.format(record[key]) for key, text in names.items() if key in record)
+
+
+def _print_summary(result: dict[str, Any]) -> None:
+    if result["views"]:
+        print(f"{len(result['views'])} held-out views  {_scores(result['mean'])}  {result['gaussians']:,} Gaussians")

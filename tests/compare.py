@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Comparisons that say what differs, where and by how much. Every test that uses one states why its tolerance."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def _pair(got: ArrayLike, wanted: ArrayLike, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    a, b = np.asarray(got, np.float64), np.asarray(wanted, np.float64)
+    assert a.shape == b.shape, f"{name}: got shape {a.shape}, wanted {b.shape}"
+    assert np.isfinite(b).all(), f"{name}: the wanted values are not all finite"
+    assert np.isfinite(a).all(), f"{name}: {np.count_nonzero(~np.isfinite(a))} of {a.size} values are not finite"
+    return a, b
+
+
+def assert_close(
+    got: ArrayLike, wanted: ArrayLike, relative: float = 0.0, absolute: float = 0.0, name: str = "array"
+) -> None:
+    """Every element within absolute + relative * |wanted|."""
+    a, b = _pair(got, wanted, name)
+    if a.size == 0:
+        return
+    excess = np.abs(a - b) - (absolute + relative * np.abs(b))
+    if (excess <= 0).all():
+        return
+    worst = tuple(int(i) for i in np.unravel_index(int(np.argmax(excess)), a.shape))
+    raise AssertionError(
+        f"{name}: {np.count_nonzero(excess > 0)} of {a.size} elements differ by more than {absolute:g} + "
+        f"{relative:g} |wanted|; worst at {worst}: got {a[worst]:.9g}, wanted {b[worst]:.9g}"
+    )
+
+
+def assert_close_images(
+    got: ArrayLike,
+    wanted: ArrayLike,
+    tolerance: float,
+    flips: float = 0.0,
+    flip_tolerance: float = 1.0,
+    ignore: NDArray[np.bool_] | None = None,
+    name: str = "image",
+) -> None:
+    """Images (H, W) or (H, W, C): every channel within `tolerance`, apart from `flips` (a ratio of the pixels, where
+    a threshold decided the other way), which must stay within `flip_tolerance`. `ignore` (H, W) masks pixels out of
+    both, for scenes whose margin band is known: give it or `flips`, not both."""
+    assert ignore is None or flips == 0.0, "a mask and a flip ratio together would hide errors"
+    a, b = _pair(got, wanted, name)
+    assert a.ndim in (2, 3), f"{name}: an image has 2 or 3 axes, not {a.ndim}"
+    error = np.abs(a - b)
+    if error.ndim == 3:
+        error = error.max(axis=2)
+    if ignore is not None:
+        assert ignore.shape == error.shape, f"{name}: mask {ignore.shape}, image {error.shape}"
+        assert not ignore.all(), f"{name}: the mask hides every pixel"
+        error = np.where(ignore, 0.0, error)
+    over = np.count_nonzero(error > tolerance)
+    worst = tuple(int(i) for i in np.unravel_index(int(np.argmax(error)), error.shape))
+    where = f"worst at (row, column) {worst}: got {a[worst]}, wanted {b[worst]}, difference {error[worst]:.3g}"
+    assert over <= flips * error.size, (
+        f"{name}: {over} of {error.size} pixels differ by more than {tolerance:g}, allowed are "
+        f"{int(flips * error.size)}; {where}"
+    )
+    assert error[worst] <= max(tolerance, flip_tolerance), f"{name}: a flip may not exceed {flip_tolerance:g}; {where}"
+
+
+def relative_error(got: ArrayLike, wanted: ArrayLike) -> float:
+    """|got - wanted| / |wanted| in the 2-norm over all elements; infinite where wanted is zero and got is not."""
+    a, b = np.asarray(got, np.float64), np.asarray(wanted, np.float64)
+    difference, norm = float(np.linalg.norm(a - b)), float(np.linalg.norm(b))
+    if norm == 0.0:
+        return 0.0 if difference == 0.0 else float("inf")
+    return difference / norm
+
+
+def cosine(got: ArrayLike, wanted: ArrayLike) -> float:
+    """Cosine of the angle between the arrays as vectors; 1 if both are zero, 0 if one is."""
+    a, b = np.asarray(got, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
+    norms = float(np.linalg.norm(a) * np.linalg.norm(b))
+    if norms == 0.0:
+        return 1.0 if not a.any() and not b.any() else 0.0
+    return float(a @ b) / norms
+
+
+def assert_close_gradient(
+    got: ArrayLike, wanted: ArrayLike, tolerance: float, minimum_cosine: float = 0.0, name: str = "gradient"
+) -> None:
+    """Relative error in norm at most `tolerance`, cosine at least `minimum_cosine`; the wanted gradient must not be
+    zero, or the test would show nothing."""
+    a, b = _pair(got, wanted, name)
+    assert b.any(), f"{name}: the wanted gradient is zero everywhere"
+    error, angle = relative_error(a, b), cosine(a, b)
+    if error <= tolerance and angle >= minimum_cosine:
+        return
+    worst = tuple(int(i) for i in np.unravel_index(int(np.argmax(np.abs(a - b))), a.shape))
+    raise AssertionError(
+        f"{name}: relative error {error:.3g} (allowed {tolerance:g}), cosine {angle:.9f} (at least {minimum_cosine:g})"
+        f"; worst at {worst}: got {a[worst]:.9g}, wanted {b[worst]:.9g}"
+    )
+
+
+def assert_same_bits(got: NDArray[Any], wanted: NDArray[Any], name: str = "array") -> None:
+    """Same dtype, shape and bytes; -0.0 and 0.0 differ, NaNs with one payload agree."""
+    assert got.dtype == wanted.dtype, f"{name}: got {got.dtype}, wanted {wanted.dtype}"
+    assert got.shape == wanted.shape, f"{name}: got shape {got.shape}, wanted {wanted.shape}"
+    if got.size == 0:
+        return
+    width = got.dtype.itemsize
+    a = np.ascontiguousarray(got).view(np.uint8).reshape(-1, width)
+    b = np.ascontiguousarray(wanted).view(np.uint8).reshape(-1, width)
+    different = (a != b).any(axis=1)
+    if not different.any():
+        return
+    first = tuple(int(i) for i in np.unravel_index(int(np.argmax(different)), got.shape))
+    raise AssertionError(
+        f"{name}: {np.count_nonzero(different)} of {got.size} elements differ in bits; first at {first}: "
+        f"got {got[first]!r}, wanted {wanted[first]!r}"
+    )

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small models for tests of files, and where the real ones are."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.gaussians import Gaussians
+
+SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
+
+
+def real_file(name: str) -> Path:
+    """A file or folder of the real data; skips the test where it is not there."""
+    path = SCENES / name
+    if not path.exists():
+        pytest.skip(f"{path} is not there (CLSPLAT_SCENES names the folder of the real data)")
+    return path
+
+
+def random_gaussians(count: int, degree: int = 3, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape: int) -> np.ndarray:
+        return rng.standard_normal(shape).astype(np.float32)
+
+    return Gaussians(
+        normal(count, 3), normal(count, 4), normal(count, 3), normal(count), normal(count, (degree + 1) ** 2, 3)
+    )
+
+
+def assert_equal(a: Gaussians, b: Gaussians) -> None:
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        left, right = getattr(a, name), getattr(b, name)
+        assert left.dtype == right.dtype == np.float32, name
+        assert left.flags.c_contiguous, name
+        assert right.flags.c_contiguous, name
+        np.testing.assert_array_equal(left, right, err_msg=name)

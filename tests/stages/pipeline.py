@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pipeline on a tiny scene, every intermediate on the host: what the stage tests look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device
+from clsplat.device.layout import SPLAT, TILE
+from clsplat.gaussians import Gaussians
+from clsplat.rendering import Frame, Rasterizer
+from clsplat.stages.project import DeviceGaussians, allocate_gaussians, download_gaussians, upload_gaussians
+
+BACKGROUND = (0.1, 0.2, 0.3)
+
+
+@dataclass
+class Pipeline:
+    """A rasterizer with one scene on its device."""
+
+    rasterizer: Rasterizer
+    gaussians: DeviceGaussians
+    camera: Camera
+    frame: Frame
+
+    @classmethod
+    def run(
+        cls, device: Device, scene: tuple[Gaussians, Camera], background: tuple[float, float, float] = BACKGROUND
+    ) -> Pipeline:
+        gaussians, camera = scene
+        rasterizer = Rasterizer(device)
+        on_device = upload_gaussians(device, gaussians)
+        frame = rasterizer.forward(on_device, camera, upload(device, np.array(background, np.float32)))
+        return cls(rasterizer, on_device, camera, frame)
+
+    def crop(self, planes: NDArray[Any]) -> NDArray[Any]:
+        """(..., rows, stride) without its padding, channels last."""
+        image = planes[..., : self.camera.height, : self.camera.width]
+        return np.ascontiguousarray(image.transpose(1, 2, 0)) if image.ndim == 3 else image
+
+    @property
+    def image(self) -> NDArray[np.float32]:
+        return self.crop(self.frame.blended.image.get())
+
+    def splat(self, *names: str) -> NDArray[np.float32]:
+        """Columns of the projected Gaussians."""
+        columns = [SPLAT.index(name) for name in names]
+        values: NDArray[np.float32] = self.frame.projected.splats.get()[:, columns]
+        return values
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        shown: NDArray[np.bool_] = self.frame.projected.tile_counts.get() > 0
+        return shown
+
+    def tiles_of(self) -> list[set[int]]:
+        """For each Gaussian the tiles whose lists hold it."""
+        lists = self.frame.lists
+        ranges, listed = lists.ranges.get(), lists.gaussian_from_sorted.get()
+        found: list[set[int]] = [set() for _ in range(self.gaussians.count)]
+        for tile, (begin, end) in enumerate(ranges):
+            for gaussian in listed[begin:end]:
+                found[gaussian].add(tile)
+        return found
+
+    def backward(
+        self, d_image: NDArray[np.float64], *, absolute: bool = False
+    ) -> tuple[Gaussians, NDArray[np.float32]]:
+        """Gradients of the parameters and of the means on the image from dL/dimage (H, W, 3)."""
+        device = self.rasterizer.device
+        height, width, _ = d_image.shape
+        planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
+        planes[:, :height, :width] = d_image.transpose(2, 0, 1)
+        gradients = allocate_gaussians(device, self.gaussians.count, self.gaussians.coefficients, zero=True)
+        screen = self.rasterizer.backward(
+            self.gaussians, self.frame, upload(device, planes), gradients, absolute=absolute
+        )
+        return download_gaussians(gradients), screen.get()

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""loss.cl and target.cl against the float64 twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from compare import assert_close, assert_close_gradient
+
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
+from clsplat.device.layout import TILE
+from clsplat.reference.loss import l1_dssim
+from clsplat.stages.loss import loss
+from clsplat.stages.target import target
+
+SIZES = ((1, 1), (11, 11), (16, 5), (17, 33), (5, 16), (63, 40))
+
+
+def padded(image: np.ndarray) -> np.ndarray:
+    height, width, _ = image.shape
+    planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
+    planes[:, :height, :width] = image.transpose(2, 0, 1)
+    return planes
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_loss_and_gradient(shaped_device: Device, size: tuple[int, int], weight: float) -> None:
+    width, height = size
+    rng = np.random.default_rng(width)
+    x = rng.random((height, width, 3)).astype(np.float32)
+    y = np.clip(x + rng.normal(0, 0.2, x.shape), 0, 1).astype(np.float32)
+    work = Workspace(shaped_device)
+    result = loss(
+        shaped_device, work, upload(shaped_device, padded(x)), upload(shaped_device, padded(y)), width, height, weight
+    )
+    value, gradient = l1_dssim(x.astype(np.float64), y.astype(np.float64), weight)
+    got, squared = result.read()
+    assert_close(got, value, relative=1e-5, absolute=1e-6)
+    assert_close(squared, np.mean((x.astype(np.float64) - y) ** 2), relative=1e-5)
+    planes = result.gradient.get()
+    # Variances are differences of windowed moments in float32: 1e-7 against C2 = 9e-4.
+    assert_close_gradient(planes[:, :height, :width].transpose(1, 2, 0), gradient, 1e-4)
+    assert not planes[:, :height, width:].any()
+
+
+def test_equal_images_have_no_loss(shaped_device: Device) -> None:
+    x = np.random.default_rng(0).random((20, 30, 3)).astype(np.float32)
+    array = upload(shaped_device, padded(x))
+    value, squared = loss(shaped_device, Workspace(shaped_device), array, array, 30, 20, 0.2).read()
+    assert abs(value) < 1e-6
+    assert squared == 0
+
+
+def test_a_smaller_image_after_a_larger_one(device: Device) -> None:
+    """The workspace's margins move with the size, and have to be zero again."""
+    rng, work = np.random.default_rng(0), Workspace(device)
+    for width, height in ((70, 50), (23, 19), (41, 60)):
+        x, y = rng.random((2, height, width, 3)).astype(np.float32)
+        result = loss(device, work, upload(device, padded(x)), upload(device, padded(y)), width, height, 0.2)
+        assert_close(result.read()[0], l1_dssim(x.astype(float), y.astype(float), 0.2)[0], relative=1e-5)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_target_composites_alpha(device: Device, channels: int, dtype: type) -> None:
+    rng = np.random.default_rng(channels)
+    levels = rng.integers(0, 256, (19, 37, channels))
+    image = levels.astype(np.uint8) if dtype is np.uint8 else (levels / 255).astype(np.float32)
+    background = np.array([0.2, 0.5, 0.9], np.float32)
+    planes = target(device, Workspace(device), image, upload(device, background)).get()
+    values = levels / 255
+    wanted = values[:, :, :3]
+    if channels == 4:
+        wanted = wanted * values[:, :, 3:] + background * (1 - values[:, :, 3:])
+    assert_close(planes, padded(wanted), absolute=2e-7)

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""project.cl and project_grad.cl against the float64 twin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from compare import assert_close, assert_close_gradient
+from pipeline import Pipeline
+
+from clsplat.device.context import Device
+from clsplat.reference import render as reference
+
+WHITEN = np.sqrt(np.log2(np.e) / 2)
+
+
+@pytest.mark.parametrize("name", scenes.NAMED)
+def test_projection(device: Device, name: str) -> None:
+    scene = scenes.NAMED[name]()
+    run, wanted = Pipeline.run(device, scene), reference.forward(*scene).projected
+    shown = run.visible
+    # Every Gaussian with a tile is visible to the twin; the twin also keeps those that reach no tile.
+    assert not np.any(shown & ~wanted.visible)
+    size = max(run.camera.width, run.camera.height)
+    # float32 of camera coordinates: a few ulp, times the focal length over the depth.
+    assert_close(run.splat("MX", "MY")[shown], wanted.means2d[shown], relative=1e-5, absolute=2e-6 * size)
+    assert_close(run.splat("DEPTH")[shown, 0], wanted.depths[shown], relative=1e-6)
+    assert_close(run.splat("RED", "GREEN", "BLUE")[shown], wanted.colors[shown], absolute=2e-6)
+    assert_close(2 ** run.splat("LOG2O")[shown, 0], wanted.opacities[shown], relative=2e-6)
+    # Relative to the row's own size: l12 passes through zero.
+    whitening = wanted.whitening[shown]
+    scale = np.abs(whitening).max(axis=1, keepdims=True)
+    # 1e-5 where the covariance is well conditioned; a needle's root has lost digits to its axis ratio before.
+    tolerance = 2e-3 if name == "needles" else 1e-5
+    assert_close(run.splat("L11", "L12", "L22")[shown] / WHITEN / scale, whitening / scale, absolute=tolerance)
+
+
+@pytest.mark.parametrize("name", scenes.NAMED)
+def test_gradients(shaped_device: Device, name: str) -> None:
+    scene = scenes.NAMED[name]()
+    run = Pipeline.run(shaped_device, scene)
+    forward = reference.forward(*scene, margins=True)
+    # The image's gradient is zero where a threshold may fall the other way in float32.
+    d_image = np.random.default_rng(1).standard_normal((run.camera.height, run.camera.width, 3))
+    d_image[forward.blended.margin < 1e-4] = 0
+    got, screen = run.backward(d_image)
+    wanted = reference.render_grad(*scene, d_image, (0.1, 0.2, 0.3))
+    for group in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        # Needles: the covariance's condition number is 1e8 there; issue: re-derive until it is 1e-4.
+        tolerance = 1e-2 if name == "needles" else 1e-4
+        assert_close_gradient(getattr(got, group), wanted.parameters[group], tolerance, name=group)
+    shown = run.visible
+    assert_close_gradient(screen[shown], wanted.means2d[shown], 1e-3 if name == "needles" else 1e-4)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_every_sh_degree(device: Device, degree: int) -> None:
+    scene = scenes.random_cloud(60, 11, 40, 30, degree=degree)
+    run = Pipeline.run(device, scene)
+    wanted = reference.forward(*scene).projected
+    assert_close(run.splat("RED", "GREEN", "BLUE")[run.visible], wanted.colors[run.visible], absolute=2e-6)
+    d_image = np.ones((30, 40, 3))
+    got, _ = run.backward(d_image)
+    assert_close_gradient(got.sh, reference.render_grad(*scene, d_image, (0.1, 0.2, 0.3)).parameters["sh"], 1e-4)
+
+
+def test_absolute_screen_gradients(shaped_device: Device) -> None:
+    scene = scenes.overlap()
+    run = Pipeline.run(shaped_device, scene)
+    d_image = np.random.default_rng(2).standard_normal((run.camera.height, run.camera.width, 3))
+    plain, screen = run.backward(d_image)
+    absolute, absolute_screen = run.backward(d_image, absolute=True)
+    wanted = reference.render_grad(*scene, d_image, (0.1, 0.2, 0.3))
+    shown = run.visible
+    assert_close_gradient(absolute_screen[shown], wanted.abs_means2d[shown], 1e-4)
+    assert np.all(absolute_screen[shown] >= np.abs(screen[shown]) * (1 - 1e-4) - 1e-6)
+    assert_close_gradient(plain.means, absolute.means, 1e-5)
+
+
+def test_culled_gaussians_get_no_gradient(device: Device) -> None:
+    scene = scenes.off_frustum()
+    run = Pipeline.run(device, scene)
+    got, _ = run.backward(np.ones((run.camera.height, run.camera.width, 3)))
+    hidden = ~run.visible
+    assert hidden.any()
+    for group in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        assert not getattr(got, group)[hidden].any()
+
+
+def test_radial_quaternion_gradient_is_zero(device: Device) -> None:
+    gaussians, camera = scenes.overlap()
+    run = Pipeline.run(device, (gaussians, camera))
+    got, _ = run.backward(np.random.default_rng(3).standard_normal((camera.height, camera.width, 3)))
+    radial = np.abs((got.quaternions * gaussians.quaternions).sum(axis=1))
+    size = np.linalg.norm(got.quaternions, axis=1) * np.linalg.norm(gaussians.quaternions, axis=1)
+    assert np.all(radial <= 1e-5 * size + 1e-7)
+
+
+@pytest.mark.parametrize("group", ["means", "quaternions", "log_scales", "opacity_logits", "sh"])
+def test_a_gaussian_that_is_not_finite_is_culled_alone(device: Device, group: str) -> None:
+    gaussians, camera = scenes.overlap()
+    arrays = {n: getattr(gaussians, n).copy() for n in ("means", "quaternions", "log_scales", "opacity_logits", "sh")}
+    arrays[group][3] = np.nan
+    run = Pipeline.run(device, (replace(gaussians, **arrays), camera))
+    assert np.isfinite(run.image).all()
+    others = {n: np.delete(a, 3, axis=0) for n, a in arrays.items()}
+    without = Pipeline.run(device, (replace(gaussians, **others), camera)).image
+    if group != "sh":  # a colour that is NaN shows as black, it does not hide the shape
+        np.testing.assert_array_equal(run.image, without)

@@ -1,0 +1,512 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line as a user calls it. What computes is replaced by fakes here; the pipeline has its own tests."""
+
+import errno
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from models import random_gaussians
+
+from clsplat import verbs
+from clsplat.camera import Camera
+from clsplat.cli import Eval, Train, main, parse
+from clsplat.config import TrainConfig
+from clsplat.errors import ClsplatError, DeviceError, InputError
+from clsplat.gaussians import Gaussians
+from clsplat.runs import Run
+
+Capture = pytest.CaptureFixture[str]
+
+
+def camera(width: int = 32, height: int = 24) -> Camera:
+    return Camera(width, height, 30.0, 31.0, width / 2, height / 2, np.eye(3), np.zeros(3))
+
+
+@dataclass
+class FakeView:
+    name: str
+    split: str
+    camera: Camera = field(default_factory=camera)
+
+    def load(self) -> np.ndarray:
+        return np.full((self.camera.height, self.camera.width, 3), 0.5, np.float32)
+
+
+@dataclass
+class Pipeline:
+    """What the fakes were asked for, and what they are to do."""
+
+    calls: list[tuple[Any, ...]] = field(default_factory=list)
+    written: dict[str, np.ndarray] = field(default_factory=dict)
+    cameras: dict[str, Camera] = field(default_factory=lambda: {"a.jpg": camera(), "sub/b.c.jpg": camera(20, 40)})
+    training: Callable[..., None] = lambda *_: None
+
+
+@pytest.fixture
+def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
+    """Stands in for scene, device, trainer, renderer and image files."""
+    pipe = Pipeline()
+
+    @dataclass
+    class Scene:
+        views: list[FakeView]
+        warnings: list[str]
+
+    @dataclass
+    class Result:
+        image: np.ndarray
+        alpha: np.ndarray
+
+    @dataclass
+    class Report:
+        step: int
+        loss: float = 0.1
+        psnr: float = 20.0
+        gaussians: int = 4
+        seconds: float = 1.0
+
+    class Renderer:
+        def __init__(self, device: object) -> None:
+            assert device == "device"
+
+        def render(self, gaussians: Gaussians, camera: Camera, background: tuple[float, ...] = (0, 0, 0)) -> Result:
+            pipe.calls.append(("render", len(gaussians), camera.width, camera.height, tuple(background)))
+            size = (camera.height, camera.width)
+            return Result(np.full((*size, 3), 0.25, np.float32), np.full(size, 0.5, np.float32))
+
+    def load_scene(path: Path, *, resolution: int, test_every: int) -> Scene:
+        if not Path(path).is_dir():
+            raise InputError(f"{path}: no such folder")
+        pipe.calls.append(("load_scene", str(path), resolution, test_every))
+        views = [FakeView("0.jpg", "test"), FakeView("1.jpg", "train")]
+        return Scene(views if test_every else views[1:], ["one photo is dark"])
+
+    def train(scene: Scene, config: TrainConfig, *, device: str, run: Run, resume: bool, on_step: Any) -> Gaussians:
+        pipe.calls.append(("train", config.iterations, config.seed, resume))
+        on_step(Report(1))
+        pipe.training(run, on_step)
+        gaussians = random_gaussians(4)
+        run.save_model(gaussians)
+        run.append_metrics({"step": config.iterations, "loss": 0.1, "gaussians": 4, "seconds": 2.5})
+        run.write_eval({"step": 1, "gaussians": 4, "seconds": 2.5, "mean": {"psnr": 20.0, "ssim": 0.5}, "views": [{}]})
+        return gaussians
+
+    def open_device(selector: str | None) -> str:
+        if selector == "nosuch":
+            raise DeviceError("--device nosuch: no such device")
+        return "device"
+
+    fakes: dict[str, dict[str, Any]] = {
+        "scene": {"load_scene": load_scene},
+        "training": {"train": train},
+        "rendering": {"Renderer": Renderer},
+        "device.context": {"open_device": open_device},
+        "colmap": {"read_cameras": lambda _: pipe.cameras},
+        "images": {"write_image": lambda path, image: pipe.written.update({str(path): image})},
+    }
+    for name, members in fakes.items():
+        module = ModuleType(f"clsplat.{name}")
+        vars(module).update(members)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    return pipe
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> str:
+    (tmp_path / "scene").mkdir()
+    return str(tmp_path / "scene")
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> str:
+    path = tmp_path / "some.ply"
+    random_gaussians(4).save(path)
+    return str(path)
+
+
+def error_line(capsys: Capture) -> str:
+    """The one line on standard error, and nothing on standard output."""
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert captured.out == "", captured
+    assert len(lines) == 1, captured
+    assert lines[0].startswith("clsplat: error: ")
+    return lines[0]
+
+
+@pytest.mark.parametrize("verb", ["devices", "demo", "sfm", "train", "eval", "render"])
+def test_help(verb: str, capsys: Capture) -> None:
+    assert main([verb, "--help"]) == 0
+    assert f"usage: clsplat {verb}" in capsys.readouterr().out
+    assert main(["--help"]) == 0
+    assert verb in capsys.readouterr().out
+
+
+def test_every_training_flag_has_help(capsys: Capture) -> None:
+    main(["train", "--help"])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for part in (
+        "--dssim-weight FLOAT Weight of D-SSIM",
+        "--density.split-factor FLOAT A split",
+        "--eval-at STEP,STEP,",
+    ):
+        assert part in text
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = "import sys, clsplat, clsplat.cli; clsplat.cli.main(['train', '--help']); "
+    code += "heavy = {'pyopencl', 'pycolmap', 'scipy', 'skimage', 'OpenImageIO'} & set(sys.modules); "
+    code += "sys.exit(str(heavy) if heavy else 0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_flags_become_the_config() -> None:
+    line = "train S -o R --iterations 50 --eval-at 10,20,30 --warmup 5 --optimiser.beta1 0.8 --density.every 0"
+    verb = parse([*line.split(), "--density.absolute-gradients", "--background", "random", "--device", "gpu"])
+    assert isinstance(verb, Train)
+    assert (verb.scene, verb.output, verb.device) == (Path("S"), Path("R"), "gpu")
+    config = verb.config
+    assert (config.iterations, config.eval_at, config.warmup) == (50, (10, 20, 30), (5,))
+    assert (config.optimiser.beta1, config.density.every, config.density.absolute_gradients) == (0.8, 0, True)
+    assert config.background == "random"
+    assert config.seed == TrainConfig().seed
+    assert parse(["train", "S", "--output", "R"]) == Train(Path("R"), Path("S"))
+    assert parse(["train", "S", "-o", "R", "--warmup", ""]).config.warmup == ()  # type: ignore[union-attr]
+    assert parse(["eval", "R"]) == Eval(Path("R"))
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("", "Expected one of"),
+        ("trian", "trian"),
+        ("train S", "--output"),
+        ("train S -o R --iterations many", "many"),
+        ("train S -o R --eval-at 1,x", "'1,x' is not a list of steps, expected such as 500,1000,2000"),
+        ("train S -o R --background green", "green"),
+        ("train S -o R --nosuch 3", "--nosuch"),
+        ("render M -o R", "--cameras"),
+    ],
+)
+def test_wrong_calls_are_one_line(line: str, message: str, capsys: Capture) -> None:
+    assert main(line.split()) == 2
+    assert message in error_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--sh-degree 4", "--sh-degree 4: expected 0 to 3"),
+        ("--iterations 0", "--iterations 0: expected at least 1"),
+        ("--eval-at 20,10", "--eval-at 20,10: expected steps"),
+        ("--dssim-weight 2", "--dssim-weight 2.0"),
+        ("--test-every -1", "--test-every -1"),
+    ],
+)
+def test_settings_without_sense(flags: str, message: str, scene: str, tmp_path: Path, capsys: Capture) -> None:
+    assert main(["train", scene, "-o", str(tmp_path / "run"), *flags.split()]) == 2
+    assert message in error_line(capsys)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (ClsplatError("work\nfailed"), 1),
+        (InputError("input is wrong"), 2),
+        (OSError(errno.ENOSPC, "No space left on device", "/full/model.ply"), 1),
+    ],
+)
+def test_exit_status(error: Exception, status: int, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    def fail(verb: object) -> int:
+        raise error
+
+    monkeypatch.setattr(verbs, "run", fail)
+    monkeypatch.delenv("CLSPLAT_DEBUG", raising=False)
+    assert main(["devices"]) == status
+    line = error_line(capsys)
+    assert " ".join(str(error).split()) in line
+    monkeypatch.setenv("CLSPLAT_DEBUG", "1")
+    assert main(["devices"]) == status
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_interrupted_anywhere(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    def interrupt(verb: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(verbs, "run", interrupt)
+    assert main(["devices"]) == 130
+    assert capsys.readouterr().err == "clsplat: interrupted\n"
+
+
+def test_warnings_are_lines(model: str, scene: str, pipeline: Pipeline, capsys: Capture) -> None:
+    with open(model, "ab") as file:
+        file.write(b"more")
+    assert main(["eval", model, "--scene", scene]) == 0
+    assert f"clsplat: warning: {model}: 4 bytes after the last Gaussian ignored\n" in capsys.readouterr().err
+
+
+def test_sfm(scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    calls = []
+
+    def reconstruct(photos: Path, output: Path, *, progress: Callable[..., None], **options: object) -> Path:
+        progress("matching photos", 0.5)
+        calls.append((str(photos), options))
+        output.mkdir()
+        (output / "sfm.json").write_text('{"photos": 3}')
+        return output
+
+    fake = ModuleType("clsplat.sfm")
+    vars(fake).update(reconstruct=reconstruct, RECORD="sfm.json")
+    monkeypatch.setitem(sys.modules, "clsplat.sfm", fake)
+    assert main(["sfm", scene, "-o", str(tmp_path / "out"), "--matching", "sequential", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {"photos": 3}
+    assert captured.err.splitlines()[0] == "matching photos 50 %"
+    options = {"matching": "sequential", "camera_model": "OPENCV", "threads": None, "seed": 0, "overwrite": False}
+    assert calls == [(scene, options)]
+    assert main(["sfm", str(tmp_path / "none"), "-o", str(tmp_path / "out")]) == 2
+    assert "none: no such folder" in error_line(capsys)
+
+
+def test_train(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+    run = tmp_path / "runs" / "a"
+    assert main(["train", scene, "-o", str(run), "--iterations", "9", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["mean"]["psnr"] == 20
+    assert "clsplat: warning: one photo is dark" in captured.err
+    assert "step 1/9  loss 0.1000" in captured.err
+    assert pipeline.calls == [("load_scene", scene, 0, 8), ("train", 9, 0, False)]
+    assert Run.open(run).scene == Path(scene)
+
+
+def test_an_output_that_is_a_run(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+    run = tmp_path / "run"
+    assert main(["train", scene, "-o", str(run), "--iterations", "9", "--seed", "3"]) == 0
+    before = (run / "model.ply").read_bytes()
+    capsys.readouterr()
+    pipeline.calls.clear()
+    assert main(["train", scene, "-o", str(run)]) == 2
+    assert "already a run, use --resume" in error_line(capsys)
+    assert main(["train", scene, "-o", str(run), "--resume", "--overwrite"]) == 2
+    assert "exclude each other" in error_line(capsys)
+    assert main(["train", scene, "-o", scene, "--resume"]) == 2
+    assert "no run to resume" in error_line(capsys)
+    for wrong in (["/no/such/scene"], [scene, "--device", "nosuch"], []):
+        assert main(["train", *wrong, "-o", str(run), "--overwrite"]) == 2
+        assert "expected" in error_line(capsys) or wrong
+    assert (run / "model.ply").read_bytes() == before
+    assert not any(call[0] == "train" for call in pipeline.calls)
+
+    assert main(["train", scene, "-o", str(run), "--overwrite", "--iterations", "5"]) == 0
+    assert pipeline.calls[-1] == ("train", 5, 0, False)
+
+
+def test_resume_takes_the_runs_settings(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+    run = str(tmp_path / "run")
+    flags = ["--iterations", "9", "--seed", "3", "--density.absolute-gradients", "--warmup", "2,4"]
+    assert main(["train", scene, "-o", run, *flags]) == 0
+    assert main(["train", "--resume", "-o", run, "--iterations", "20"]) == 0
+    assert pipeline.calls[-2:] == [("load_scene", scene, 0, 8), ("train", 20, 3, True)]
+    assert main(["train", scene, "-o", run, *flags, "--resume"]) == 0  # the first call again, with one flag more
+    assert pipeline.calls[-1] == ("train", 9, 3, True)
+    config = Run.open(run).config
+    assert config.density.absolute_gradients
+    assert config.warmup == (2, 4)
+    capsys.readouterr()
+    assert main(["train", "--resume", "-o", run, "--seed", "4"]) == 2
+    assert "seed is 3 there" in error_line(capsys)
+
+
+def test_ctrl_c_leaves_a_resumable_run(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+    def interrupt(run: Run, on_step: object) -> None:
+        run.save_checkpoint(4, {}, {})
+        raise KeyboardInterrupt
+
+    pipeline.training = interrupt
+    run = str(tmp_path / "run")
+    assert main(["train", scene, "-o", run]) == 130
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == f"clsplat: interrupted at step 4; go on with: clsplat train -o {run} --resume"
+    pipeline.training = lambda *_: None
+    assert main(["train", "-o", run, "--resume"]) == 0
+
+
+def test_eval_of_a_run(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+    run = tmp_path / "run"
+    assert main(["train", scene, "-o", str(run), "--background", "white", "--iterations", "9"]) == 0
+    (run / "eval.json").unlink()
+    capsys.readouterr()
+    assert main(["eval", str(run), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result == json.loads((run / "eval.json").read_text())
+    assert (result["step"], result["gaussians"], result["seconds"]) == (9, 4, 2.5)
+    assert [view["name"] for view in result["views"]] == ["0.jpg"]
+    assert result["mean"]["psnr"] == pytest.approx(-20 * np.log10(0.25))
+    assert pipeline.calls[-1] == ("render", 4, 32, 24, (1, 1, 1))
+    assert list(pipeline.written) == [str(run / "test" / "0.png")]
+
+    assert main(["eval", str(run / "model.ply"), "--background", "black", "--resolution", "99"]) == 0
+    assert pipeline.calls[-2:] == [("load_scene", scene, 99, 8), ("render", 4, 32, 24, (0, 0, 0))]
+    assert "1 held-out views  PSNR 12.04 dB" in capsys.readouterr().out
+
+
+def test_eval_that_cannot_be(scene: str, model: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
+    cases = [
+        ([model], "expected --scene SCENE"),
+        ([model, "--scene", scene, "--test-every", "0"], "no view is held out"),
+        ([model, "--scene", scene, "--device", "nosuch"], "no such device"),
+        ([str(tmp_path / "none.ply"), "--scene", scene], "no such file"),
+        ([scene], "not a run"),
+    ]
+    for arguments, message in cases:
+        assert main(["eval", *arguments]) == 2, arguments
+        assert message in capsys.readouterr().err.splitlines()[-1]
+    Run.create(tmp_path / "new", TrainConfig(), scene=scene)
+    assert main(["eval", str(tmp_path / "new")]) == 2
+    assert "has not written its model yet" in error_line(capsys)
+
+
+@pytest.mark.parametrize("verb", ["eval", "render"])
+@pytest.mark.parametrize("trouble", ["property", "nan", "none", "truncated", "text"])
+def test_bad_models(verb: str, trouble: str, model: str, scene: str, pipeline: Pipeline, capsys: Capture) -> None:
+    path = Path(model)
+    head, data = path.read_bytes().split(b"end_header\n")
+    content, message = {
+        "property": (head.replace(b"float opacity", b"float opaque") + b"end_header\n" + data, "property opacity"),
+        "nan": (head + b"end_header\n" + np.float32(np.nan).tobytes() + data[4:], "1 of 4 Gaussians have a position"),
+        "none": (head.replace(b"vertex 4", b"vertex 0") + b"end_header\n", "0 Gaussians"),
+        "truncated": (path.read_bytes()[:-9], "truncated"),
+        "text": (b"hello", "not a PLY"),
+    }[trouble]
+    path.write_bytes(content)
+    rest = ["--scene", scene] if verb == "eval" else ["--cameras", scene, "-o", "{name}.png"]
+    assert main([verb, model, *rest]) == 2
+    line = error_line(capsys)
+    assert message in line
+    assert model in line
+    assert not pipeline.written
+
+
+def test_render(model: str, scene: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
+    pattern = str(tmp_path / "out" / "x_{name}_y.exr")
+    assert main(["render", model, "--cameras", scene, "-o", pattern, "--background", "0.5,0,1", "--json"]) == 0
+    records = json.loads(capsys.readouterr().out)
+    assert [record["name"] for record in records] == ["a.jpg", "sub/b.c.jpg"]
+    assert [Path(record["path"]) for record in records] == [
+        tmp_path / "out" / "x_a_y.exr",
+        tmp_path / "out" / "x_sub" / "b.c_y.exr",
+    ]
+    assert list(pipeline.written) == [record["path"] for record in records]
+    assert pipeline.calls == [("render", 4, 32, 24, (0.5, 0, 1)), ("render", 4, 20, 40, (0.5, 0, 1))]
+    assert pipeline.written[records[0]["path"]].shape == (24, 32, 3)
+
+
+@pytest.mark.parametrize(("extension", "colour"), [("exr", 0.25), ("png", 0.5)])
+def test_render_with_alpha(
+    extension: str, colour: float, model: str, scene: str, pipeline: Pipeline, tmp_path: Path
+) -> None:
+    assert main(["render", model, "--cameras", scene, "-o", f"{tmp_path}/{{name}}.{extension}", "--alpha"]) == 0
+    image = pipeline.written[f"{tmp_path}/a.{extension}"]
+    np.testing.assert_allclose(image, np.broadcast_to([colour] * 3 + [0.5], (24, 32, 4)))
+
+
+def test_straight_alpha_where_nothing_is() -> None:
+    image = verbs.with_alpha(np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32), straight=True)
+    np.testing.assert_array_equal(image, np.zeros((1, 1, 4)))
+
+
+@pytest.mark.parametrize(
+    ("flags", "size"),
+    [
+        ("--width 64", (64, 48)),
+        ("--height 12", (16, 12)),
+        ("--scale 0.5", (16, 12)),
+        ("--width 10 --height 5", (10, 5)),
+    ],
+)
+def test_render_sizes(
+    flags: str, size: tuple[int, int], model: str, scene: str, pipeline: Pipeline, tmp_path: Path
+) -> None:
+    pipeline.cameras = {"a.jpg": camera()}
+    assert main(["render", model, "--cameras", scene, "-o", str(tmp_path / "one.png"), *flags.split()]) == 0
+    assert pipeline.calls == [("render", 4, *size, (0, 0, 0))]
+
+
+def test_render_that_cannot_be(model: str, scene: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
+    out = str(tmp_path / "{name}.png")
+    cases = [
+        (["--cameras", scene, "-o", str(tmp_path / "one.png")], "has no {name} in it, expected one to tell 2 cameras"),
+        (["--cameras", scene, "-o", str(tmp_path / "{name}.tga")], "extension '.tga', expected .png or .exr"),
+        (["--cameras", scene, "-o", str(tmp_path / "{name}")], "extension 'none'"),
+        (["--cameras", str(tmp_path / "none"), "-o", out], "none: no such folder"),
+        (["--cameras", scene, "-o", out, "--background", "red"], "expected black, white or three numbers"),
+        (["--cameras", scene, "-o", out, "--background", "1,2,3"], "expected black, white or three numbers"),
+        (["--cameras", scene, "-o", out, "--background", "white", "--alpha"], "exclude each other"),
+        (["--cameras", scene, "-o", out, "--width", "0"], "--width 0: expected a number above 0"),
+        (["--cameras", scene, "-o", out, "--scale", "2", "--width", "9"], "exclude each other"),
+        (["--cameras", scene, "-o", out, "--device", "nosuch"], "no such device"),
+    ]
+    for arguments, message in cases:
+        assert main(["render", model, *arguments]) == 2, arguments
+        assert message in error_line(capsys)
+    for names, message in [
+        (["a.jpg", "a.png"], "would be both a.jpg and a.png"),
+        (["../../a.jpg"], "leads out of the output folder"),
+        ([], "has no images"),
+    ]:
+        pipeline.cameras = {name: camera() for name in names}
+        assert main(["render", model, "--cameras", scene, "-o", out]) == 2
+        assert message in error_line(capsys)
+    assert not pipeline.written
+
+
+def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "clsplat", *arguments], capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def test_devices_for_real() -> None:
+    listed = command("devices", "--json")
+    assert listed.returncode == 0, listed.stderr
+    devices = json.loads(listed.stdout)
+    assert devices
+    assert {"index", "name", "platform", "version", "kind"} <= devices[0].keys()
+    assert devices[0]["name"] in command("devices").stdout
+
+
+@pytest.mark.parametrize("arguments", [["train", "SCENE", "-o", "RUN"], ["eval", "MODEL", "--scene", "SCENE"]])
+def test_unknown_device_for_real(arguments: list[str], scene: str, model: str, tmp_path: Path) -> None:
+    places = {"SCENE": scene, "RUN": str(tmp_path / "run"), "MODEL": model}
+    done = command(*(places.get(word, word) for word in arguments), "--device", "no such thing")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("clsplat: error: --device no such thing: ")
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_no_such_scene_for_real(tmp_path: Path) -> None:
+    done = command("train", str(tmp_path / "none"), "-o", str(tmp_path / "run"))
+    assert done.returncode == 2
+    assert str(tmp_path / "none") in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_reader_that_goes_away() -> None:
+    shell = f"{sys.executable} -m clsplat train --help | head -1"
+    done = subprocess.run(shell, shell=True, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.startswith("usage: clsplat train")
+    assert done.stderr == ""

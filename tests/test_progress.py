@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Progress as plain lines and as a bar."""
+
+import io
+from dataclasses import dataclass
+
+from clsplat.progress import StageProgress, TrainProgress, duration
+
+
+@dataclass
+class Report:
+    step: int
+    loss: float = 0.5
+    psnr: float = 20.0
+    gaussians: int = 12345
+    seconds: float = 0.0
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_plain_lines_now_and_then() -> None:
+    stream, now = io.StringIO(), [0.0]
+    with TrainProgress(100, stream, lambda: now[0]) as progress:
+        for step in range(1, 51):
+            now[0] += 0.5
+            progress(Report(step, seconds=now[0]))
+    lines = stream.getvalue().splitlines()
+    assert lines[0] == "step 20/100  loss 0.5000  PSNR 20.00  12,345 Gaussians  2.0 it/s  0:40 left"
+    assert [line.split()[1] for line in lines] == ["20/100", "40/100", "50/100"]
+
+
+def test_rate_counts_from_where_a_resumed_run_began() -> None:
+    progress = TrainProgress(2000, io.StringIO(), lambda: 0.0)
+    assert progress.rate() == 0
+    progress(Report(1001, seconds=500))
+    progress(Report(1011, seconds=505))
+    assert progress.rate() == 2
+
+
+def test_a_bar_on_a_terminal() -> None:
+    stream = Terminal()
+    with TrainProgress(10, stream) as progress:
+        progress(Report(10))
+    assert "step 10/10" in stream.getvalue()
+    assert "PSNR 20.00" in stream.getvalue()
+
+
+def test_stages_are_told_apart() -> None:
+    stream, now = io.StringIO(), [0.0]
+    progress = StageProgress(stream, lambda: now[0])
+    for stage, fraction in [("features", None), ("features", 0.5), ("matching", 0.0), ("matching", 1.0)]:
+        progress(stage, fraction)
+    now[0] = 11
+    progress("matching", 0.25)
+    assert stream.getvalue().splitlines() == ["features", "matching 0 %", "matching 100 %", "matching 25 %"]
+
+
+def test_durations() -> None:
+    assert [duration(s) for s in (0, 59.6, 61, 3600, 36061)] == ["0:00", "1:00", "1:01", "1:00:00", "10:01:01"]
