@@ -60,7 +60,7 @@ class Sfm:
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Match every pair of photos, or neighbours in the order of their names only (for video frames); auto is every
     pair up to 100 photos."""
-    camera_model: Annotated[str, arg(metavar="MODEL")] = "OPENCV"
+    camera_model: Annotated[str, arg(metavar="MODEL")] = "auto"
     """COLMAP's model of the lens; the scene's images are undistorted with it."""
     threads: Annotated[int | None, arg(metavar="INT")] = None
     """CPU threads; all cores if not given."""

@@ -83,7 +83,7 @@ def plan(
 
 
 def split_halves(
-    config: DensityConfig, means: Float32, quaternions: Float32, log_scales: Float32, rng: np.random.Generator
+    config: DensityConfig, *, means: Float32, quaternions: Float32, log_scales: Float32, rng: np.random.Generator
 ) -> tuple[Float32, Float32]:
     """Means and log scales of halves: drawn from the Gaussian they come from, and smaller. (m, 3), (m, 4), (m, 3)."""
     offsets = rng.standard_normal(means.shape) * np.exp(log_scales.astype(np.float64))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
+from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device, open_device
 from clsplat.gaussians import Gaussians
 from clsplat.stages.blend import Blended, blend, blend_grad
@@ -129,7 +129,7 @@ class Renderer:
         blended = self._rasterizer.forward(on_device, camera, self._background).blended
         height, width = camera.height, camera.width
         planes = blended.image.get()[:, :height, :width]
-        alpha = 1.0 - blended.transmittance.get()[:height, :width]
+        alpha: Float32 = np.float32(1) - blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(planes.transpose(1, 2, 0)), alpha)
 
 
@@ -142,6 +142,3 @@ def render(
 ) -> RenderResult:
     """Render one view on the device that `device` names (see `clsplat devices`). Raises DeviceError."""
     return Renderer(open_device(device)).render(gaussians, camera, background)
-
-
-__all__ = ["Frame", "Rasterizer", "RenderResult", "Renderer", "render", "upload"]

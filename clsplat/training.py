@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training: the step on one screen, and what surrounds it."""
+"""Training from start to end: the loop around the trainer's step, and what it leaves in a run's folder."""
 
 from __future__ import annotations
 
@@ -15,28 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat import density
 from clsplat.config import TrainConfig
-from clsplat.device.buffers import allocate, upload
 from clsplat.device.context import Device, open_device
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError
 from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
-from clsplat.initialise import from_points, random_points
-from clsplat.rendering import Rasterizer, Renderer
-from clsplat.runs import Checkpoint, Run
-from clsplat.stages.adam import adam
-from clsplat.stages.density import NO_ROW, DensityStatistics, add_statistics, gather, new_statistics, widen
-from clsplat.stages.loss import Loss, loss
-from clsplat.stages.project import (
-    GROUPS,
-    DeviceGaussians,
-    allocate_gaussians,
-    download_gaussians,
-    group_shapes,
-    upload_gaussians,
-)
-from clsplat.stages.target import target
+from clsplat.rendering import Renderer
+from clsplat.runs import Run
+from clsplat.stages.loss import Loss
+from clsplat.trainer import Trainer
 
 if TYPE_CHECKING:
     from clsplat.scene import Scene, View
@@ -56,224 +43,6 @@ class StepReport:
     seconds: float
 
 
-class Photographs:
-    """The training views' pixels at one resolution, decoded once each; uint8 where that holds them exactly."""
-
-    def __init__(self, views: list[View]) -> None:
-        self._views = views
-        self._factor = 0
-        self._held: dict[int, NDArray[Any]] = {}
-
-    def load(self, index: int, factor: int) -> NDArray[Any]:
-        """View `index` at 1/factor of its size, (H, W, 3 or 4), straight alpha."""
-        if factor != self._factor:
-            self._factor = factor
-            self._held.clear()
-        if index not in self._held:
-            camera = self._views[index].camera
-            image = self._views[index].load(max(camera.width // factor, 1), max(camera.height // factor, 1))
-            levels = np.rint(image * 255)
-            exact = np.array_equal((levels / np.float32(255)).astype(np.float32), image) and levels.max() <= 255
-            self._held[index] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
-        return self._held[index]
-
-
-class Trainer:
-    """A model in training: parameters, moments, statistics and the random state, all of which a checkpoint holds."""
-
-    def __init__(self, scene: Scene, config: TrainConfig, device: Device) -> None:
-        self.scene, self.config, self.device = scene, config, device
-        self.views = scene.train_views
-        if not self.views:
-            raise InputError(f"{scene.name}: no training views, use a larger --test-every")
-        self.rasterizer = Rasterizer(device)
-        self.photographs = Photographs(self.views)
-        self.rng = np.random.default_rng(config.seed)
-        self.step = 0
-        self.queue: list[int] = []
-        self.background = allocate(device, (3,), np.float32)
-        self._set_parameters(self._initial())
-
-    def _initial(self) -> DeviceGaussians:
-        points, colors = self.scene.points, self.scene.point_colors
-        if len(points) == 0:
-            low, high = self.scene.bounds
-            points, colors = random_points(self.config.random_points, low, high, self.rng)
-        return upload_gaussians(self.device, from_points(points, colors, sh_degree=0))
-
-    def _set_parameters(
-        self,
-        parameters: DeviceGaussians,
-        first: DeviceGaussians | None = None,
-        second: DeviceGaussians | None = None,
-    ) -> None:
-        count, coefficients = parameters.count, parameters.coefficients
-        self.parameters = parameters
-        self.first = first or allocate_gaussians(self.device, count, coefficients, zero=True)
-        self.second = second or allocate_gaussians(self.device, count, coefficients, zero=True)
-        self.gradients = allocate_gaussians(self.device, count, coefficients, zero=True)
-        self.statistics = new_statistics(self.device, count)
-
-    def train_step(self) -> Loss:
-        """Density control as the last step left it to do, then one view: forward, loss, backward, Adam.
-
-        Kerbl et al. 2023, algorithm 1, but for where the loop is cut: a model is looked at, kept or finished before
-        its Gaussians are split or made transparent, not just after.
-        """
-        config, device, work = self.config, self.device, self.rasterizer.work
-        self._control_density()
-        self.step += 1
-        self._raise_sh_degree()
-        view, factor = self._next_view(), self._factor()
-        image = self.photographs.load(view, factor)
-        camera = self.views[view].camera.resized(image.shape[1], image.shape[0])
-        self.background.set(self._background_colour())
-
-        planes = target(device, work, image, self.background)
-        frame = self.rasterizer.forward(self.parameters, camera, self.background)
-        result = loss(device, work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight)
-        screen = self.rasterizer.backward(
-            self.parameters,
-            frame,
-            result.gradient,
-            self.gradients,
-            absolute=config.density.absolute_gradients,
-        )
-        if self.step <= config.density.stop:
-            ranks = frame.pairs.gaussian_from_rank
-            add_statistics(device, self.statistics, camera, ranks, screen, frame.projected.splats)
-        optimiser = config.optimiser
-        adam(
-            device,
-            self.step,
-            self.rates(),
-            optimiser.beta1,
-            optimiser.beta2,
-            optimiser.epsilon,
-            self.parameters,
-            self.gradients,
-            self.first,
-            self.second,
-        )
-        return result
-
-    def rates(self) -> dict[str, float]:
-        """Learning rate of each group at this step; the means' falls exponentially."""
-        optimiser = self.config.optimiser
-        fraction = min(self.step / optimiser.means_rate_steps, 1.0)
-        means_rate = optimiser.means_rate ** (1 - fraction) * optimiser.means_rate_end**fraction
-        return {
-            "means": means_rate * self.scene.extent,
-            "quaternions": optimiser.quaternions_rate,
-            "log_scales": optimiser.scales_rate,
-            "opacity_logits": optimiser.opacities_rate,
-            "sh_dc": optimiser.sh_dc_rate,
-            "sh_rest": optimiser.sh_rest_rate,
-        }
-
-    def _factor(self) -> int:
-        return 1 << sum(self.step <= end for end in self.config.warmup)
-
-    def _next_view(self) -> int:
-        if not self.queue:
-            self.queue = [int(index) for index in self.rng.permutation(len(self.views))]
-        return self.queue.pop()
-
-    def _background_colour(self) -> NDArray[np.float32]:
-        if self.config.background == "random":
-            return self.rng.random(3, dtype=np.float32)
-        return np.array(background_colour(self.config.background), np.float32)
-
-    def _raise_sh_degree(self) -> None:
-        """Bands that are not in use yet have no place in memory: their gradient, and so their step, would be zero."""
-        every = self.config.sh_degree_every
-        degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
-        coefficients = (degree + 1) ** 2
-        if coefficients > self.parameters.coefficients:
-            self.parameters = widen(self.device, self.parameters, coefficients)
-            self.first = widen(self.device, self.first, coefficients)
-            self.second = widen(self.device, self.second, coefficients)
-            self.gradients = widen(self.device, self.gradients, coefficients)
-
-    def _control_density(self) -> None:
-        config = self.config.density
-        if self.step == 0:
-            return
-        if density.is_due(config, self.step):
-            self._densify()
-        if density.is_reset_due(config, self.step, white=self.config.background == "white"):
-            logits = self.parameters["opacity_logits"]
-            logits.set(density.reset_opacities(config, logits.get()))
-            self.first["opacity_logits"].fill(0.0)
-            self.second["opacity_logits"].fill(0.0)
-
-    def _densify(self) -> None:
-        config, device = self.config.density, self.device
-        plan = density.plan(
-            config,
-            self.step,
-            self.scene.extent,
-            gradient_sums=self.statistics.gradient_sums.get(),
-            seen=self.statistics.seen.get(),
-            radii=self.statistics.radii.get(),
-            log_scales=self.parameters["log_scales"].get(),
-            opacity_logits=self.parameters["opacity_logits"].get(),
-        )
-        if len(plan.rows) == 0:
-            raise ClsplatError(f"step {self.step}: every Gaussian was pruned; lower --density.min-opacity")
-        moment_rows = np.where(plan.fresh, NO_ROW, plan.rows)
-        parameters = gather(device, plan.rows, self.parameters)
-        if plan.split.any():
-            host = {name: parameters[name].get() for name in ("means", "quaternions", "log_scales")}
-            means, log_scales = density.split_halves(
-                config, *(host[name][plan.split] for name in ("means", "quaternions", "log_scales")), self.rng
-            )
-            host["means"][plan.split], host["log_scales"][plan.split] = means, log_scales
-            parameters["means"].set(host["means"])
-            parameters["log_scales"].set(host["log_scales"])
-        self._set_parameters(
-            parameters, gather(device, moment_rows, self.first), gather(device, moment_rows, self.second)
-        )
-
-    def gaussians(self) -> Gaussians:
-        """The model so far, on the host, with room for the SH degree it is trained to."""
-        model = download_gaussians(self.parameters)
-        full = np.zeros((len(model), (self.config.sh_degree + 1) ** 2, 3), np.float32)
-        full[:, : model.sh.shape[1]] = model.sh
-        model.sh = full
-        return model
-
-    def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Everything that the steps to come depend on: arrays and JSON state."""
-        arrays = {f"statistics/{name}": getattr(self.statistics, name).get() for name in _STATISTICS}
-        for kind, source in (("parameters", self.parameters), ("first", self.first), ("second", self.second)):
-            arrays.update({f"{kind}/{group}": source[group].get() for group in GROUPS})
-        return arrays, {"rng": self.rng.bit_generator.state, "queue": self.queue}
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        self.step = checkpoint.step
-        self.rng.bit_generator.state = checkpoint.state["rng"]
-        self.queue = list(checkpoint.state["queue"])
-        loaded = [self._loaded(checkpoint, kind) for kind in ("parameters", "first", "second")]
-        self._set_parameters(*loaded)
-        self.statistics = DensityStatistics(
-            *(upload(self.device, checkpoint.arrays[f"statistics/{name}"]) for name in _STATISTICS)
-        )
-
-    def _loaded(self, checkpoint: Checkpoint, kind: str) -> DeviceGaussians:
-        host = {group: checkpoint.arrays[f"{kind}/{group}"] for group in GROUPS}
-        count, coefficients = len(host["means"]), host["sh_rest"].shape[1] + 1
-        for group, shape in group_shapes(count, coefficients).items():
-            if host[group].shape != shape:
-                raise InputError(f"checkpoint of step {checkpoint.step}: {kind}/{group} has shape {host[group].shape}")
-        arrays = {group: upload(self.device, values) for group, values in host.items()}
-        return DeviceGaussians(count, coefficients, arrays)
-
-
-_STATISTICS = ("gradient_sums", "seen", "radii")
-
-
 @contextmanager
 def _interruption() -> Iterator[Callable[[], bool]]:
     """Ctrl-C asks once, and the loop stops between two steps; a second one is Python's own."""
@@ -282,7 +51,7 @@ def _interruption() -> Iterator[Callable[[], bool]]:
         yield asked.is_set
         return
 
-    def ask(number: int, frame: FrameType | None) -> None:
+    def ask(_number: int, _frame: FrameType | None) -> None:
         asked.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -291,6 +60,79 @@ def _interruption() -> Iterator[Callable[[], bool]]:
         yield asked.is_set
     finally:
         signal.signal(signal.SIGINT, previous)
+
+
+class _Session:
+    """One call of `train`: a trainer, the run that it writes to, and the seconds that it has trained."""
+
+    def __init__(self, trainer: Trainer, run: Run | None) -> None:
+        self.trainer, self.run = trainer, run
+        self.renderer = Renderer(trainer.device)
+        self.seconds = 0.0
+        self.saved = 0
+
+    def resume(self) -> None:
+        """Go on from the latest checkpoint, if there is one."""
+        if self.run is not None and (checkpoint := self.run.load_latest_checkpoint()) is not None:
+            self.trainer.restore(checkpoint)
+            self.seconds = float(checkpoint.state["seconds"])
+            self.saved = checkpoint.step
+
+    def save(self) -> None:
+        """Write a checkpoint, unless this step has one."""
+        if self.run is not None and self.trainer.step > self.saved:
+            arrays, state = self.trainer.checkpoint()
+            self.run.save_checkpoint(self.trainer.step, arrays, {**state, "seconds": self.seconds})
+            self.saved = self.trainer.step
+
+    def report(self, result: Loss) -> StepReport:
+        """Read the loss of the step just made. Raises ClsplatError where it is not finite."""
+        start = time.perf_counter()
+        value, squared = result.read()
+        self.seconds += time.perf_counter() - start
+        if not np.isfinite(value):
+            raise ClsplatError(
+                f"step {self.trainer.step}: the loss is {value}; the last checkpoint is of step {self.saved}"
+            )
+        psnr = float(-10 * np.log10(max(squared, 1e-12)))
+        return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
+
+    def evaluate(self, *, keep: bool) -> dict[str, Any]:
+        """The held-out views; their renders are kept in the run's test/ if asked for."""
+        trainer, background = self.trainer, background_colour(self.trainer.config.background)
+
+        def render(view: View) -> NDArray[Any]:
+            return self.renderer.render(trainer.parameters, view.camera, background).image
+
+        return evaluate(
+            render,
+            trainer.scene.test_views,
+            background,
+            self.run.test_path if keep and self.run is not None else None,
+            step=trainer.step,
+            gaussians=trainer.parameters.count,
+            seconds=self.seconds,
+        )
+
+    def step(self, on_step: Callable[[StepReport], None] | None) -> None:
+        """One step, and what is due after it."""
+        trainer, config = self.trainer, self.trainer.config
+        start = time.perf_counter()
+        result = trainer.train_step()
+        self.seconds += time.perf_counter() - start
+        step = trainer.step
+        evaluating = step in config.eval_at and bool(trainer.scene.test_views)
+        if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
+            report = self.report(result)
+            if on_step is not None:
+                on_step(report)
+            record = asdict(report)
+            if evaluating:
+                record["eval"] = self.evaluate(keep=False)
+            if self.run is not None:
+                self.run.append_metrics(record)
+        if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
+            self.save()
 
 
 def train(
@@ -310,76 +152,21 @@ def train(
     KeyboardInterrupt on Ctrl-C after a checkpoint has been written.
     """
     config = config or TrainConfig()
+    config.check()
     opened = device if isinstance(device, Device) else open_device(device)
-    trainer = Trainer(scene, config, opened)
-    seconds = 0.0
-    if resume and run is not None and (checkpoint := run.load_latest_checkpoint()) is not None:
-        trainer.restore(checkpoint)
-        seconds = float(checkpoint.state["seconds"])
-
-    def save_checkpoint() -> None:
-        if run is not None:
-            arrays, state = trainer.checkpoint()
-            run.save_checkpoint(trainer.step, arrays, {**state, "seconds": seconds})
-
-    renderer = Renderer(opened)
-    saved = trainer.step
+    session = _Session(Trainer(scene, config, opened), run)
+    trainer = session.trainer
+    if resume:
+        session.resume()
     with _interruption() as interrupted:
         while trainer.step < config.iterations and not interrupted():
-            start = time.perf_counter()
-            result = trainer.train_step()
-            step = trainer.step
-            reporting = step % REPORT_EVERY == 0 or step == config.iterations
-            if reporting:
-                value, squared = result.read()
-            seconds += time.perf_counter() - start
-            evaluating = step in config.eval_at and bool(scene.test_views)
-            record: dict[str, Any] = {}
-            if reporting:
-                if not np.isfinite(value):
-                    raise ClsplatError(f"step {step}: the loss is {value}; the last checkpoint is of step {saved}")
-                report = StepReport(step, value, _psnr(squared), trainer.parameters.count, seconds)
-                record = asdict(report)
-                if on_step is not None:
-                    on_step(report)
-            elif evaluating:
-                record = {"step": step, "loss": result.read()[0], "gaussians": trainer.parameters.count,
-                          "seconds": seconds}
-            if evaluating:
-                record["eval"] = _evaluate(trainer, renderer, None, seconds)
-            if record and run is not None:
-                run.append_metrics(record)
-            if config.checkpoint_every > 0 and step % config.checkpoint_every == 0 and step < config.iterations:
-                save_checkpoint()
-                saved = step
-        if trainer.step > saved or trainer.step == config.iterations:
-            save_checkpoint()
+            session.step(on_step)
+        session.save()
         if trainer.step < config.iterations:
             raise KeyboardInterrupt
     model = trainer.gaussians()
     if run is not None:
         run.save_model(model)
         if scene.test_views:
-            run.write_eval(_evaluate(trainer, renderer, run, seconds))
+            run.write_eval(session.evaluate(keep=True))
     return model
-
-
-def _psnr(squared: float) -> float:
-    return float(-10 * np.log10(max(squared, 1e-12)))
-
-
-def _evaluate(trainer: Trainer, renderer: Renderer, run: Run | None, seconds: float) -> dict[str, Any]:
-    background = background_colour(trainer.config.background)
-
-    def render(view: View) -> NDArray[Any]:
-        return renderer.render(trainer.parameters, view.camera, background).image
-
-    return evaluate(
-        render,
-        trainer.scene.test_views,
-        background,
-        run.test_path if run is not None else None,
-        step=trainer.step,
-        gaussians=trainer.parameters.count,
-        seconds=seconds,
-    )

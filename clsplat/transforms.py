@@ -88,9 +88,7 @@ def read_transforms(path: Path) -> Transforms:
         split = None if held_out is None else "test" if _plain(listed) in held_out else "train"
         lens = _lens(keys, file)
         rotation, translation = _pose(keys)
-        name = str(PurePosixPath(_plain(listed)).with_suffix(file.suffix)) if file.suffix else _plain(listed)
-        if not _plain(listed).endswith(file.suffix):  # no extension in the list: a dot in the stem is part of it
-            name = _plain(listed) + file.suffix
+        name = _plain(listed) + file.name[len(PurePosixPath(_plain(listed)).name) :]  # with the extension found
         result.frames.append(Frame(name, file, lens, rotation, translation, split))
     names = [frame.name for frame in result.frames]
     if len(set(names)) < len(names):

@@ -22,7 +22,7 @@ def test_replaces_the_file(tmp_path: Path) -> None:
 def test_failure_in_the_middle_leaves_the_previous_file(tmp_path: Path, error: type[BaseException]) -> None:
     path = tmp_path / "model.ply"
     path.write_bytes(b"old")
-    with pytest.raises(type(error) if isinstance(error, OSError) else error):  # noqa: PT012, SIM117
+    with pytest.raises(type(error) if isinstance(error, OSError) else error):  # noqa: SIM117
         with atomic_writer(path) as file:
             file.write(b"half of the n")
             raise error

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 from clsplat.device.layout import header
@@ -22,7 +22,7 @@ def kernel_root() -> Path:
     raise FileNotFoundError(f"no kernels/ inside or beside {package}: the installation is incomplete")
 
 
-@lru_cache(maxsize=None)
+@cache
 def kernel_source(stem: str) -> str:
     """The layouts and the text of `stem`.cl, each `#include "..."` (relative to the kernel root) put in once.
 

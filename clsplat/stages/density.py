@@ -12,7 +12,7 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
-from clsplat.stages.project import GROUPS, DeviceGaussians, group_shapes
+from clsplat.stages.project import DeviceGaussians, group_shapes
 
 NO_ROW = np.uint32(0xFFFFFFFF)
 """In a list of rows: a row of zeros."""
@@ -82,6 +82,3 @@ def widen(device: Device, source: DeviceGaussians, coefficients: int) -> DeviceG
     rest[:, : source.coefficients - 1] = source["sh_rest"].get()
     arrays["sh_rest"] = upload(device, rest)
     return DeviceGaussians(source.count, coefficients, arrays)
-
-
-__all__ = ["GROUPS", "NO_ROW", "DensityStatistics", "add_statistics", "gather", "new_statistics", "widen"]

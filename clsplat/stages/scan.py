@@ -15,15 +15,18 @@ _PER_ITEM = 16
 def chunking(device: Device, n: int) -> tuple[int, int]:
     """(groups, chunk): how many groups share n elements, and how many each has."""
     shape = device.shape
-    if shape.items > 1:
-        chunk = shape.items * _PER_ITEM
-    else:
-        chunk = max(-(-n // shape.chunks), 1024)
+    chunk = shape.items * _PER_ITEM if shape.items > 1 else max(-(-n // shape.chunks), 1024)
     return max(-(-n // chunk), 1), chunk
 
 
 def scan(
-    device: Device, work: Workspace, values: DeviceArray, out: DeviceArray, total: DeviceArray, *, as_flags: bool = False
+    device: Device,
+    work: Workspace,
+    values: DeviceArray,
+    out: DeviceArray,
+    total: DeviceArray,
+    *,
+    as_flags: bool = False,
 ) -> None:
     """out[i] = sum of values[:i], total[0] = sum of all; with `as_flags` each nonzero value counts 1."""
     n = values.shape[0]

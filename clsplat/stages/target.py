@@ -23,6 +23,16 @@ def target(device: Device, work: Workspace, image: NDArray[Any], background: Dev
     planes = work.array("target", (3, rows, stride))
     kernels = device.kernels("target", **({"BYTES": True} if image.dtype == np.uint8 else {}))
     launch_grid(
-        device, kernels.target, (stride, rows), width, height, channels, stride, rows * stride, source, background, planes
+        device,
+        kernels.target,
+        (stride, rows),
+        width,
+        height,
+        channels,
+        stride,
+        rows * stride,
+        source,
+        background,
+        planes,
     )
     return planes

@@ -25,15 +25,20 @@ static inline Ellipse ellipse_of(__global const float *splat) {
 }
 
 // First index of the tiles (or rows, at size 1) whose last pixel centre is at or after `low`, within [0, count].
+// Rounding goes by integers after the clamp: ceil and floor are calls in some drivers, and here in the inner loop.
 static inline int first_cell(float low, float size, int count) {
-  const float cell = ceil((low - TILE_SLACK - (size - 0.5f)) / size);
-  return cell > 0.0f ? (cell < (float)count ? (int)cell : count) : 0;
+  float cell = (low - TILE_SLACK - (size - 0.5f)) * (1.0f / size);
+  cell = cell > 0.0f ? cell : 0.0f;
+  cell = cell < (float)count ? cell : (float)count;
+  const int whole = (int)cell;
+  return whole + ((float)whole < cell);
 }
 
 // One past the last index of those whose first pixel centre is at or before `high`, within [0, count].
 static inline int end_cell(float high, float size, int count) {
-  const float cell = floor((high + TILE_SLACK - 0.5f) / size) + 1.0f;
-  return cell > 0.0f ? (cell < (float)count ? (int)cell : count) : 0;
+  float cell = (high + TILE_SLACK - 0.5f) * (1.0f / size) + 1.0f;
+  cell = cell > 0.0f ? cell : 0.0f;
+  return (int)(cell < (float)count ? cell : (float)count);
 }
 
 // The right edge of the ellipse, from the mean, over the offsets [d0, d1] in y; the left edge by symmetry.

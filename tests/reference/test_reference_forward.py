@@ -129,7 +129,7 @@ def test_stop_rule_excludes_the_gaussian_that_would_saturate() -> None:
 
 
 @pytest.mark.parametrize(
-    "field, value",
+    ("field", "value"),
     [
         ("means", np.nan),
         ("means", np.inf),

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading, writing and scaling pictures, through OpenImageIO.
+
+In memory a picture is float32 (H, W, C), C = 3 (RGB) or 4 (RGBA), with *straight* (unassociated) alpha whatever the
+file has, in the file's own colour space: nothing is linearised. In files alpha is what OpenImageIO writes:
+unassociated in PNG, associated (premultiplied) in EXR.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+from scipy import sparse
+
+from clsplat.errors import ClsplatError, InputError
+from clsplat.files import TEMPORARY_SUFFIX
+
+Float32 = NDArray[np.float32]
+Metadata = Mapping[str, str | int | float]
+
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
+"""What counts as a picture when a folder is searched, in lower case. Named files may be anything OpenImageIO reads."""
+
+CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+# libjpeg's notes about data that it can do without; every other message means that pixels are lost
+HARMLESS = ("extraneous bytes",)
+
+
+def find_images(folder: Path) -> list[Path]:
+    """All pictures (by extension) under `folder`, sub-folders included, sorted; hidden files and folders left out."""
+    found: list[Path] = []
+    for root, folders, files in os.walk(folder, followlinks=True):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        found += [
+            path
+            for path in (Path(root, name) for name in files)
+            if not path.name.startswith(".") and path.suffix.lower() in EXTENSIONS
+        ]
+    return sorted(found)
+
+
+def require_images(paths: Iterable[Path], listed_in: Path) -> None:
+    """Raise InputError that names the files of `paths` that do not exist; `listed_in` is what lists them."""
+    if missing := [path for path in paths if not path.is_file()]:
+        raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {name_some(missing)}")
+
+
+def name_some(paths: Sequence[Path]) -> str:
+    """The first ten paths, and how many more there are, for a message of one line."""
+    more = f" and {len(paths) - 10} more" if len(paths) > 10 else ""
+    return ", ".join(str(path) for path in paths[:10]) + more
+
+
+def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
+    """Width and height from the header, without decoding the pixels, as `read_image` would give them.
+
+    Raises InputError for a file that is missing, no picture, or a PNG that is cut short.
+    """
+    source = _open(path)
+    spec = source.spec()
+    source.close()
+    width, height = spec.full_width, spec.full_height
+    if source.format_name() != "openexr":
+        width, height = spec.width, spec.height
+    if source.format_name() == "png":
+        _check_png_is_whole(path)
+    return (height, width) if orient and _orientation(spec) >= 5 else (width, height)
+
+
+def read_image(path: Path, *, orient: bool = True) -> Float32:
+    """Read a picture as float32 (H, W, 3), or (H, W, 4) if it has alpha, straight.
+
+    Integers of 8 or 16 bits are scaled to [0, 1], floats kept as they are, beyond 1 too. Grey becomes RGB. Of an EXR
+    with more channels R, G, B and A are taken, and its whole display window. orient: turn the picture as its EXIF
+    orientation says, right for photos as such; pictures of a COLMAP model are read without, as COLMAP itself
+    (pycolmap 4.2.1) keeps the pixels as stored: keypoints and camera sizes refer to those.
+
+    Raises InputError, naming the file and the decoder's reason, for a file that is missing, no picture, damaged, cut
+    short, of another kind of channels, or with values that are not finite.
+    """
+    source = _open(path)
+    spec = source.spec()
+    if source.format_name() == "png":
+        _check_png_is_whole(path)
+    pixels = source.read_image(oiio.FLOAT)
+    reason = source.geterror()
+    source.close()
+    if pixels is None or (reason and not any(harmless in reason for harmless in HARMLESS)):
+        raise InputError(f"{path}: does not decode: {_one_line(reason)}; copy the picture again or leave it out")
+    pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
+    image = _as_rgb(path, pixels, spec)
+    if not np.isfinite(image).all():
+        count = int(np.count_nonzero(~np.isfinite(image).all(axis=2)))
+        raise InputError(f"{path}: {count} pixels are not finite, expected numbers only; repair or leave it out")
+    if source.format_name() == "openexr":
+        image = _display_window(image, spec)
+    if image.shape[2] == 4 and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
+        image = unassociate(image)
+    return np.ascontiguousarray(_reorient(image, _orientation(spec)) if orient else image)
+
+
+def write_image(
+    path: Path,
+    image: NDArray[Any],
+    metadata: Metadata | None = None,
+    *,
+    alpha: Literal["straight", "associated"] = "straight",
+    half: bool = False,
+) -> None:
+    """Write a picture, atomically: 8-bit PNG or float EXR, by the extension.
+
+    image (H, W) or (H, W, C), C = 1, 3 or 4; floats, in a PNG clipped to [0, 1] and rounded, or uint8. alpha: what
+    kind of RGBA is given; the file gets what its format wants. half: 16-bit floats in the EXR. metadata goes into the
+    header under its own names. Raises InputError for another extension or a folder that does not exist, ClsplatError
+    if writing fails (disk full); the previous file is whole then, and no temporary file is left.
+    """
+    path = Path(path)
+    extension = path.suffix.lower()
+    if extension not in (".png", ".exr"):
+        raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected .png or .exr")
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such folder to write {path.name} to")
+    pixels = np.asarray(image)
+    pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    if pixels.ndim != 3 or pixels.shape[2] not in CHANNEL_NAMES or 0 in pixels.shape:
+        raise ValueError(f"image {np.shape(image)}: expected (H, W), (H, W, 1), (H, W, 3) or (H, W, 4)")
+    if pixels.dtype == np.uint8:
+        pixels = pixels.astype(np.float32) / np.float32(255)
+    pixels = pixels.astype(np.float32)
+
+    is_png = extension == ".png"
+    if pixels.shape[2] == 4 and (alpha == "straight") != is_png:
+        pixels = unassociate(pixels) if is_png else associate(pixels)
+    if is_png:
+        pixels = np.rint(np.clip(np.nan_to_num(pixels), 0, 1) * 255).astype(np.uint8)
+    height, width, channels = pixels.shape
+    kind = oiio.UINT8 if is_png else oiio.HALF if half else oiio.FLOAT
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec.channelnames = CHANNEL_NAMES[channels]
+    if is_png:
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+    for name, value in (metadata or {}).items():
+        spec.attribute(name, value)
+    _write_atomically(path, np.ascontiguousarray(pixels), spec, extension[1:])
+
+
+def downscale(image: Float32, width: int, height: int) -> Float32:
+    """Resample (H, W, C) to (height, width, C): each new pixel is the mean of the area it covers.
+
+    The exact area, so that a whole factor is a box filter, and pixel corners stay where they are, as
+    `Camera.resized` has it. An axis that grows is interpolated linearly. With four channels the mean is taken of
+    premultiplied colour, so that what is transparent does not bleed in. Straight alpha in and out.
+    """
+    if image.shape[:2] == (height, width):
+        return image
+    has_alpha = image.shape[2] == 4
+    source = associate(image) if has_alpha else image
+    rows, columns, channels = source.shape
+    half = _resampling(rows, height) @ source.reshape(rows, columns * channels)
+    half = half.reshape(height, columns, channels).transpose(1, 0, 2).reshape(columns, height * channels)
+    result = (_resampling(columns, width) @ half).reshape(width, height, channels).transpose(1, 0, 2)
+    result = np.ascontiguousarray(result, np.float32)
+    return unassociate(result) if has_alpha else result
+
+
+def associate(image: Float32) -> Float32:
+    """(H, W, 4) with straight alpha to premultiplied."""
+    return np.concatenate([image[:, :, :3] * image[:, :, 3:], image[:, :, 3:]], axis=2)
+
+
+def unassociate(image: Float32) -> Float32:
+    """(H, W, 4) with premultiplied alpha to straight. Colour without any alpha is kept as it is."""
+    alpha = image[:, :, 3:]
+    return np.concatenate([image[:, :, :3] / np.where(alpha > 0, alpha, np.float32(1)), alpha], axis=2)
+
+
+def _open(path: Path) -> Any:
+    if not path.is_file():
+        raise InputError(f"{path}: no such image file")
+    hints = oiio.ImageSpec()
+    hints.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), hints)
+    if source is None:
+        raise InputError(f"{path}: does not decode: {_one_line(oiio.geterror())}; expected an image")
+    return source
+
+
+def _one_line(reason: str) -> str:
+    lines = [line.strip() for line in reason.splitlines() if line.strip()]
+    return lines[0] if lines else "the decoder gives no reason"
+
+
+def _orientation(spec: Any) -> int:
+    value = int(spec.get_int_attribute("Orientation", 1))
+    return value if 1 <= value <= 8 else 1
+
+
+def _reorient(image: Float32, orientation: int) -> Float32:
+    """What EXIF orientations 1 to 8 mean: from 5 on rows and columns change places, then the axes are flipped."""
+    if orientation >= 5:
+        image = image.transpose(1, 0, 2)
+    if orientation in (3, 4, 7, 8):
+        image = image[::-1]
+    if orientation in (2, 3, 6, 7):
+        image = image[:, ::-1]
+    return image
+
+
+def _as_rgb(path: Path, pixels: Float32, spec: Any) -> Float32:
+    names = [name.upper() for name in spec.channelnames]
+    alpha = int(spec.alpha_channel)
+    if all(name in names for name in "RGB"):
+        colour = [names.index(name) for name in "RGB"]
+    else:
+        others = [index for index in range(len(names)) if index != alpha]
+        if len(others) not in (1, 3):
+            listed = ", ".join(spec.channelnames)
+            raise InputError(f"{path}: has the channels {listed}; expected grey or RGB, with alpha or without")
+        colour = others * 3 if len(others) == 1 else others
+    return pixels[:, :, [*colour, alpha] if alpha >= 0 else colour]
+
+
+def _display_window(image: Float32, spec: Any) -> Float32:
+    """The whole picture of an EXR whose data window is only a part of it; outside is 0."""
+    x, y = spec.x - spec.full_x, spec.y - spec.full_y
+    width, height = spec.full_width, spec.full_height
+    if (x, y, spec.width, spec.height) == (0, 0, width, height):
+        return image
+    whole = np.zeros((height, width, image.shape[2]), np.float32)
+    left, top = max(x, 0), max(y, 0)
+    right, bottom = min(x + spec.width, width), min(y + spec.height, height)
+    if left < right and top < bottom:
+        whole[top:bottom, left:right] = image[top - y : bottom - y, left - x : right - x]
+    return whole
+
+
+def _check_png_is_whole(path: Path) -> None:
+    """Follow the chunks to the last one: finds a file that is cut short before training, and before libpng prints."""
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        position = len(PNG_SIGNATURE) if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE else size
+        while position + 12 <= size:
+            file.seek(position)
+            length, kind = struct.unpack(">I4s", file.read(8))
+            position += 12 + length
+            if kind == b"IEND" and position <= size:
+                return
+    raise InputError(f"{path}: does not decode: the PNG ends early, after {size} bytes; copy it again or leave it out")
+
+
+def _write_atomically(path: Path, pixels: NDArray[Any], spec: Any, kind: str) -> None:
+    # Not through files.atomic_writer: OpenImageIO writes to a name, not to an open file.
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+    try:
+        output: Any = oiio.ImageOutput.create(kind)
+        written = output.open(str(temporary), spec) and output.write_image(pixels)
+        reason = output.geterror()
+        if not (output.close() and written):
+            raise ClsplatError(f"{path}: cannot be written: {_one_line(reason or output.geterror())}")
+        temporary.replace(target)
+    except OSError as error:
+        raise ClsplatError(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        with suppress(OSError):  # it is gone if all went well
+            temporary.unlink()
+
+
+def _resampling(source: int, target: int) -> Any:
+    """The sparse matrix (target, source) whose rows are the weights of an axis, each summing to 1."""
+    if target >= source:
+        centres = (np.arange(target) + 0.5) * (source / target) - 0.5
+        first = np.clip(np.floor(centres).astype(int), 0, source - 1)
+        fraction = np.clip(centres - first, 0, 1)
+        index = np.stack([first, np.minimum(first + 1, source - 1)])
+        weights = np.stack([1 - fraction, fraction])
+    else:
+        edges = np.arange(target + 1) * (source / target)
+        low, high = edges[:-1], edges[1:]
+        index = np.floor(low).astype(int) + np.arange(int(np.ceil(source / target)) + 1)[:, None]
+        weights = np.clip(np.minimum(index + 1, high) - np.maximum(index, low), 0, None)
+        index = np.minimum(index, source - 1)  # the weight beyond the last pixel is 0
+        weights /= weights.sum(axis=0)
+    rows = np.broadcast_to(np.arange(target), index.shape)
+    matrix = sparse.coo_matrix((weights.ravel(), (rows.ravel(), index.ravel())), shape=(target, source))
+    return matrix.tocsr().astype(np.float32)

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photos on their way into structure from motion: found, decoded once, stood upright, grouped by camera."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import OpenImageIO as oiio
+
+from clsplat.errors import ClsplatError, InputError
+
+EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+"""What pycolmap's wheel reads and writes; its OpenImageIO has no WebP, JPEG 2000 or HEIF."""
+OTHER_IMAGES = frozenset({".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"})
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo as staged for pycolmap: its name (path below the folder, with slashes) and what tells its camera.
+
+    width, height: pixels, upright; lens: make, model and focal length from EXIF, empty strings where it has none.
+    """
+
+    name: str
+    width: int
+    height: int
+    lens: tuple[str, ...]
+
+
+def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], list[Path]]:
+    """Photos below folder in the order of their names, and image files of kinds that cannot be used.
+
+    Hidden files and folders are skipped, as is `excluded` (the output, where it lies inside). Raises InputError
+    for a folder that does not exist or holds no photos.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder, expected one with photos")
+    skip = excluded.resolve() if excluded is not None else None
+    photos: list[Path] = []
+    others: list[Path] = []
+    for parent, folders, files in os.walk(folder):
+        here = Path(parent)
+        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() != skip]
+        for name in files:
+            extension = Path(name).suffix.lower()
+            if name.startswith("."):
+                continue
+            if extension in EXTENSIONS:
+                photos.append(here / name)
+            elif extension in OTHER_IMAGES:
+                others.append(here / name)
+    if not photos:
+        kinds = " ".join(sorted(EXTENSIONS))
+        found = f", only {len(others)} of a kind not supported such as {others[0].name}" if others else ""
+        raise InputError(f"{folder}: no photos found{found}; expected files ending in {kinds}")
+    key = partial(photo_name, folder)
+    return sorted(photos, key=key), sorted(others, key=key)
+
+
+def photo_name(folder: Path, path: Path) -> str:
+    """The photo's name in the scene: its path below the folder, with forward slashes."""
+    return path.relative_to(folder).as_posix()
+
+
+def fingerprint(folder: Path, photos: Sequence[Path], settings: str) -> str:
+    """Changes when a photo is added, taken away or rewritten, or a setting changes; cheap, as it reads no pixels."""
+    digest = hashlib.sha256(settings.encode())
+    for path in photos:
+        status = path.stat()
+        digest.update(f"\n{photo_name(folder, path)}\t{status.st_size}\t{status.st_mtime_ns}".encode())
+    return digest.hexdigest()
+
+
+def stage_photos(
+    folder: Path, photos: Sequence[Path], target: Path, report: Callable[[float], None], threads: int
+) -> list[Photo]:
+    """Put every photo under target, upright and with its name, and say what it is.
+
+    pycolmap ignores the EXIF orientation, so that turned photos are written anew; the others are linked (copied
+    where the file system cannot). Every photo is decoded once, as pycolmap would skip a broken one silently:
+    raises InputError with the name of the first that does not decode.
+    """
+    staged: list[Photo] = []
+    with ThreadPoolExecutor(threads) as pool:
+        work = pool.map(partial(_stage, folder, target), photos)
+        try:
+            for photo in work:
+                staged.append(photo)
+                report(len(staged) / len(photos))
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return staged
+
+
+def _stage(folder: Path, target: Path, path: Path) -> Photo:
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise InputError(f"{path}: cannot be decoded as an image: {_last_line(oiio.geterror())}")
+    try:
+        spec = source.spec()
+        pixels = source.read_image(spec.format)
+        # a truncated JPEG still gives pixels, grey at its end, and only an error text says so
+        trouble = source.geterror()
+    finally:
+        source.close()
+    if pixels is None or trouble:
+        raise InputError(f"{path}: cannot be decoded as an image: {_last_line(trouble)}")
+
+    name = photo_name(folder, path)
+    copy = target / name
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    orientation = spec.get_int_attribute("Orientation", 1)
+    width, height = spec.width, spec.height
+    if orientation in range(2, 9):
+        if orientation >= 5:
+            width, height = height, width
+        _write_upright(path, copy)
+    else:
+        try:
+            os.link(path.resolve(), copy)
+        except OSError:
+            shutil.copyfile(path, copy)
+    focal = spec.get_float_attribute("Exif:FocalLength", 0.0)
+    lens = (spec.get_string_attribute("Make"), spec.get_string_attribute("Model"), f"{focal:.3f}" if focal else "")
+    return Photo(name, width, height, lens)
+
+
+def _write_upright(path: Path, copy: Path) -> None:
+    """Write the photo as it is meant to be seen. EXIF stays, for the focal length, but says upright now."""
+    upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(str(path)))
+    upright.specmod().attribute("Orientation", 1)
+    upright.specmod().attribute("Compression", "jpeg:98" if copy.suffix.lower() in (".jpg", ".jpeg") else "lzw")
+    if upright.has_error or not upright.write(str(copy)):
+        raise ClsplatError(f"{copy}: cannot write the turned copy of {path}: {_last_line(upright.geterror())}")
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[-1] if lines else "unknown kind of file"
+
+
+def camera_groups(photos: Sequence[Photo], shared_camera: bool | str) -> list[list[str]]:
+    """Names of the photos by camera, each group in order; photos in a group share their intrinsics.
+
+    shared_camera: True puts all photos of one size in a group; "auto" also wants the same make, model and focal
+    length in EXIF; False gives each photo its own camera.
+    """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for photo in photos:
+        if shared_camera is False:
+            key: tuple[object, ...] = (photo.name,)
+        elif shared_camera is True:
+            key = (photo.width, photo.height)
+        else:
+            key = (photo.width, photo.height, *photo.lens)
+        groups.setdefault(key, []).append(photo.name)
+    return list(groups.values())

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera paths made from a scene's own cameras. The world stays as it is; only what is up in it is estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+
+Float64 = NDArray[np.float64]
+
+WIDEST_GAP = np.deg2rad(100.0)
+"""Where the cameras leave a wider gap around the middle than this, a turntable swings instead of going round."""
+
+
+def look_at(position: Float64, target: Float64, up: Float64) -> tuple[Float64, Float64]:
+    """`cam_from_world` rotation (3, 3) and translation (3,) of a level camera at position that faces target.
+
+    up (3,) need not be at right angles to the view, but not along it.
+    """
+    forward = target - position
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right = right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return rotation, -rotation @ position
+
+
+def up_axis(cameras: Sequence[Camera]) -> Float64:
+    """The world's up as the photographers held their cameras, a unit vector (3,).
+
+    People hold cameras level, tilted up or down: up is the direction most nearly at right angles to every image's
+    x axis. Where these axes do not span a plane (all photos from one side), up is the mean of the images' up.
+    """
+    right = np.stack([camera.rotation[0] for camera in cameras])
+    mean_up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    spread, axes = np.linalg.eigh(right.T @ right / len(cameras))
+    up: Float64 = axes[:, 0]
+    if spread[1] < 0.05 or abs(up @ mean_up) < 0.2 * np.linalg.norm(mean_up):
+        up = mean_up if np.linalg.norm(mean_up) > 1e-6 else -cameras[0].rotation[1]
+    up = up / np.linalg.norm(up)
+    return up if up @ mean_up >= 0 else -up
+
+
+def focus_point(cameras: Sequence[Camera]) -> Float64:
+    """The point (3,) that the cameras look at: nearest to all optical axes in the least squares sense.
+
+    Where the axes are nearly parallel and meet nowhere, a point ahead of the cameras, as far as they are spread.
+    """
+    positions = np.stack([camera.position for camera in cameras])
+    forward = np.stack([camera.rotation[2] for camera in cameras])
+    # the squared distance to an axis is |P (x - c)|^2 with P = 1 - f f^T
+    projections = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    normal = projections.mean(axis=0)
+    ahead = forward.mean(axis=0)
+    if np.linalg.eigvalsh(normal)[0] > 1e-3:
+        point: Float64 = np.linalg.solve(normal, np.einsum("nij,nj->i", projections, positions) / len(cameras))
+        if np.mean(np.einsum("nj,nj->n", forward, point - positions) > 0) > 0.5:
+            return point
+    spread = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
+    return np.asarray(positions.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(spread, 1.0))
+
+
+def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A closed camera path around what the cameras look at, `frames` views with the first camera's intrinsics.
+
+    It keeps the cameras' median distance and height. Where they stand all around it goes round once; where they
+    leave a wide gap it swings to and fro over the arc that they cover, as nobody has seen the rest. It begins near
+    the first camera. Raises ValueError for no cameras or no frames.
+    """
+    if not cameras or frames < 1:
+        raise ValueError(f"a turntable of {frames} frames from {len(cameras)} cameras: expected at least one of each")
+    up, focus = up_axis(cameras), focus_point(cameras)
+    offsets = np.stack([camera.position for camera in cameras]) - focus
+    heights = offsets @ up
+    level = offsets - heights[:, None] * up
+    first = level[0] if np.linalg.norm(level[0]) > 1e-9 else np.cross(up, cameras[0].rotation[0])
+    east = first / np.linalg.norm(first)
+    north = np.cross(up, east)
+    azimuths = np.arctan2(level @ north, level @ east)
+    radius, height = float(np.median(np.linalg.norm(level, axis=1))), float(np.median(heights))
+
+    time = np.arange(frames) / frames
+    begin, width = covered_arc(azimuths)
+    if 2 * np.pi - width <= WIDEST_GAP:
+        angles = 2 * np.pi * time
+    else:
+        # phase chosen so that the first frame is at azimuth 0, the first camera's
+        middle, half = begin + width / 2, width / 2
+        off = (-middle + np.pi) % (2 * np.pi) - np.pi
+        phase = np.arcsin(np.clip(off / half, -1, 1)) if half > 1e-6 else 0.0
+        angles = middle + half * np.sin(2 * np.pi * time + phase)
+    path = []
+    for angle in angles:
+        position = focus + height * up + radius * (np.cos(angle) * east + np.sin(angle) * north)
+        rotation, translation = look_at(position, focus, up)
+        path.append(replace(cameras[0], rotation=rotation, translation=translation))
+    return path
+
+
+def covered_arc(azimuths: Float64) -> tuple[float, float]:
+    """Begin and width in radians of the shortest arc that holds all azimuths (n,), in the direction of growth."""
+    ordered = np.sort(np.mod(azimuths, 2 * np.pi))
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    widest = int(np.argmax(gaps))
+    return float(ordered[(widest + 1) % len(ordered)]), float(2 * np.pi - gaps[widest])

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import os
+import random
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from clsplat.colmap import find_model, read_cameras, read_model, rotation_from_quaternion
+from clsplat.errors import InputError
+
+SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
+needs_scenes = pytest.mark.skipif(not SCENES.is_dir(), reason=f"no real scenes: {SCENES} is not there (CLSPLAT_SCENES)")
+
+
+def make_model(folder: Path, names: list[str] | None = None, model: str = "PINHOLE") -> pycolmap.Reconstruction:
+    """A small model, written by pycolmap as binary and as text."""
+    rng = np.random.default_rng(3)
+    made = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, model, 40.0, 48, 32)
+    made.add_camera_with_trivial_rig(camera)
+    for index, name in enumerate(names or ["b/2 with blank.png", "a/1.png", "é.png"]):
+        image = pycolmap.Image(name=name, camera_id=1, image_id=index + 1, keypoints=rng.random((4, 2)) * 32)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rng.normal(size=4)), rng.normal(size=3))
+        pose.rotation.normalize()
+        made.add_image_with_trivial_frame(image, pose)
+    for _ in range(5):
+        color = rng.integers(0, 256, 3).astype(np.uint8)
+        track = pycolmap.Track([pycolmap.TrackElement(1, 0)]) if made.num_points3D() == 0 else pycolmap.Track()
+        made.add_point3D(rng.normal(size=3), track, color)
+    for kind in ("bin", "txt"):
+        (folder / kind).mkdir(parents=True)
+        getattr(made, {"bin": "write_binary", "txt": "write_text"}[kind])(folder / kind)
+    return made
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_reads_what_pycolmap_wrote(tmp_path: Path, kind: str) -> None:
+    made = make_model(tmp_path)
+    model = read_model(tmp_path / kind)
+    assert [image.name for image in model.images] == ["a/1.png", "b/2 with blank.png", "é.png"]
+    by_name = {image.name: image for image in made.images.values()}
+    for image in model.images:
+        expected = by_name[image.name].cam_from_world().matrix()
+        np.testing.assert_allclose(np.c_[image.rotation, image.translation], expected, atol=1e-12)
+        assert (image.lens.model, image.lens.width, image.lens.height) == ("PINHOLE", 48, 32)
+    points = [made.points3D[key] for key in made.points3D]
+    assert {tuple(point) for point in model.points} == {tuple(point.xyz) for point in points}
+    assert model.colors.dtype == np.float32
+    rounded = {tuple(color) for color in np.rint(model.colors * 255).astype(int).tolist()}
+    assert rounded == {tuple(point.color.tolist()) for point in points}
+
+
+def test_binary_goes_before_text(tmp_path: Path) -> None:
+    make_model(tmp_path)
+    for file in (tmp_path / "txt").iterdir():
+        shutil.copy(file, tmp_path / "bin")
+    (tmp_path / "bin" / "images.txt").write_text("nonsense")
+    assert len(read_model(tmp_path / "bin").images) == 3
+
+
+def test_text_without_observations_and_points(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("# a comment\n1 SIMPLE_PINHOLE 8 6 10 4 3\n")
+    (tmp_path / "images.txt").write_text("# two lines each\n1 1 0 0 0 0 0 0 1 a.png\n\n2 1.5 0 0 0 1 2 3 1 b.png\n")
+    model = read_model(tmp_path)
+    assert [image.name for image in model.images] == ["a.png", "b.png"]
+    np.testing.assert_array_equal(model.images[1].translation, [1, 2, 3])
+    np.testing.assert_array_equal(model.images[1].rotation, np.eye(3))  # the quaternion 1.5 0 0 0 is normalised
+    assert model.points.shape == model.colors.shape == (0, 3)
+
+
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
+def test_every_truncation_of_a_binary_file_is_found(tmp_path: Path, stem: str) -> None:
+    make_model(tmp_path)
+    path = tmp_path / "bin" / f"{stem}.bin"
+    whole = path.read_bytes()
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        with pytest.raises(InputError, match=rf"{stem}\.bin: truncated or corrupt: ") as caught:
+            read_model(tmp_path / "bin")
+        assert "\n" not in str(caught.value)
+    path.write_bytes(whole + b"\0")
+    with pytest.raises(InputError, match=rf"{stem}\.bin: truncated or corrupt: 1 bytes follow"):
+        read_model(tmp_path / "bin")
+
+
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
+def test_flipped_bytes_are_read_or_refused_but_never_crash(tmp_path: Path, stem: str) -> None:
+    make_model(tmp_path)
+    path = tmp_path / "bin" / f"{stem}.bin"
+    whole = path.read_bytes()
+    chance = random.Random(5)
+    refused = []
+    for _ in range(400):
+        damaged = bytearray(whole)
+        damaged[chance.randrange(len(whole))] ^= chance.randrange(1, 256)
+        path.write_bytes(damaged)
+        try:
+            read_model(tmp_path / "bin")  # a flip in a coordinate may well pass
+        except InputError as error:
+            refused.append(str(error))
+    assert all(str(tmp_path) in message and "\n" not in message for message in refused)
+    assert len(refused) > 40
+
+
+def test_truncated_text_is_refused_with_the_line(tmp_path: Path) -> None:
+    make_model(tmp_path)
+    path = tmp_path / "txt" / "images.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:-2], lines[-2][:30]]))
+    with pytest.raises(InputError, match=r"images\.txt: line \d+ does not read as IMAGE_ID QW"):
+        read_model(tmp_path / "txt")
+
+
+def test_unknown_camera_models_are_refused_by_name(tmp_path: Path) -> None:
+    make_model(tmp_path)
+    path = tmp_path / "bin" / "cameras.bin"
+    data = bytearray(path.read_bytes())
+    data[12] = 77
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"cameras\.bin: camera 1 has the unknown camera model id 77"):
+        read_model(tmp_path / "bin")
+    text = tmp_path / "txt" / "cameras.txt"
+    text.write_text("1 KALEIDOSCOPE 48 32 1 2 3\n")
+    with pytest.raises(InputError, match=r"cameras\.txt: camera 1: unknown camera model KALEIDOSCOPE, expected one of"):
+        read_model(tmp_path / "txt")
+    text.write_text("1 EQUIRECTANGULAR 48 32 48 32\n")
+    with pytest.raises(InputError, match="EQUIRECTANGULAR is not supported"):
+        read_model(tmp_path / "txt")
+    text.write_text("1 PINHOLE 48 32 1 2 3\n")
+    with pytest.raises(InputError, match="PINHOLE has 3 parameters, expected 4"):
+        read_model(tmp_path / "txt")
+    text.write_text("1 PINHOLE 48 32 -1 2 3 4\n")
+    with pytest.raises(InputError, match="focal lengths above 0"):
+        read_model(tmp_path / "txt")
+
+
+@pytest.mark.parametrize(
+    ("images", "found"),
+    [
+        ("1 1 0 0 0 0 0 0 2 a.png\n\n", "camera 2, which is not in the model"),
+        ("1 1 0 0 0 0 0 0 1 ../../etc/a.png\n\n", "expected a path inside"),
+        ("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 0 1 a.png\n\n", "a.png is there twice"),
+        ("1 0 0 0 0 0 0 0 1 a.png\n\n", "expected a unit quaternion"),
+        ("1 1 0 0 0 nan 0 0 1 a.png\n\n", "expected a unit quaternion, finite numbers"),
+        ("# nothing\n", "holds no images"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path: Path, images: str, found: str) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 8 6 10 4 3\n")
+    (tmp_path / "images.txt").write_text(images)
+    with pytest.raises(InputError, match=found):
+        read_model(tmp_path)
+
+
+def test_find_model_prefers_the_largest_of_several(tmp_path: Path) -> None:
+    make_model(tmp_path / "small", ["a.png"])
+    make_model(tmp_path / "large")
+    (tmp_path / "sparse").mkdir()
+    shutil.copytree(tmp_path / "small" / "bin", tmp_path / "sparse" / "0")
+    assert find_model(tmp_path) == tmp_path / "sparse" / "0"
+    shutil.copytree(tmp_path / "large" / "txt", tmp_path / "sparse" / "1")
+    assert find_model(tmp_path) == tmp_path / "sparse" / "1"
+    assert find_model(tmp_path / "sparse") == tmp_path / "sparse" / "1"
+    assert find_model(tmp_path / "sparse" / "0") == tmp_path / "sparse" / "0"
+    assert find_model(tmp_path / "nothing") is None
+
+
+def test_read_cameras(tmp_path: Path) -> None:
+    make_model(tmp_path)
+    cameras = read_cameras(tmp_path / "bin")
+    assert list(cameras) == ["a/1.png", "b/2 with blank.png", "é.png"]
+    camera = cameras["a/1.png"]
+    assert (camera.width, camera.height, camera.fx, camera.cx, camera.cy) == (48, 32, 40, 24, 16)
+    with pytest.raises(InputError, match="none: no COLMAP model"):
+        read_cameras(tmp_path / "none")
+    (tmp_path / "bin" / "cameras.bin").unlink()
+    with pytest.raises(InputError, match=r"has no cameras\.bin or cameras\.txt"):
+        read_cameras(tmp_path / "bin")
+
+
+def test_rotation_from_quaternion() -> None:
+    quaternion = np.array([0.5, 0.1, -0.7, 0.3])
+    quaternion /= np.linalg.norm(quaternion)
+    xyzw = quaternion[[1, 2, 3, 0]]
+    np.testing.assert_allclose(rotation_from_quaternion(quaternion), pycolmap.Rotation3d(xyzw).matrix(), atol=1e-15)
+
+
+@needs_scenes
+@pytest.mark.parametrize("name", ["fox", "sceaux_castle"])
+def test_real_points_project_to_their_observations(name: str) -> None:
+    """Our cameras, our points and COLMAP's keypoints, matched by COLMAP's tracks: the README's reprojection error."""
+    folder = SCENES / name / "sparse" / "0"
+    model = read_model(folder)
+    cameras = read_cameras(SCENES / name)
+    oracle = pycolmap.Reconstruction(folder)
+    assert len(model.points) == oracle.num_points3D()
+    where = {tuple(point): index for index, point in enumerate(model.points)}
+    errors = []
+    for image in oracle.images.values():
+        camera = cameras[image.name]
+        seen = [point for point in image.points2D if point.has_point3D()]
+        index = [where[tuple(oracle.points3D[point.point3D_id].xyz)] for point in seen]
+        local = model.points[index] @ camera.rotation.T + camera.translation
+        pixels = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        assert (local[:, 2] > 0).all()
+        errors.append(np.linalg.norm(pixels - [point.xy for point in seen], axis=1))
+    per_image = np.array([error.mean() for error in errors])
+    assert per_image.max() < 1
+    assert np.concatenate(errors).mean() < 0.45

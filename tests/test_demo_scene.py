@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from clsplat import demo_scene
+from clsplat.camera import Camera
+from clsplat.trajectory import look_at
+
+
+@pytest.fixture(scope="module")
+def surfaces():
+    objects = demo_scene.still_life()
+    demo_scene.bake(objects, seed=0)
+    return objects
+
+
+def test_photos_are_whole_repeatable_and_hold_no_pose(tmp_path):
+    heard = []
+    for folder in ("one", "two"):
+        demo_scene.write_photos(
+            tmp_path / folder, count=2, width=64, height=48, progress=lambda text, part: heard.append((text, part))
+        )
+    names = sorted(path.name for path in (tmp_path / "one").iterdir())
+    assert names == ["photo_000.jpg", "photo_001.jpg"]
+    for name in names:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    assert heard[-1] == ("taking photos", 1.0)
+    spec = oiio.ImageInput.open(str(tmp_path / "one" / names[0])).spec()
+    assert (spec.width, spec.height, spec.nchannels) == (64, 48, 3)
+    assert not [attribute.name for attribute in spec.extra_attribs if attribute.name.startswith(("Exif", "GPS"))]
+
+
+def test_every_object_is_textured(surfaces):
+    for surface in surfaces:
+        rows, columns = surface.rows, surface.columns
+        assert surface.texture.shape == (rows, columns, 3)
+        assert np.isfinite(surface.texture).all() and surface.texture.min() >= 0
+        # contrast within patches of 16 texels, not only from one end of the object to the other
+        luma = surface.texture.mean(axis=2)[: rows // 16 * 16, : columns // 16 * 16]
+        patches = luma.reshape(rows // 16, 16, columns // 16, 16)
+        assert np.median(patches.std(axis=(1, 3))) > 0.01, type(surface).__name__
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_rays_meet_the_surface_where_its_texture_says(surfaces, index):
+    surface = surfaces[index]
+    points, normals = surface.grid(12, 30)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    # from a short way out along the normal, straight back at the point
+    distance = surface.distance(points + np.float32(0.05) * normals, -normals)
+    np.testing.assert_allclose(distance, 0.05, atol=2e-3)
+    row, column = surface.texture_coordinates(points)
+    again, _ = surface.point(np.clip(row, 0, 1), np.clip(column, 0, 0.99999))
+    if not isinstance(surface, demo_scene.Ball):  # around a pole the columns of a ball meet
+        np.testing.assert_allclose(again, points, atol=2e-2)
+
+
+def test_camera_sees_what_lies_on_its_axis(surfaces):
+    marble = surfaces[2]
+    rotation, translation = look_at(np.array([2.0, 0.5, 1.0]), np.array(marble.centre), np.array([0.0, 0.0, 1.0]))
+    camera = Camera(32, 24, 200.0, 200.0, 16.0, 12.0, rotation, translation)
+    alone = demo_scene.render([marble], camera, samples=1)
+    together = demo_scene.render(surfaces, camera, samples=1)
+    np.testing.assert_array_equal(alone[12, 16], together[12, 16])
+    assert together.min() >= 0 and together.max() <= 1
+
+
+def test_cameras_stand_inside_the_wall_and_look_at_the_middle():
+    views = demo_scene.cameras(40, 320, 240, seed=0)
+    assert len(views) == 40
+    for view in views:
+        assert np.hypot(*view.position[:2]) < demo_scene.WALL_RADIUS - 0.5
+        x, y, z = view.rotation @ demo_scene.CENTRE + view.translation
+        assert z > 0
+        assert abs(view.fx * x / z) < 40 and abs(view.fy * y / z) < 40

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from clsplat.device.source import kernel_root
+
+ROOT = Path(__file__).resolve().parents[1]
+FOUND = "from clsplat.device.source import kernel_root; print(kernel_root())"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel, built in the environment at hand: no network."""
+    pytest.importorskip("hatchling", reason="the extra `test` brings it")
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def test_wheel_has_every_kernel_and_module_and_nothing_else(wheel):
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    kernels = {path.relative_to(ROOT).as_posix() for path in (ROOT / "kernels").rglob("*") if path.is_file()}
+    modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "clsplat").rglob("*.py")}
+    assert kernels
+    assert {f"clsplat/{name}" for name in kernels} <= names
+    assert names == {f"clsplat/{name}" for name in kernels} | modules | {"clsplat/py.typed"}
+
+
+def test_kernels_hold_no_python():
+    # hatchling refuses an editable install where a rewritten path holds Python
+    assert not list((ROOT / "kernels").rglob("*.py"))
+
+
+def test_wheel_metadata(wheel):
+    archive = zipfile.ZipFile(wheel)
+    (metadata,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
+    text = archive.read(metadata).decode()
+    assert "License-Expression: Apache-2.0" in text
+    (entries,) = (name for name in archive.namelist() if name.endswith("/entry_points.txt"))
+    assert "clsplat = clsplat.cli:main" in archive.read(entries).decode()
+    assert any(name.endswith("/licenses/LICENSE") for name in archive.namelist())
+
+
+def test_kernels_are_found_from_a_wheel(wheel, tmp_path):
+    zipfile.ZipFile(wheel).extractall(tmp_path)
+    # -I: neither the checkout in the working folder nor PYTHONPATH; site-packages still has what clsplat needs
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {FOUND}"
+    found = subprocess.run(
+        [sys.executable, "-I", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 0, found.stderr
+    assert Path(found.stdout.strip()) == tmp_path / "clsplat/kernels"
+
+
+def test_kernels_are_found_from_the_checkout():
+    assert kernel_root() == ROOT / "kernels"
+
+
+def test_scripts_can_be_run():
+    for name in ("tools/demo", "tools/test", ".ci/run"):
+        path = ROOT / name
+        assert path.stat().st_mode & 0o111, f"{name} is not executable"
+        assert path.read_text().startswith("#!/usr/bin/env ")

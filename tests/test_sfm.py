@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import warnings
+
+import numpy as np
+import OpenImageIO as oiio
+import pycolmap
+import pytest
+
+from clsplat import demo_scene, sfm, sfm_photos
+from clsplat.errors import ClsplatError, InputError
+
+WIDTH, HEIGHT, COUNT = 240, 180, 12
+# EXIF orientation: what a viewer does to stored pixels to show the photo; here its inverse, shown to stored
+STORED_FROM_SHOWN = {
+    1: lambda image: image,
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    6: lambda image: np.rot90(image, 1),
+    8: lambda image: np.rot90(image, -1),
+}
+
+
+def write_image(path, pixels, orientation=1):
+    pixels = np.ascontiguousarray(pixels)
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
+    spec.attribute("Compression", "jpeg:97")
+    spec.attribute("jpeg:subsampling", "4:4:4")
+    if orientation != 1:
+        spec.attribute("Orientation", orientation)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(pixels) and output.close()
+
+
+def read_image(path):
+    return oiio.ImageInput.open(str(path)).read_image("uint8")
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """A dozen neighbouring views of the demo's ring, (height, width, 3) uint8, and their true cameras."""
+    surfaces = demo_scene.still_life()
+    demo_scene.bake(surfaces, seed=0)
+    cameras = demo_scene.cameras(40, WIDTH, HEIGHT, seed=0)[:COUNT]
+    return [np.rint(demo_scene.render(surfaces, camera) * 255).astype(np.uint8) for camera in cameras], cameras
+
+
+@pytest.fixture(scope="module")
+def photos(pictures, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    for index, picture in enumerate(pictures[0]):
+        write_image(folder / f"view_{index:02d}.jpg", picture)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(photos, tmp_path_factory):
+    heard = []
+    output = sfm.reconstruct(
+        photos,
+        tmp_path_factory.mktemp("scenes") / "scene",
+        camera_model="SIMPLE_PINHOLE",
+        progress=lambda text, fraction: heard.append((text, fraction)),
+    )
+    return output, heard
+
+
+def thumbnail(pixels):
+    """The green channel at the same 18 x 24 places of an image of any size."""
+    rows, columns = (
+        (np.linspace(0.05, 0.95, count) * side).astype(int) for count, side in zip((18, 24), pixels.shape, strict=False)
+    )
+    return pixels[np.ix_(rows, columns)][..., 1].ravel().astype(float)
+
+
+def leftovers(folder):
+    return [path.name for path in folder.iterdir()]
+
+
+def centres_after_alignment(found, true):
+    """Found positions (n, 3) moved, turned and scaled onto the true ones (Umeyama 1991)."""
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * np.diag(sign)).sum() / (a**2).sum()
+    return scale * a @ (u @ sign @ vt).T + true.mean(axis=0)
+
+
+def test_every_pose_is_recovered(scene, pictures):
+    output, heard = scene
+    model = pycolmap.Reconstruction(output / "sparse/0")
+    images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
+    assert [image.name for image in images] == [f"view_{index:02d}.jpg" for index in range(COUNT)]
+    found = np.stack([image.projection_center() for image in images])
+    true = np.stack([camera.position for camera in pictures[1]])
+    errors = np.linalg.norm(centres_after_alignment(found, true) - true, axis=1)
+    assert errors.max() < 0.02  # metres; the cameras are 2.5 m from the middle
+    (camera,) = model.cameras.values()
+    assert camera.model_name == "PINHOLE"
+    assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+    assert camera.params[0] == pytest.approx(pictures[1][0].fx, rel=0.02)
+
+    record = json.loads((output / sfm.RECORD).read_text())
+    assert record["unregistered"] == [] == sfm.unregistered(output)
+    assert record["photos"] == len(record["registered"]) == COUNT
+    assert record["mean_reprojection_error"] < 0.5
+    stages = list(dict.fromkeys(text for text, _ in heard))
+    assert stages == [
+        "reading photos",
+        "finding features",
+        "matching photos",
+        "placing cameras",
+        "undistorting photos",
+    ]
+    assert leftovers(output.parent) == ["scene"]
+
+
+def test_finished_result_is_used_again_and_never_replaced_unasked(scene, photos, tmp_path):
+    output, _ = scene
+    before = (output / "sparse/0/images.bin").stat().st_mtime_ns
+    assert sfm.reconstruct(photos, output, camera_model="SIMPLE_PINHOLE") == output
+    with pytest.raises(InputError, match="other photos or settings"):
+        sfm.reconstruct(photos, output, camera_model="SIMPLE_PINHOLE", max_features=100)
+    assert (output / "sparse/0/images.bin").stat().st_mtime_ns == before
+
+
+def test_same_seed_same_bytes(scene, photos, tmp_path):
+    again = sfm.reconstruct(photos, tmp_path / "again", camera_model="SIMPLE_PINHOLE", threads=3)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (again / "sparse/0" / name).read_bytes() == (scene[0] / "sparse/0" / name).read_bytes(), name
+
+
+def test_exif_orientation_subfolders_and_a_photo_of_something_else(pictures, tmp_path):
+    folder = tmp_path / "photos"
+    turns = [1, 6, 3, 8, 1, 2, 6, 8, 3, 1, 6, 1]
+    for index, (picture, turn) in enumerate(zip(pictures[0], turns, strict=True)):
+        write_image(
+            folder / ("left" if index < 6 else "right") / f"{index:02d}.JPG", STORED_FROM_SHOWN[turn](picture), turn
+        )
+    noise = np.random.default_rng(0).integers(0, 255, (HEIGHT // 4, WIDTH // 4, 3), np.uint8)
+    write_image(folder / "stray.jpg", noise.repeat(4, axis=0).repeat(4, axis=1))
+    (folder / "phone.heic").write_bytes(b"not read")
+    (folder / "notes.txt").write_text("not a photo")
+    # the output may lie among the photos: it must not be taken for some
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        output = sfm.reconstruct(folder, folder / "scene")
+    messages = [str(warning.message) for warning in caught if warning.category is UserWarning]
+    assert any("phone.heic" in message for message in messages)
+    assert any("stray.jpg" in message and "could not be placed" in message for message in messages)
+    assert sfm.unregistered(output) == ["stray.jpg"]
+
+    found = sorted(path.relative_to(output / "images").as_posix() for path in (output / "images").rglob("*.JPG"))
+    assert found == [f"{'left' if index < 6 else 'right'}/{index:02d}.JPG" for index in range(COUNT)]
+    for name, picture in zip(found, pictures[0], strict=True):
+        image = read_image(output / "images" / name).astype(float)
+        assert np.corrcoef(thumbnail(image), thumbnail(picture))[0, 1] > 0.8, name
+        assert image.shape[1] > image.shape[0]
+    model = pycolmap.Reconstruction(output / "sparse/0")
+    assert len(model.cameras) == 1
+    assert sfm.reconstruct(folder, output) == output
+
+
+def test_bad_folders(tmp_path, photos):
+    with pytest.raises(InputError, match=r"missing: no such folder"):
+        sfm.reconstruct(tmp_path / "missing", tmp_path / "out")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty/a.webp").write_bytes(b"")
+    with pytest.raises(InputError, match=r"empty: no photos found, only 1 of a kind not supported such as a\.webp"):
+        sfm.reconstruct(tmp_path / "empty", tmp_path / "out")
+    (tmp_path / "few").mkdir()
+    shutil.copy(photos / "view_00.jpg", tmp_path / "few")
+    with pytest.raises(InputError, match=r"few: only 1 photo\(s\) found, expected at least 3"):
+        sfm.reconstruct(tmp_path / "few", tmp_path / "out")
+    with pytest.raises(InputError, match="is not empty and not a result of sfm"):
+        sfm.reconstruct(photos, tmp_path)
+    with pytest.raises(InputError, match="is a file"):
+        sfm.reconstruct(photos, tmp_path / "few/view_00.jpg")
+    with pytest.raises(InputError, match="expected auto, exhaustive or sequential"):
+        sfm.reconstruct(photos, tmp_path / "out", matching="nearest")
+    with pytest.raises(InputError, match="camera model 'LENS'"):
+        sfm.reconstruct(photos, tmp_path / "out", camera_model="LENS")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("damage", ["garbage", "truncated", "empty"])
+def test_photo_that_does_not_decode_is_named(photos, tmp_path, damage):
+    folder = tmp_path / "photos"
+    shutil.copytree(photos, folder)
+    whole = (folder / "view_05.jpg").read_bytes()
+    broken = {"garbage": b"hello" * 100, "truncated": whole[: len(whole) // 2], "empty": b""}[damage]
+    (folder / "view_05.jpg").write_bytes(broken)
+    with pytest.raises(InputError, match=r"view_05\.jpg: cannot be decoded"):
+        sfm.reconstruct(folder, tmp_path / "out")
+    assert leftovers(tmp_path) == ["photos"]
+
+
+def test_photos_without_texture_say_what_there_was(tmp_path):
+    for index in range(4):
+        write_image(tmp_path / f"photos/{index}.jpg", np.full((HEIGHT, WIDTH, 3), 60 * index, np.uint8))
+    with pytest.raises(InputError, match=r"no cameras could be recovered from 4 photos: 0 features .* 0 of \d+ pairs"):
+        sfm.reconstruct(tmp_path / "photos", tmp_path / "out")
+    assert leftovers(tmp_path) == ["photos"]
+
+
+@pytest.mark.parametrize("stage", ["reading photos", "finding features", "placing cameras"])
+def test_interrupt_leaves_nothing(photos, tmp_path, stage):
+    def interrupt(text, fraction):
+        if text == stage:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sfm.reconstruct(photos, tmp_path / "out", progress=interrupt)
+    assert leftovers(tmp_path) == []
+
+
+def test_failing_worker_is_an_error_with_its_last_words(photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(ClsplatError, match="structure from motion failed"):
+        sfm.reconstruct(photos, tmp_path / "out")
+    assert leftovers(tmp_path) == []
+
+
+def test_camera_groups():
+    photo = sfm_photos.Photo
+    wide, tall = photo("a", 40, 30, ()), photo("b", 30, 40, ())
+    zoomed, other = photo("c", 40, 30, ("x", "y", "50")), photo("d", 40, 30, ())
+    everything = [wide, tall, zoomed, other]
+    assert sfm_photos.camera_groups(everything, "auto") == [["a", "d"], ["b"], ["c"]]
+    assert sfm_photos.camera_groups(everything, True) == [["a", "c", "d"], ["b"]]
+    assert sfm_photos.camera_groups(everything, False) == [["a"], ["b"], ["c"], ["d"]]
+
+
+@pytest.mark.slow
+def test_the_whole_demo_registers(tmp_path):
+    demo_scene.write_photos(tmp_path / "photos")
+    output = sfm.reconstruct(tmp_path / "photos", tmp_path / "scene", camera_model="SIMPLE_PINHOLE")
+    record = json.loads((output / sfm.RECORD).read_text())
+    assert record["unregistered"] == []
+    assert record["points"] > 2000
+    assert record["mean_reprojection_error"] < 0.3
+
+
+@pytest.mark.slow
+def test_cameras_of_their_own_and_sequential_matching(photos, tmp_path):
+    output = sfm.reconstruct(photos, tmp_path / "scene", matching="sequential", shared_camera=False)
+    assert len(pycolmap.Reconstruction(output / "sparse/0").cameras) == COUNT

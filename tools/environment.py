@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes the checkout's own environment, `.venv`, with clsplat installed in it; `tools/demo` and `tools/test` use it.
+
+Needs nothing but Python's standard library and a package index that pip can reach. As a script, sets up the extras
+named as arguments and prints the path of the environment's Python.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+ENVIRONMENT = ROOT / ".venv"
+OLDEST = (3, 10)
+
+
+def python_of(environment: Path) -> Path:
+    """The interpreter of a virtual environment."""
+    return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def set_up(extras: tuple[str, ...] = ()) -> Path:
+    """Make `.venv` if it is missing and install clsplat in it, editable; returns its Python.
+
+    Installs again only when pyproject.toml has changed, the checkout has moved, or an extra is new. Exits with one
+    line where this Python is too old or pip fails.
+    """
+    if sys.version_info < OLDEST:
+        found = ".".join(map(str, sys.version_info[:3]))
+        sys.exit(f"{sys.argv[0]}: this is Python {found}, expected {'.'.join(map(str, OLDEST))} or later")
+    python = python_of(ENVIRONMENT)
+    if not _runs(python):
+        print(f"making {ENVIRONMENT}", file=sys.stderr, flush=True)
+        # --clear: what may be there does not run, as after an interrupted start or an upgrade of Python
+        if _call([sys.executable, "-m", "venv", "--clear", str(ENVIRONMENT)]) != 0:
+            shutil.rmtree(ENVIRONMENT, ignore_errors=True)
+            sys.exit(f"{sys.argv[0]}: {sys.executable} -m venv failed; on Debian and Ubuntu, install python3-venv")
+
+    stamp = ENVIRONMENT / "clsplat-installed"
+    state = hashlib.sha256((ROOT / "pyproject.toml").read_bytes() + str(ROOT).encode()).hexdigest()
+    lines = stamp.read_text().splitlines() if stamp.exists() else []
+    installed = set(lines[1:]) if lines[:1] == [state] else None
+    if installed is None or not installed.issuperset(extras):
+        wanted = sorted({*extras, *(installed or ())})
+        target = f"{ROOT}[{','.join(wanted)}]" if wanted else str(ROOT)
+        print("installing clsplat and what it needs (several hundred MB the first time)", file=sys.stderr, flush=True)
+        stamp.unlink(missing_ok=True)
+        command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--editable", target]
+        if _call(command) != 0:
+            sys.exit(f"{sys.argv[0]}: pip could not install clsplat, see above; is the package index reachable?")
+        stamp.write_text("\n".join([state, *wanted]) + "\n")
+    return python
+
+
+def run(command: list[str]) -> int:
+    """Run a command to its end and give its exit status; Ctrl-C is for the command, and then for us."""
+    process = subprocess.Popen(command)
+    while True:
+        try:
+            status = process.wait()
+        except KeyboardInterrupt:
+            continue  # the terminal sent it to the command as well, which ends in its own way
+        return status if status >= 0 else 128 - status
+
+
+def _runs(python: Path) -> bool:
+    return python.exists() and _call([str(python), "-c", "import pip"], quiet=True) == 0
+
+
+def _call(command: list[str], *, quiet: bool = False) -> int:
+    stream = subprocess.DEVNULL if quiet else sys.stderr
+    return subprocess.run(command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, check=False).returncode
+
+
+if __name__ == "__main__":
+    print(set_up(tuple(sys.argv[1:])))
