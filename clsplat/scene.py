@@ -285,8 +285,7 @@ def _view(frame: Frame, split: Split, resolution: int, smaller: list[Path]) -> V
     if scale < 1 and lens.is_pinhole and not upright:
         for folder in smaller:
             candidate = folder / frame.name
-            # Two tools may round a size differently: a pixel of difference is the same factor.
-            if candidate.is_file() and _matches(candidate, width, height, folder, lens):
+            if candidate.is_file() and _stands_in(candidate, width, height, lens):
                 path = candidate
                 width, height = image_size(path, orient=False)
                 lens = lens.resized(width, height)
@@ -294,15 +293,11 @@ def _view(frame: Frame, split: Split, resolution: int, smaller: list[Path]) -> V
     return View(frame.name, camera.resized(width, height), path, split, lens, upright)
 
 
-def _matches(path: Path, width: int, height: int, folder: Path, lens: Lens) -> bool:
-    factor = int(folder.name.rsplit("_", 1)[1])
+def _stands_in(path: Path, width: int, height: int, lens: Lens) -> bool:
+    """Whether a smaller picture has just the size that is wanted; tools round the shorter side up or down."""
     size = image_size(path, orient=False)
-    return (
-        abs(size[0] - width) <= 1
-        and abs(size[1] - height) <= 1
-        and abs(size[0] - lens.width / factor) < 1
-        and abs(size[1] - lens.height / factor) < 1
-    )
+    near = abs(size[0] - width) <= 1 and abs(size[1] - height) <= 1
+    return near and max(size) == max(width, height) and max(size) < max(lens.width, lens.height)
 
 
 def _fit(path: Path, lens: Lens) -> tuple[Lens, bool]:
@@ -312,10 +307,11 @@ def _fit(path: Path, lens: Lens) -> tuple[Lens, bool]:
     proportions, another tool has turned it, and so it is turned.
     """
     stored = image_size(path, orient=False)
+    if stored == (lens.width, lens.height):
+        return lens, False
     turned = image_size(path, orient=True)
-    for size, upright in ((stored, False), (turned, True)):
-        if size == (lens.width, lens.height):
-            return lens, upright
+    if turned == (lens.width, lens.height):
+        return lens, True
     for size, upright in ((stored, False), (turned, True)):
         scale = max(size) / max(lens.width, lens.height)
         if abs(lens.width * scale - size[0]) <= 1 and abs(lens.height * scale - size[1]) <= 1:

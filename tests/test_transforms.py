@@ -20,11 +20,11 @@ needs_scenes = pytest.mark.skipif(not SCENES.is_dir(), reason=f"no real scenes: 
 POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 
 
-def make(folder: Path, frames: int = 2, name: str = "transforms.json", **keys: Any) -> Path:
+def make(folder: Path, count: int = 2, name: str = "transforms.json", **keys: Any) -> Path:
     """A data set of pictures of 12 x 8; `keys` replace those of the file, None leaves one out."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     listed = []
-    for index in range(frames):
+    for index in range(count):
         write_image(folder / "images" / f"{index}.png", np.full((8, 12, 3), 0.5, np.float32))
         listed.append({"file_path": f"images/{index}.png", "transform_matrix": POSE})
     document: dict[str, Any] = {"fl_x": 10.0, "frames": listed, **keys}
@@ -207,7 +207,7 @@ def test_point_clouds(tmp_path: Path) -> None:
     path.write_bytes(head + points.astype(">f8").tobytes()[:-1])
     with pytest.raises(InputError, match=r"a\.ply: truncated"):
         read_point_cloud(path)
-    path.write_bytes(head + np.full((3, 3), np.nan).tobytes())
+    path.write_bytes(head + np.full((3, 3), np.nan, ">f8").tobytes())
     with pytest.raises(InputError, match="not finite"):
         read_point_cloud(path)
 
