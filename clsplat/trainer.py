@@ -122,9 +122,8 @@ class Trainer:
             self.gradients,
             absolute=config.density.absolute_gradients,
         )
-        if self.step <= config.density.stop:
-            ranks = frame.pairs.gaussian_from_rank
-            add_statistics(device, self.statistics, camera, ranks, screen, frame.projected.splats)
+        if self.step < config.density.stop:
+            add_statistics(device, self.statistics, camera, frame.projected, screen)
         optimiser = config.optimiser
         adam(
             device,

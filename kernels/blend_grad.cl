@@ -1,5 +1,5 @@
 // The gradient of blending, back to front (docs/gradients.md, equations 14 to 22). A group owns a tile and writes one
-// slot of partial sums for each of its (tile, Gaussian) pairs, at the pair's own place: no atomics.
+// slot of partial sums for each of its (tile, Gaussian) pairs, at a place of its own: no atomics.
 //
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
@@ -35,10 +35,10 @@ static inline void group_sums(float *values, __local float *scratch, __global fl
 }
 #endif
 
-// As blend, its transmittance and stops, image_gradient (3, height, width), pair_from_sorted (pairs)
+// As blend, its transmittance and stops, image_gradient (3, height, width), slot_from_sorted (pairs)
 // -> slots (pairs, SLOT_STRIDE), every one of them.
 GROUP __kernel void blend_grad(const int tiles_x, const int height, __global const uint *ranges,
-                               __global const uint *gaussian_from_sorted, __global const uint *pair_from_sorted,
+                               __global const uint *gaussian_from_sorted, __global const uint *slot_from_sorted,
                                __global const float *splats, __global const float *background,
                                __global const float *image_gradient, __global const float *transmittance,
                                __global const int *stops, __global float *slots) {
@@ -80,13 +80,13 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
 #endif
 
   for (int i = last + (int)get_local_id(0); i < end; i += ITEMS) {
-    __global float *slot = slots + (size_t)SLOT_STRIDE * pair_from_sorted[i];
+    __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[i];
     for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = 0.0f;
   }
 
   for (int i = last - 1; i >= begin; --i) {
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
-    __global float *slot = slots + (size_t)SLOT_STRIDE * pair_from_sorted[i];
+    __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[i];
     int y0, y1, h0, h1;
     tile_box(splat, (float)tile_x, (float)tile_y, &y0, &y1, &h0, &h1);
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];

@@ -3,15 +3,14 @@
 
 #define WHITEN 0.84932180028801904f // sqrt(log2(e) / 2)
 
-// One work-item a visible Gaussian. screen (n, 2): gradient of the mean on the image in pixels; x_scale, y_scale to NDC
+// One work-item a Gaussian; those with tiles are seen. screen (n, 2): gradient of the mean on the image in pixels; x_scale, y_scale to NDC
 // -> gradient_sums (n): norms added up; seen (n): views; radii (n): largest radius in pixels at 3 sigma.
-__kernel void density_statistics(const uint visible, const float x_scale, const float y_scale,
-                                 __global const uint *gaussian_from_rank, __global const float *screen,
+__kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
+                                 __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums,
                                  __global float *seen, __global float *radii) {
-  const uint rank = get_global_id(0);
-  if (rank >= visible) return;
-  const uint i = gaussian_from_rank[rank];
+  const uint i = get_global_id(0);
+  if (i >= n || tile_counts[i] == 0) return;
   const float gx = x_scale * screen[2 * i], gy = y_scale * screen[2 * i + 1];
   gradient_sums[i] += sqrt(fma1(gx, gx, gy * gy));
   seen[i] += 1.0f;

@@ -25,24 +25,27 @@ __kernel void order_counts(const uint visible, __global const uint *order, __glo
   counts[rank] = tile_counts[i];
 }
 
-// offsets (visible): scan of the counts -> tile_keys, gaussian_from_pair (pairs)
+// offsets (visible): scan of the counts by rank; slots (n): scan of the counts by Gaussian -> tile_keys,
+// slot_from_pair (pairs): pairs in order of depth; gaussian_from_slot (pairs): a Gaussian's slots follow each other, and
+// Gaussians' slots the Gaussians, so that what is summed over slots streams through memory.
 __kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y,
                         __global const uint *gaussian_from_rank, __global const uint *offsets,
-                        __global const float *splats, __global uint *tile_keys, __global uint *gaussian_from_pair) {
+                        __global const uint *slots, __global const float *splats, __global uint *tile_keys,
+                        __global uint *slot_from_pair, __global uint *gaussian_from_slot) {
   const uint rank = get_global_id(0);
   if (rank >= visible) return;
   const uint i = gaussian_from_rank[rank];
   const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i);
   const int y0 = first_cell(e.my - e.half_h, (float)TILE, tiles_y);
   const int y1 = end_cell(e.my + e.half_h, (float)TILE, tiles_y);
-  uint pair = offsets[rank];
+  uint pair = offsets[rank], slot = slots[i];
   for (int ty = y0; ty < y1; ++ty) {
     int x0, x1;
     tile_span(&e, ty, tiles_x, &x0, &x1);
-    for (int tx = x0; tx < x1; ++tx) {
+    for (int tx = x0; tx < x1; ++tx, ++pair, ++slot) {
       tile_keys[pair] = ty * tiles_x + tx;
-      gaussian_from_pair[pair] = i;
-      ++pair;
+      slot_from_pair[pair] = slot;
+      gaussian_from_slot[slot] = i;
     }
   }
 }

@@ -1,5 +1,5 @@
 // The gradient of projection: sums a Gaussian's slots in the order of its tiles, then the chain rule back to its
-// parameters (docs/gradients.md, equations 23 to 40). One work-item a visible Gaussian.
+// parameters (docs/gradients.md, equations 23 to 40). One work-item a Gaussian.
 #include "shared/math.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
@@ -11,11 +11,11 @@
 #endif
 #define INVERSE_WHITEN2 1.38629436111989062f // 2 ln 2: the slots' moments are of W times sqrt(log2(e) / 2)
 
-// gaussian_from_rank, offsets (visible), pairs: their total; the parameters, splats and camera as in project
+// tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project
 // -> gradients of the parameters (same shapes; rows of Gaussians that are not visible are left as they are) and of
 // the mean on the image: screen (n, 2) in pixels, plain or absolute.
-__kernel void project_grad(const uint visible, const uint pairs, const int coefficients, __constant float *camera,
-                           __global const uint *gaussian_from_rank, __global const uint *offsets,
+__kernel void project_grad(const uint n, const int coefficients, __constant float *camera,
+                           __global const uint *tile_counts, __global const uint *first_slots,
                            __global const float *slots, __global const float *splats, __global const float *means,
                            __global const float *quaternions, __global const float *log_scales,
                            __global const float *opacity_logits, __global const float *sh_dc, __global const float *sh_rest,
@@ -23,14 +23,13 @@ __kernel void project_grad(const uint visible, const uint pairs, const int coeff
                            __global float *d_quaternions, __global float *d_log_scales,
                            __global float *d_opacity_logits, __global float *d_sh_dc, __global float *d_sh_rest,
                            __global float *screen) {
-  const uint rank = get_global_id(0);
-  if (rank >= visible) return;
-  const uint i = gaussian_from_rank[rank];
-  const uint first = offsets[rank], after = rank + 1 < visible ? offsets[rank + 1] : pairs;
+  const uint i = get_global_id(0);
+  if (i >= n || tile_counts[i] == 0) return;
+  const uint first = first_slots[i], after = first + tile_counts[i];
   float m[SLOT_STRIDE];
   for (int field = 0; field < SLOT_STRIDE; ++field) m[field] = 0.0f;
-  for (uint pair = first; pair < after; ++pair)
-    for (int field = 0; field < SLOT_STRIDE; ++field) m[field] += slots[(size_t)SLOT_STRIDE * pair + field];
+  for (uint slot = first; slot < after; ++slot)
+    for (int field = 0; field < SLOT_STRIDE; ++field) m[field] += slots[(size_t)SLOT_STRIDE * slot + field];
 
   Projection p;
   if (!project_gaussian(means + 3 * i, quaternions + 4 * i, log_scales + 3 * i, camera, &p)) return;

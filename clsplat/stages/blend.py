@@ -73,7 +73,7 @@ def blend_grad(
     *,
     absolute: bool = False,
 ) -> DeviceArray:
-    """Partial gradients of every pair, slots (pairs, SLOT), from image_gradient (3, rows, stride)."""
+    """Partial gradients of every pair at its slot, (pairs, SLOT), from image_gradient (3, rows, stride)."""
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]
     slots = work.array("slots", (pairs, SLOT_ABSOLUTE if absolute else SLOT_PLAIN))
@@ -88,7 +88,7 @@ def blend_grad(
         rows,
         lists.ranges,
         lists.gaussian_from_sorted,
-        lists.pair_from_sorted,
+        lists.slot_from_sorted,
         splats,
         background,
         image_gradient,

@@ -12,7 +12,7 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
-from clsplat.stages.project import DeviceGaussians, group_shapes
+from clsplat.stages.project import DeviceGaussians, Projected, group_shapes
 
 NO_ROW = np.uint32(0xFFFFFFFF)
 """In a list of rows: a row of zeros."""
@@ -39,22 +39,21 @@ def add_statistics(
     device: Device,
     statistics: DensityStatistics,
     camera: Camera,
-    gaussian_from_rank: DeviceArray,
+    projected: Projected,
     screen: DeviceArray,
-    splats: DeviceArray,
 ) -> None:
     """Add one view: the norm of each visible mean's gradient, from pixels to NDC, as the paper's threshold wants."""
-    visible = gaussian_from_rank.shape[0]
+    n = projected.tile_counts.shape[0]
     launch_items(
         device,
         device.kernels("density").density_statistics,
-        visible,
-        visible,
+        n,
+        n,
         0.5 * camera.width,
         0.5 * camera.height,
-        gaussian_from_rank,
+        projected.tile_counts,
         screen,
-        splats,
+        projected.splats,
         statistics.gradient_sums,
         statistics.seen,
         statistics.radii,

@@ -11,7 +11,7 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.stages.project import Projected
-from clsplat.stages.scan import scan, total
+from clsplat.stages.scan import scan
 from clsplat.stages.sort import sort
 
 _KEY_BITS = 31
@@ -20,13 +20,14 @@ _KEY_BITS = 31
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """gaussian_from_rank (visible): by depth, ties by index; offsets (visible): where a rank's pairs begin;
-    tile_keys, gaussian_from_pair (pairs)."""
+    """gaussian_from_rank (visible): by depth, ties by index; tile_keys, slot_from_pair (pairs): in that order;
+    first_slots (n): where a Gaussian's slots begin; gaussian_from_slot (pairs)."""
 
     gaussian_from_rank: DeviceArray
-    offsets: DeviceArray
     tile_keys: DeviceArray
-    gaussian_from_pair: DeviceArray
+    slot_from_pair: DeviceArray
+    first_slots: DeviceArray
+    gaussian_from_slot: DeviceArray
 
 
 def duplicate(device: Device, work: Workspace, projected: Projected, tiles: tuple[int, int]) -> Pairs:
@@ -37,7 +38,8 @@ def duplicate(device: Device, work: Workspace, projected: Projected, tiles: tupl
     visible_total = work.array("visible_total", (1,), np.uint32)
     pairs_total = work.array("pairs_total", (1,), np.uint32)
     scan(device, work, projected.tile_counts, ranks, visible_total, as_flags=True)
-    total(device, work, projected.tile_counts, pairs_total)
+    first_slots = work.array("first_slots", (n,), np.uint32)
+    scan(device, work, projected.tile_counts, first_slots, pairs_total)
     visible, pairs = int(visible_total.get()[0]), int(pairs_total.get()[0])
 
     gaussian_from_visible = work.array("gaussian_from_visible", (visible,), np.uint32)
@@ -70,7 +72,8 @@ def duplicate(device: Device, work: Workspace, projected: Projected, tiles: tupl
     offsets = work.array("offsets", (visible,), np.uint32)
     scan(device, work, counts, offsets, pairs_total)
     tile_keys = work.array("tile_keys", (pairs,), np.uint32)
-    gaussian_from_pair = work.array("gaussian_from_pair", (pairs,), np.uint32)
+    slot_from_pair = work.array("slot_from_pair", (pairs,), np.uint32)
+    gaussian_from_slot = work.array("gaussian_from_slot", (pairs,), np.uint32)
     launch_items(
         device,
         kernels.duplicate,
@@ -79,8 +82,10 @@ def duplicate(device: Device, work: Workspace, projected: Projected, tiles: tupl
         *tiles,
         gaussian_from_rank,
         offsets,
+        first_slots,
         projected.splats,
         tile_keys,
-        gaussian_from_pair,
+        slot_from_pair,
+        gaussian_from_slot,
     )
-    return Pairs(gaussian_from_rank, offsets, tile_keys, gaussian_from_pair)
+    return Pairs(gaussian_from_rank, tile_keys, slot_from_pair, first_slots, gaussian_from_slot)

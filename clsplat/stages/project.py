@@ -141,9 +141,8 @@ def project_grad(
     device: Device,
     gaussians: DeviceGaussians,
     camera_array: DeviceArray,
-    splats: DeviceArray,
-    gaussian_from_rank: DeviceArray,
-    offsets: DeviceArray,
+    projected: Projected,
+    first_slots: DeviceArray,
     slots: DeviceArray,
     gradients: DeviceGaussians,
     screen: DeviceArray,
@@ -152,19 +151,18 @@ def project_grad(
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` and `screen` (n, 2) from the pairs' slots."""
     defines = {"ABSOLUTE_GRADIENTS": True} if absolute else {}
-    visible = offsets.shape[0]
+    n = gaussians.count
     launch_items(
         device,
         device.kernels("project_grad", **defines).project_grad,
-        visible,
-        visible,
-        slots.shape[0],
+        n if slots.shape[0] else 0,
+        n,
         gaussians.coefficients,
         camera_array,
-        gaussian_from_rank,
-        offsets,
+        projected.tile_counts,
+        first_slots,
         slots,
-        splats,
+        projected.splats,
         *(gaussians[group] for group in GROUPS),
         *(gradients[group] for group in GROUPS),
         screen,

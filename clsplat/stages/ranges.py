@@ -16,11 +16,11 @@ from clsplat.stages.sort import sort
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """ranges (tiles, 2): begin and end in the lists; gaussian_from_sorted, pair_from_sorted (pairs)."""
+    """ranges (tiles, 2): begin and end in the lists; gaussian_from_sorted, slot_from_sorted (pairs)."""
 
     ranges: DeviceArray
     gaussian_from_sorted: DeviceArray
-    pair_from_sorted: DeviceArray
+    slot_from_sorted: DeviceArray
 
 
 def tile_lists(device: Device, work: Workspace, pairs: Pairs, tiles: int) -> TileLists:
@@ -29,6 +29,7 @@ def tile_lists(device: Device, work: Workspace, pairs: Pairs, tiles: int) -> Til
     keys, pair_from_sorted = sort(device, work, "tile", pairs.tile_keys, max(tiles - 1, 1).bit_length())
     ranges = work.array("ranges", (tiles, 2), np.uint32)
     ranges.fill(0)
+    slot_from_sorted = work.array("slot_from_sorted", (count,), np.uint32)
     gaussian_from_sorted = work.array("gaussian_from_sorted", (count,), np.uint32)
     launch_items(
         device,
@@ -37,8 +38,10 @@ def tile_lists(device: Device, work: Workspace, pairs: Pairs, tiles: int) -> Til
         count,
         keys,
         pair_from_sorted,
-        pairs.gaussian_from_pair,
+        pairs.slot_from_pair,
+        pairs.gaussian_from_slot,
         ranges,
+        slot_from_sorted,
         gaussian_from_sorted,
     )
-    return TileLists(ranges, gaussian_from_sorted, pair_from_sorted)
+    return TileLists(ranges, gaussian_from_sorted, slot_from_sorted)
