@@ -44,7 +44,8 @@ class Demo:
     output: Output
     """Folder for everything the demo makes."""
     device: Device = None
-    """OpenCL device: an index of `clsplat devices`, cpu, gpu, or a part of its name. The best one if not given."""
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
+    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
     json: Flag = False
     """Print the evaluation as JSON on standard output."""
 
@@ -58,16 +59,16 @@ class Sfm:
     output: Output
     """Folder for the scene."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Match every pair of photos, or neighbours in the order of their names only (for video frames); auto is every
-    pair up to 100 photos."""
+    """Match every pair of photos, or only neighbours by name, for video frames; auto: every pair up to 100 photos."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "auto"
-    """COLMAP's model of the lens; the scene's images are undistorted with it."""
+    """Lens model to fit, by COLMAP's name; the scene's images are undistorted with it.
+    auto is OPENCV for a camera with 20 photos or more, else SIMPLE_RADIAL."""
     threads: Annotated[int | None, arg(metavar="INT")] = None
     """CPU threads; all cores if not given."""
     seed: int = 0
     """Seed of the robust estimators."""
     overwrite: Flag = False
-    """Replace a scene in the output folder that was made of other photos."""
+    """Replace a scene in the output folder that was made of other photos or with other settings."""
     json: Flag = False
     """Print what was recovered as JSON, as in the scene's sfm.json."""
 
@@ -82,13 +83,14 @@ class Train:
     output: Output
     """Folder for the run: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/, test/."""
     scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None
-    """Folder with the scene: COLMAP, Blender, nerfstudio or instant-ngp. With --resume it need not be given."""
+    """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, or just photos. Not needed with --resume."""
     resume: Flag = False
     """Go on with the run in the output folder."""
     overwrite: Flag = False
-    """Replace the run in the output folder."""
+    """Replace the run in the output folder; files that clsplat did not write stay."""
     device: Device = None
-    """OpenCL device: an index of `clsplat devices`, cpu, gpu, or a part of its name. The best one if not given."""
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
+    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
     json: Flag = False
     """Print the final evaluation as JSON on standard output."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
@@ -102,7 +104,7 @@ class Eval:
     """
 
     model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
-    """A run's folder or a model file."""
+    """A run's folder or a model file; for a file in a run's folder that run's settings hold."""
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None
     """Folder with the scene; the one the run was trained on if not given."""
     test_every: Annotated[int | None, arg(metavar="INT")] = None
@@ -112,7 +114,8 @@ class Eval:
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians and behind images with alpha; as the run has it, or black."""
     device: Device = None
-    """OpenCL device: an index of `clsplat devices`, cpu, gpu, or a part of its name. The best one if not given."""
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
+    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
     json: Flag = False
     """Print the result as JSON, as in eval.json."""
 
@@ -124,10 +127,10 @@ class Render:
     model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
     """A run's folder or a model file."""
     cameras: Annotated[Path, arg(metavar="SPARSE_DIR")]
-    """Folder with cameras and images, bin or txt, of a COLMAP model."""
+    """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
-    """Where the images go, such as 'out/{name}.exr': {name} is the image's name without extension, with its
-    sub-folders. The extension chooses 8-bit .png or float .exr."""
+    """Where the images go, such as 'out/{name}.exr'; .png files have 8 bits, .exr files floats.
+    {name} is the image's name without its extension, sub-folders included."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     alpha: Flag = False
@@ -139,7 +142,8 @@ class Render:
     scale: float = 1.0
     """Size relative to the camera's, where neither width nor height is given."""
     device: Device = None
-    """OpenCL device: an index of `clsplat devices`, cpu, gpu, or a part of its name. The best one if not given."""
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
+    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
     json: Flag = False
     """Print the images written as JSON: name, path, width, height, seconds."""
 

@@ -21,7 +21,7 @@ class OptimiserConfig:
     means_rate: float = 1.6e-4
     """Rate of the means at the start, times the scene's extent."""
     means_rate_end: float = 1.6e-6
-    """Rate of the means at `means_rate_steps`; log-linear in between."""
+    """Rate of the means at `means_rate_steps`, times the extent; log-linear in between."""
     means_rate_steps: int = 30_000
     """Steps over which the means' rate decays."""
     sh_dc_rate: float = 2.5e-3
@@ -49,9 +49,9 @@ class DensityConfig:
     every: int = 100
     """Steps between densifications; 0 turns density control off."""
     start: int = 500
-    """First step after which Gaussians are cloned and split."""
+    """Gaussians are cloned, split and pruned after steps later than this one."""
     stop: int = 15_000
-    """Last step at which Gaussians are cloned and split."""
+    """Gaussians are cloned, split, pruned and reset after steps before this one."""
     gradient_threshold: float = 2e-4
     """Mean norm of the screen-space position gradient (in NDC units) from which a Gaussian is densified."""
     absolute_gradients: bool = False
@@ -67,11 +67,11 @@ class DensityConfig:
     max_screen_radius: float = 0.0
     """Gaussians that covered a larger radius in pixels are pruned, after the first opacity reset; 0 prunes none."""
     opacity_reset_every: int = 3000
-    """Steps between opacity resets; also once at `start` where the background is white."""
+    """Steps between opacity resets, 0 for none; one more at `start` where the background is white."""
     opacity_reset_to: float = 0.01
     """Opacity is lowered to at most this at a reset."""
     max_gaussians: int = 10_000_000
-    """No densification beyond this number."""
+    """Clones and splits stop at this number of Gaussians; where room is short, the largest gradients go first."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,9 @@ class TrainConfig:
     """One training run."""
 
     iterations: int = 30_000
-    """Number of optimisation steps."""
+    """Number of steps; learning rates and density control do not depend on it."""
     seed: int = 0
-    """Seed of everything random."""
+    """Seed of everything random; the same seed on the same device gives the same model."""
     sh_degree: int = 3
     """Highest spherical-harmonics degree, 0 to 3."""
     sh_degree_every: int = 1000
@@ -89,13 +89,13 @@ class TrainConfig:
     dssim_weight: float = 0.2
     """Weight of D-SSIM in the loss; L1 has the rest."""
     background: Background = "black"
-    """Background behind the Gaussians, and behind images with alpha."""
+    """Behind the Gaussians, and behind images with alpha; random is a new colour each step, evaluated on black."""
     warmup: tuple[int, ...] = (250, 500)
-    """Steps at which the training resolution doubles; two of them start at a quarter of the size."""
+    """Steps after which the training resolution doubles; two of them start at a quarter, '' at the full size."""
     resolution: int = 0
-    """Longest image side for training; 0 keeps the images' size up to 1600."""
+    """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
     test_every: int = 8
-    """Every n-th view by name is held out; 0 holds out none."""
+    """Every n-th view by name is held out, the first too; 0 holds out none. A data set's own split goes first."""
     random_points: int = 100_000
     """Initial Gaussians where a scene has no points."""
     checkpoint_every: int = 1000

@@ -28,12 +28,12 @@ class Plan:
 
 def is_due(config: DensityConfig, step: int) -> bool:
     """Whether Gaussians are cloned, split and pruned after this step."""
-    return config.every > 0 and config.start < step <= config.stop and step % config.every == 0
+    return config.every > 0 and config.start < step < config.stop and step % config.every == 0
 
 
 def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
     """Whether opacities are reset after this step; once early before a white background, as the authors' code."""
-    if config.every <= 0 or step > config.stop:
+    if config.every <= 0 or step >= config.stop:
         return False
     return (config.opacity_reset_every > 0 and step % config.opacity_reset_every == 0) or (
         white and step == config.start

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import os
+
 
 class ClsplatError(Exception):
     """Base of every error that is reported as one line: the work failed (exit status 1)."""
@@ -21,7 +23,15 @@ class DeviceError(InputError):
 
 
 class KernelBuildError(ClsplatError):
-    """A driver refused a kernel. The message holds the device, the options and the numbered source."""
+    """A driver refused a kernel. The message has the device, the options and the log's first error; `log` and `source`,
+    with its lines numbered as the log counts them, have the rest, which CLSPLAT_DEBUG=1 shows."""
+
+    def __init__(self, message: str, log: str, source: str) -> None:
+        super().__init__(message)
+        self.log, self.source = log, source
+
+    def __str__(self) -> str:
+        return f"{self.args[0]}\n{self.log}\n{self.source}" if os.environ.get("CLSPLAT_DEBUG") else str(self.args[0])
 
 
 class CapacityError(ClsplatError):

@@ -19,7 +19,7 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     The data goes to a temporary name in the same folder (a rename is atomic only within a file system), is flushed
     to the disk and renamed. A link at `path` is followed. The folder must exist. Raises OSError as `open` and
-    `write` do; the temporary file is removed on any exception, KeyboardInterrupt included.
+    `write` do, with the name `path`; the temporary file is removed on any exception, KeyboardInterrupt included.
     """
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
@@ -30,9 +30,12 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(target)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
+            # A full disk is found by `write`, which does not know the name; and nobody knows the temporary one.
+            raise OSError(error.errno, error.strerror, str(path)) from None
         raise
     _sync_folder(target.parent)
 

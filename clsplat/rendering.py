@@ -106,11 +106,11 @@ class RenderResult:
 
 
 class Renderer:
-    """Renders models; keeps the last one on the device."""
+    """Renders models; keeps the last one on the device. It can work in another's rasterizer and its memory."""
 
-    def __init__(self, device: Device | None = None) -> None:
+    def __init__(self, device: Device | None = None, rasterizer: Rasterizer | None = None) -> None:
         self.device = device or open_device()
-        self._rasterizer = Rasterizer(self.device)
+        self._rasterizer = rasterizer or Rasterizer(self.device)
         self._background = allocate(self.device, (3,), np.float32)
         self._held: tuple[Gaussians, DeviceGaussians] | None = None
 

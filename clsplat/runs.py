@@ -123,8 +123,11 @@ class Run:
             line = json.dumps(record, allow_nan=False)
         except ValueError:
             raise ClsplatError(f"training diverged at step {record.get('step')}: {dict(record)}") from None
-        with open(self.metrics_path, "a", encoding="utf-8") as file:
-            file.write(line + "\n")
+        try:
+            with open(self.metrics_path, "a", encoding="utf-8") as file:
+                file.write(line + "\n")
+        except OSError as error:  # a full disk does not say which file it was
+            raise OSError(error.errno, error.strerror, str(self.metrics_path)) from None
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """The records of metrics.jsonl; a cut last line, as a crash leaves it, is left out."""

@@ -67,7 +67,7 @@ class _Session:
 
     def __init__(self, trainer: Trainer, run: Run | None) -> None:
         self.trainer, self.run = trainer, run
-        self.renderer = Renderer(trainer.device)
+        self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
         self.saved = 0
 

@@ -227,8 +227,8 @@ def render(verb: Render) -> int:
         result = renderer.render(gaussians, camera, background)
         path = paths[name]
         path.parent.mkdir(parents=True, exist_ok=True)
-        image = with_alpha(result.image, result.alpha, straight=extension == ".png") if verb.alpha else result.image
-        write_image(path, image)
+        image = with_alpha(result.image, result.alpha) if verb.alpha else result.image
+        write_image(path, image, alpha="associated")
         seconds = time.monotonic() - start
         record = {"name": name, "path": str(path), "width": camera.width, "height": camera.height, "seconds": seconds}
         written.append(record)
@@ -239,15 +239,11 @@ def render(verb: Render) -> int:
     return 0
 
 
-def with_alpha(image: Any, alpha: Any, *, straight: bool) -> Any:
-    """(H, W, 4) float32 from an image (H, W, 3) over black, which is premultiplied, and its alpha (H, W)."""
+def with_alpha(image: Any, alpha: Any) -> Any:
+    """(H, W, 4) float32, premultiplied, from an image (H, W, 3) over black and its alpha (H, W)."""
     import numpy as np
 
-    opacity = np.asarray(alpha, np.float32)[:, :, None]
-    colour = np.asarray(image, np.float32)
-    if straight:
-        colour = np.divide(colour, opacity, out=np.zeros_like(colour), where=opacity > 0)
-    return np.concatenate([colour, opacity], axis=2)
+    return np.concatenate([image, alpha[:, :, None]], axis=2, dtype=np.float32)
 
 
 def parse_colour(text: str) -> Colour:
@@ -318,9 +314,10 @@ def _load_model(path: Path) -> Gaussians:
 
 def _load_scene(path: Path, resolution: int, test_every: int) -> Scene:
     """The scene, its warnings printed."""
+    from clsplat.progress import StageProgress
     from clsplat.scene import load_scene
 
-    scene = load_scene(path, resolution=resolution, test_every=test_every)
+    scene = load_scene(path, resolution=resolution, test_every=test_every, progress=StageProgress())
     for warning in scene.warnings:
         print(f"clsplat: warning: {warning}", file=sys.stderr)
     return scene

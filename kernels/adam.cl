@@ -1,5 +1,6 @@
-// Adam (Kingma and Ba 2015, algorithm 1) on one parameter group as a flat array, LANES elements a work-item. It leaves
-// the gradient zero, so that the next step need only write the rows of visible Gaussians.
+// Adam (Kingma and Ba 2015, algorithm 1; docs/gradients.md, equation 42) on one parameter group as a flat array, LANES
+// elements a work-item. It leaves the gradient zero, so that the next step need only write the rows of visible
+// Gaussians.
 #include "shared/math.h"
 #include "shared/lanes.h"
 

@@ -2,7 +2,8 @@
 // On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each only the rows that its ellipse reaches,
 // LANES pixels at a time; on a GPU (LANES == 1) each work-item has pixels of its own. The bits are the same.
 //
-// Transmittance is kept negative in a pixel that is finished, which no test then lets continue.
+// Transmittance is kept negative in a pixel that is finished, which no test then lets continue. Each mask comes from
+// one comparison: of several joined by & some compilers make 16-bit lanes and back.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -40,30 +41,31 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     const float log2o = splat[SPLAT_LOG2O];
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
-    const float mx = splat[SPLAT_MX] - ((float)tile_x + 0.5f), my = splat[SPLAT_MY] - ((float)tile_y + 0.5f);
-    floatL offset_u[HALVES];
-    for (int h = 0; h < HALVES; ++h) offset_u[h] = l11 * (mx - ((floatL)(h * LANES) + LANE_INDEX));
-    FOR_VECTORS(row, part, k) {
-      const float dy = my - (float)row;
-      const float v = l22 * dy;
-      const floatL power = log2_alpha(offset_u[part], l12 * dy, fma1(-v, v, log2o));
-      const floatL before = t[k];
-      const intL reached = (power >= LOG2_ALPHA_MIN) & (before > 0.0f);
-      if (ANYL(reached)) {
-        floatL alpha = exp2L(power);
-        alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
-        const floatL after = fmaL(-before, alpha, before);
-        const intL added = reached & (after > TRANSMITTANCE_MIN);
-        const intL ended = reached & (after <= TRANSMITTANCE_MIN);
-        const floatL weight = added ? before * alpha : (floatL)(0.0f);
-        red[k] = fmaL(weight, (floatL)(c_red), red[k]);
-        green[k] = fmaL(weight, (floatL)(c_green), green[k]);
-        blue[k] = fmaL(weight, (floatL)(c_blue), blue[k]);
-        t[k] = added ? after : before;
-        if (ANYL(ended)) {
-          t[k] = ended ? -before : t[k];
-          stop[k] = ended ? (intL)(i) : stop[k];
-          if (!ANYL(t[k] > 0.0f)) --alive;
+    const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
+    FOR_PARTS(part) {
+      const floatL offset_u = l11 * (mx - ((floatL)(part * LANES) + LANE_INDEX));
+      FOR_ROWS(row, k, part) {
+        const float dy = my - (float)row;
+        const float v = l22 * dy;
+        const floatL before = t[k];
+        const floatL open = log2_alpha(offset_u, l12 * dy, fma1(-v, v, log2o));
+        const floatL power = before > 0.0f ? open : (floatL)(FINISHED);
+        if (ANYL(power >= LOG2_ALPHA_MIN)) {
+          floatL alpha = exp2L(power);
+          alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
+          alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);
+          const floatL after = fmaL(-before, alpha, before);
+          const floatL weight = after > TRANSMITTANCE_MIN ? before * alpha : (floatL)(0.0f);
+          red[k] = fmaL(weight, (floatL)(c_red), red[k]);
+          green[k] = fmaL(weight, (floatL)(c_green), green[k]);
+          blue[k] = fmaL(weight, (floatL)(c_blue), blue[k]);
+          t[k] = after > TRANSMITTANCE_MIN ? after : before;
+          const floatL ended = after > TRANSMITTANCE_MIN ? (floatL)(0.0f) : before;
+          if (ANYL(ended > 0.0f)) {
+            t[k] = ended > 0.0f ? -before : t[k];
+            stop[k] = ended > 0.0f ? (intL)(i) : stop[k];
+            if (!ANYL(t[k] > 0.0f)) --alive;
+          }
         }
       }
     }

@@ -1,5 +1,5 @@
-// The gradient of blending, back to front (docs/gradients.md, equations 14 to 22). A group owns a tile and writes one
-// slot of partial sums for each of its (tile, Gaussian) pairs, at a place of its own: no atomics.
+// The gradient of blending, back to front (docs/gradients.md, equations 22 to 26, 48 and 49). A group owns a tile and
+// writes one slot of partial sums for each of its (tile, Gaussian) pairs, at a place of its own: no atomics.
 //
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
@@ -92,63 +92,60 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     const float log2o = splat[SPLAT_LOG2O];
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
-    const float mx = splat[SPLAT_MX] - ((float)tile_x + 0.5f), my = splat[SPLAT_MY] - ((float)tile_y + 0.5f);
-    floatL offset_u[HALVES], s0[HALVES], s1[HALVES], s2[HALVES];
-    for (int h = 0; h < HALVES; ++h) {
-      offset_u[h] = l11 * (mx - ((floatL)(h * LANES) + LANE_INDEX));
-      s0[h] = s1[h] = s2[h] = (floatL)(0.0f);
-    }
-    floatL d_red = (floatL)(0.0f), d_green = (floatL)(0.0f), d_blue = (floatL)(0.0f);
-#ifdef ABSOLUTE_GRADIENTS
-    floatL abs_x = (floatL)(0.0f), abs_y = (floatL)(0.0f);
-#endif
-    FOR_VECTORS(row, part, k) {
-      const float dy = my - (float)row;
-      const float v = l22 * dy;
-      const floatL power = log2_alpha(offset_u[part], l12 * dy, fma1(-v, v, log2o));
-      const intL reached = (power >= LOG2_ALPHA_MIN) & ((intL)(i) < stop[k]);
-      if (ANYL(reached)) {
-        const floatL uncapped = reached ? exp2L(power) : (floatL)(0.0f);
-        const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
-        const floatL inverse = 1.0f / (1.0f - alpha);
-        const floatL before = t[k] * inverse;
-        const floatL shade = fmaL(g_red[k], (floatL)(c_red), fmaL(g_green[k], (floatL)(c_green), g_blue[k] * c_blue));
-        const floatL weight = alpha * before;
-        const floatL d_alpha = fmaL(before, shade, -(behind[k] * inverse));
-        floatL g = alpha * d_alpha;
-        g = uncapped < ALPHA_MAX ? g : (floatL)(0.0f);
-        behind[k] = fmaL(weight, shade, behind[k]);
-        t[k] = before;
-        d_red = fmaL(weight, g_red[k], d_red);
-        d_green = fmaL(weight, g_green[k], d_green);
-        d_blue = fmaL(weight, g_blue[k], d_blue);
-        const float y = (float)row - CENTRE;
-        const floatL gy = g * y;
-        s0[part] += g;
-        s1[part] += gy;
-        s2[part] = fmaL(gy, (floatL)(y), s2[part]);
-#ifdef ABSOLUTE_GRADIENTS
-        const floatL u = offset_u[part] + l12 * dy;
-        abs_x += fabs(g * (l11 * u));
-        abs_y += fabs(g * fmaL((floatL)(l12), u, (floatL)(l22 * v)));
-#endif
-      }
-    }
-
-    // (20) to (22): u = uc - l12 y, v = vc - l22 y with y from the tile's centre row.
+    const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
+    // (49), in (u, v) with y from the tile's centre row: u = uc - l12 y, v = vc - l22 y.
     const float uy = l12 * (my - CENTRE), vc = l22 * (my - CENTRE);
-    floatL m0 = (floatL)(0.0f), m1 = m0, mu = m0, muu = m0, mu1 = m0, m2 = m0;
-    for (int h = 0; h < HALVES; ++h) {
-      const floatL uc = offset_u[h] + uy;
-      m0 += s0[h];
-      m1 += s1[h];
-      m2 += s2[h];
-      const floatL first = fmaL(uc, s0[h], -(l12 * s1[h]));
+    const floatL zero = (floatL)(0.0f);
+    floatL m0 = zero, m1 = zero, m2 = zero, mu = zero, mu1 = zero, muu = zero;
+    floatL d_red = zero, d_green = zero, d_blue = zero;
+#ifdef ABSOLUTE_GRADIENTS
+    floatL abs_x = zero, abs_y = zero;
+#endif
+    FOR_PARTS(part) {
+      const floatL offset_u = l11 * (mx - ((floatL)(part * LANES) + LANE_INDEX));
+      floatL s0 = zero, s1 = zero, s2 = zero;
+      FOR_ROWS(row, k, part) {
+        const float dy = my - (float)row;
+        const float v = l22 * dy;
+        const floatL open = log2_alpha(offset_u, l12 * dy, fma1(-v, v, log2o));
+        const floatL power = (intL)(i) < stop[k] ? open : (floatL)(FINISHED);
+        if (ANYL(power >= LOG2_ALPHA_MIN)) {
+          const floatL uncapped = power >= LOG2_ALPHA_MIN ? exp2L(power) : zero;
+          const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
+          const floatL inverse = 1.0f / (1.0f - alpha);
+          const floatL before = t[k] * inverse;
+          const floatL shade = fmaL(g_red[k], (floatL)(c_red), fmaL(g_green[k], (floatL)(c_green), g_blue[k] * c_blue));
+          const floatL weight = alpha * before;
+          const floatL d_alpha = fmaL(before, shade, -(behind[k] * inverse));
+          const floatL g = uncapped < ALPHA_MAX ? alpha * d_alpha : zero;
+          behind[k] = fmaL(weight, shade, behind[k]);
+          t[k] = before;
+          d_red = fmaL(weight, g_red[k], d_red);
+          d_green = fmaL(weight, g_green[k], d_green);
+          d_blue = fmaL(weight, g_blue[k], d_blue);
+          const float y = (float)row - CENTRE;
+          const floatL gy = g * y;
+          s0 += g;
+          s1 += gy;
+          s2 = fmaL(gy, (floatL)(y), s2);
+#ifdef ABSOLUTE_GRADIENTS
+          const floatL u = offset_u + l12 * dy;
+          abs_x += fabs(g * (l11 * u));
+          abs_y += fabs(g * fmaL((floatL)(l12), u, (floatL)(l22 * v)));
+#endif
+        }
+      }
+      const floatL uc = offset_u + uy;
+      const floatL first = fmaL(uc, s0, -(l12 * s1));
+      const floatL cross = fmaL(uc, s1, -(l12 * s2));
+      m0 += s0;
+      m1 += s1;
+      m2 += s2;
       mu += first;
-      const floatL cross = fmaL(uc, s1[h], -(l12 * s2[h]));
       mu1 += cross;
       muu += fmaL(uc, first, -(l12 * cross));
     }
+
     float values[SLOT_STRIDE];
     const float g = sumL(m0), g1 = sumL(m1), g2 = sumL(m2), gu = sumL(mu), gu1 = sumL(mu1);
     values[SLOT_G] = g;

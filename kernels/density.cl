@@ -3,8 +3,9 @@
 
 #define WHITEN 0.84932180028801904f // sqrt(log2(e) / 2)
 
-// One work-item a Gaussian; those with tiles are seen. screen (n, 2): gradient of the mean on the image in pixels; x_scale, y_scale to NDC
-// -> gradient_sums (n): norms added up; seen (n): views; radii (n): largest radius in pixels at 3 sigma.
+// One work-item a Gaussian; those with tiles are seen. screen (n, 2): gradient of the mean on the image in pixels;
+// x_scale, y_scale to NDC -> gradient_sums (n): norms added up (docs/gradients.md, equation 43); seen (n): views;
+// radii (n): largest radius in pixels at 3 sigma.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
                                  __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums,

@@ -3,8 +3,8 @@
 #include "shared/math.h"
 #include "shared/tile.h"
 
-// tile_counts (n), rank (n): scan of the visible -> gaussian_from_visible, depth_keys (visible). A positive float's bits
-// sort as it does.
+// tile_counts (n), rank (n): scan of the visible -> gaussian_from_visible, depth_keys (visible). A positive float's
+// bits sort as it does.
 __kernel void compact_visible(const uint n, __global const uint *tile_counts, __global const uint *ranks,
                               __global const float *splats, __global uint *gaussian_from_visible,
                               __global uint *depth_keys) {
@@ -26,8 +26,8 @@ __kernel void order_counts(const uint visible, __global const uint *order, __glo
 }
 
 // offsets (visible): scan of the counts by rank; slots (n): scan of the counts by Gaussian -> tile_keys,
-// slot_from_pair (pairs): pairs in order of depth; gaussian_from_slot (pairs): a Gaussian's slots follow each other, and
-// Gaussians' slots the Gaussians, so that what is summed over slots streams through memory.
+// slot_from_pair (pairs): pairs in order of depth; gaussian_from_slot (pairs): a Gaussian's slots follow each other,
+// and Gaussians' slots the Gaussians, so that what is summed over slots streams through memory.
 __kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y,
                         __global const uint *gaussian_from_rank, __global const uint *offsets,
                         __global const uint *slots, __global const float *splats, __global uint *tile_keys,

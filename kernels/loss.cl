@@ -1,4 +1,4 @@
-// The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient (docs/gradients.md, equations 41 to 46), SSIM with the
+// The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient (docs/gradients.md, equations 17 to 21), SSIM with the
 // usual 11 x 11 Gaussian window, sigma 1.5, zeros outside the image. The window is separable: vertical first, which
 // needs no margin, into planes with PAD zero columns on either side, then horizontal without bounds checks. A second
 // pair of passes convolves the three partial derivatives, the adjoint of the first.
@@ -63,7 +63,7 @@ __kernel void loss_vertical(const int height, const int stride, const int plane,
 }
 
 // moments -> partials (3, 3, height, stride): dSSIM by the windowed x, xx and xy, 0 right of the image;
-// sums (2, 3, height, strips)[0]: SSIM.
+// sums (3, 3, height, strips)[0]: SSIM.
 __kernel void loss_ssim(const int width, const int height, const int stride, const int plane,
                         __global const float *moments, __global float *partials, __global float *sums) {
   OWN_ROWS

@@ -1,5 +1,5 @@
-// Projection (Kerbl et al. 2023, section 4): each Gaussian to its ellipse, colour, depth and number of tiles.
-// One work-item a Gaussian.
+// Projection (Kerbl et al. 2023, section 4; docs/gradients.md, equations 1 to 13 and 44 to 47): each Gaussian to its
+// ellipse, colour, depth and number of tiles. One work-item a Gaussian.
 #include "shared/math.h"
 #include "shared/tile.h"
 #include "shared/gaussian.h"
@@ -7,12 +7,13 @@
 
 #define WHITEN 0.84932180028801904f // sqrt(log2(e) / 2)
 
-// means (n, 3), quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n, 3), sh_rest (n, coefficients - 1, 3);
-// splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.
+// means (n, 3), quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n, 3),
+// sh_rest (n, coefficients - 1, 3); splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.
 __kernel void project(const uint n, const int coefficients, const int tiles_x, const int tiles_y,
                       __constant float *camera, __global const float *means, __global const float *quaternions,
                       __global const float *log_scales, __global const float *opacity_logits,
-                      __global const float *sh_dc, __global const float *sh_rest, __global float *splats, __global uint *tile_counts) {
+                      __global const float *sh_dc, __global const float *sh_rest, __global float *splats,
+                      __global uint *tile_counts) {
   const uint i = get_global_id(0);
   if (i >= n) return;
   tile_counts[i] = 0;
@@ -22,15 +23,15 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   if (!(opacity > ALPHA_MIN)) return;
 
   __global float *splat = splats + (size_t)SPLAT_SIZE * i;
-  const float mx = fma1(camera[CAMERA_FX], p.x / p.z, camera[CAMERA_CX]);
-  const float my = fma1(camera[CAMERA_FY], p.y / p.z, camera[CAMERA_CY]);
-  // (7): Sigma^-1 = W^T W with W upper triangular.
+  image_position(p.x, p.lx, p.z, p.lz, camera[CAMERA_FX], camera[CAMERA_FX_LOW], camera[CAMERA_CX],
+                 camera[CAMERA_CX_LOW], splat + SPLAT_PIXEL_X, splat + SPLAT_SUB_X);
+  image_position(p.y, p.ly, p.z, p.lz, camera[CAMERA_FY], camera[CAMERA_FY_LOW], camera[CAMERA_CY],
+                 camera[CAMERA_CY_LOW], splat + SPLAT_PIXEL_Y, splat + SPLAT_SUB_Y);
+  // (8), (44): Sigma^-1 = W^T W with W upper triangular, stored as WHITEN W.
   const float l22 = WHITEN / sqrt(p.syy);
   const float l11 = WHITEN * sqrt(p.syy / p.det);
   const float log2o = log2_1(opacity);
   const float budget = log2o - LOG2_ALPHA_MIN;
-  splat[SPLAT_MX] = mx;
-  splat[SPLAT_MY] = my;
   splat[SPLAT_L11] = l11;
   splat[SPLAT_L12] = -(p.sxy / p.syy) * l11;
   splat[SPLAT_L22] = l22;

@@ -1,5 +1,5 @@
 // The gradient of projection: sums a Gaussian's slots in the order of its tiles, then the chain rule back to its
-// parameters (docs/gradients.md, equations 23 to 40). One work-item a Gaussian.
+// parameters (docs/gradients.md, equations 25 to 41 in the forms 50 to 52). One work-item a Gaussian.
 #include "shared/math.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
@@ -18,7 +18,8 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
                            __global const uint *tile_counts, __global const uint *first_slots,
                            __global const float *slots, __global const float *splats, __global const float *means,
                            __global const float *quaternions, __global const float *log_scales,
-                           __global const float *opacity_logits, __global const float *sh_dc, __global const float *sh_rest,
+                           __global const float *opacity_logits, __global const float *sh_dc,
+                           __global const float *sh_rest,
                            __global float *d_means,
                            __global float *d_quaternions, __global float *d_log_scales,
                            __global float *d_opacity_logits, __global float *d_sh_dc, __global float *d_sh_rest,
@@ -36,10 +37,10 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
   const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
 
-  // Opacity: sum of g is o dL/do, and do/dlogit = o (1 - o).
+  // Opacity, (29) and (41): sum of g is o dL/do, and do/dlogit = o (1 - o).
   d_opacity_logits[i] = m[SLOT_G] * (1.0f - sigmoid1(opacity_logits[i]));
 
-  // Mean on the image: -W^T (sum of g w); covariance: W^T (sum of g w w^T) W / 2.
+  // (50). Mean on the image: -W^T (sum of g w); covariance: W^T (sum of g w w^T) W / 2.
   const float d_mx = -INVERSE_WHITEN2 * (l11 * m[SLOT_GU]);
   const float d_my = -INVERSE_WHITEN2 * fma1(l12, m[SLOT_GU], l22 * m[SLOT_GV]);
 #ifdef ABSOLUTE_GRADIENTS
@@ -55,7 +56,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   const float g_xy = half4 * l11 * fma1(l12, uu, l22 * uv);
   const float g_yy = half4 * fma1(l12, fma1(l12, uu, 2.0f * l22 * uv), l22 * l22 * vv);
 
-  // M = J A S: dL/dM = 2 G M, column by column; J's entries and A's collect theirs.
+  // (31), (51). M = J A S: dL/dM = 2 G M, column by column; J's entries and A's collect theirs.
   float d_jx = 0.0f, d_kx = 0.0f, d_jy = 0.0f, d_ky = 0.0f, d_a[9];
   for (int k = 0; k < 3; ++k) {
     const float m1 = p.s[k] * p.b1[k], m2 = p.s[k] * p.b2[k];
@@ -72,7 +73,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
     d_a[6 + k] = fma1(d_b1, p.kx, d_b2 * p.ky);
   }
 
-  // Rotation: A = R_camera R(q), so dL/dR = R_camera^T dL/dA; then q, then the normalisation.
+  // Rotation, (51), (34), (35): A = R_camera R(q), so dL/dR = R_camera^T dL/dA; then q, then the normalisation.
   float r[9];
   for (int row = 0; row < 3; ++row)
     for (int column = 0; column < 3; ++column)
@@ -88,8 +89,8 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   const float radial = d_q[0] * w + d_q[1] * x + d_q[2] * y + d_q[3] * z;
   for (int k = 0; k < 4; ++k) d_quaternions[4 * i + k] = fma1(-radial, p.q[k], d_q[k]) / p.length;
 
-  // Mean in the camera's frame: through the image position, and through J. With the ratio clamped, kx = -jx rx depends
-  // on z alone.
+  // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, kx = -jx rx
+  // depends on z alone.
   const float rx = p.x / p.z, ry = p.y / p.z;
   float d_x = d_mx * p.jx, d_y = d_my * p.jy;
   float d_z = -(d_mx * p.jx * rx + d_my * p.jy * ry);
@@ -105,7 +106,8 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
     d_z -= d_ry * ry;
   }
 
-  // Colour: a channel clamped at 0 has no gradient; the basis depends on the mean through the view direction.
+  // Colour, (38) to (40): a channel clamped at 0 has no gradient; the basis depends on the mean through the view
+  // direction.
   float vx = means[3 * i] - camera[CAMERA_PX], vy = means[3 * i + 1] - camera[CAMERA_PY];
   float vz = means[3 * i + 2] - camera[CAMERA_PZ];
   const float length = sqrt(fma1(vx, vx, fma1(vy, vy, vz * vz)));

@@ -14,6 +14,8 @@ from opencl_drivers import use_every_driver
 
 use_every_driver()
 
+from pipeline import shaped
+
 from clsplat.device.context import Device, list_devices, open_device
 
 INFOS = list_devices()
@@ -31,6 +33,12 @@ def device(request: pytest.FixtureRequest) -> Device:
     return open_device(str(request.param))
 
 
+@pytest.fixture(scope="session")
+def default_device() -> Device:
+    """The driver that is used unless another is asked for: CLSPLAT_DEVICE, or the first."""
+    return open_device()
+
+
 SHAPES = ((1, 1), (1, 64), (8, 1), (8, 16))
 """(lanes, items): the scalar loop, a GPU's shape, a CPU's, and a mixture. 16 lanes abort PoCL 3.0's compiler."""
 
@@ -39,4 +47,4 @@ SHAPES = ((1, 1), (1, 64), (8, 1), (8, 16))
 def shaped_device(device: Device, request: pytest.FixtureRequest) -> Device:
     """Each driver in each kernel shape."""
     lanes, items = request.param
-    return device.with_shape(lanes=lanes, items=items)
+    return shaped(device, lanes, items)

@@ -195,3 +195,6 @@ NAMED: dict[str, Callable[[], Scene]] = {
     "random_cloud": lambda: random_cloud(300, 11, 70, 50),
 }
 """Every scene without arguments, by name, for `pytest.mark.parametrize`."""
+
+SHAPE_MATTERS = ("overlap", "many_per_tile", "saturating")
+"""Of them those that take the branches in which kernels of other shapes differ: several batches, pixels that end."""

@@ -104,13 +104,17 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             raise DeviceError("--device nosuch: no such device")
         return "device"
 
+    def write_image(path: Path, image: np.ndarray, *, alpha: str = "straight") -> None:
+        assert image.shape[2] == 3 or alpha == "associated"
+        pipe.written[str(path)] = image
+
     fakes: dict[str, dict[str, Any]] = {
         "scene": {"load_scene": load_scene},
         "training": {"train": train},
         "rendering": {"Renderer": Renderer},
         "device.context": {"open_device": open_device},
         "colmap": {"read_cameras": lambda _: pipe.cameras},
-        "images": {"write_image": lambda path, image: pipe.written.update({str(path): image})},
+        "images": {"write_image": write_image},
     }
     for name, members in fakes.items():
         module = ModuleType(f"clsplat.{name}")
@@ -273,7 +277,7 @@ def test_sfm(scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
     captured = capsys.readouterr()
     assert json.loads(captured.out) == {"photos": 3}
     assert captured.err.splitlines()[0] == "matching photos 50 %"
-    options = {"matching": "sequential", "camera_model": "OPENCV", "threads": None, "seed": 0, "overwrite": False}
+    options = {"matching": "sequential", "camera_model": "auto", "threads": None, "seed": 0, "overwrite": False}
     assert calls == [(scene, options)]
     assert main(["sfm", str(tmp_path / "none"), "-o", str(tmp_path / "out")]) == 2
     assert "none: no such folder" in error_line(capsys)
@@ -412,18 +416,11 @@ def test_render(model: str, scene: str, pipeline: Pipeline, tmp_path: Path, caps
     assert pipeline.written[records[0]["path"]].shape == (24, 32, 3)
 
 
-@pytest.mark.parametrize(("extension", "colour"), [("exr", 0.25), ("png", 0.5)])
-def test_render_with_alpha(
-    extension: str, colour: float, model: str, scene: str, pipeline: Pipeline, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("extension", ["exr", "png"])
+def test_render_with_alpha(extension: str, model: str, scene: str, pipeline: Pipeline, tmp_path: Path) -> None:
     assert main(["render", model, "--cameras", scene, "-o", f"{tmp_path}/{{name}}.{extension}", "--alpha"]) == 0
     image = pipeline.written[f"{tmp_path}/a.{extension}"]
-    np.testing.assert_allclose(image, np.broadcast_to([colour] * 3 + [0.5], (24, 32, 4)))
-
-
-def test_straight_alpha_where_nothing_is() -> None:
-    image = verbs.with_alpha(np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32), straight=True)
-    np.testing.assert_array_equal(image, np.zeros((1, 1, 4)))
+    np.testing.assert_allclose(image, np.broadcast_to([0.25] * 3 + [0.5], (24, 32, 4)))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-# PoCL keeps work-items apart by a loop; two CPU threads per core would only fight over its pool.
+# Drivers cache what they build, keyed by the whole text that they get; a second cache in front of theirs only adds
+# binaries that some of them fail to load again.
 os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 
 import numpy as np
@@ -80,9 +81,10 @@ def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
 
 
 def default_shape(device: cl.Device) -> Shape:
-    """The shape by type and vector width; DESIGN's measurements are in docs/performance.md."""
+    """The shape by type and vector width; why there are several is in docs/decisions/0003-one-source-many-shapes.md."""
     if _kind(device) != "cpu":
-        return Shape(lanes=1, items=min(256, device.max_work_group_size), chunks=0)
+        items = next((n for n in (256, 128, 64, 32, 16) if n <= device.max_work_group_size), 1)
+        return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
     lanes = 16 if device.native_vector_width_float >= 16 else 8
     if _pocl_version(device) == (3, 0):
         lanes = 8  # its compiler aborts on some float16 built-ins

@@ -9,18 +9,30 @@ TILE = 16
 PAD = 16
 """Zero columns on either side of the loss's planes, so that the horizontal window needs no bounds check."""
 
-CAMERA = (
+_TRANSFORM = (
     *(f"R{row}{column}" for row in range(3) for column in range(3)),
     *("T0", "T1", "T2"),
-    *("FX", "FY", "CX", "CY", "NEAR"),
-    *("XMIN", "XMAX", "YMIN", "YMAX"),
-    *("PX", "PY", "PZ"),
+    *("FX", "FY", "CX", "CY"),
 )
-"""A camera as float32: `cam_from_world`, intrinsics, the limits of x/z and y/z in the Jacobian, its centre."""
 
-SPLAT = ("MX", "MY", "L11", "L12", "L22", "LOG2O", "RED", "GREEN", "BLUE", "HALF_W", "HALF_H", "DEPTH")
-"""A projected Gaussian: mean in pixels; the whitening W of docs/gradients.md times sqrt(log2(e) / 2), so that
-log2(alpha) = LOG2O - u^2 - v^2; colour; half extents in pixels of the ellipse where alpha is 1/255; camera depth."""
+CAMERA = (
+    *_TRANSFORM,
+    *("NEAR", "XMIN", "XMAX", "YMIN", "YMAX"),
+    *("PX", "PY", "PZ"),
+    *(f"{name}_LOW" for name in _TRANSFORM),
+)
+"""A camera: `cam_from_world`, intrinsics, near plane, the limits of x/z and y/z in the Jacobian, its centre; and what
+the rounding of pose and intrinsics to float32 left, so that a mean's place on the image is good to 1e-6 pixels."""
+
+SPLAT = (
+    *("PIXEL_X", "PIXEL_Y", "SUB_X", "SUB_Y"),
+    *("L11", "L12", "L22", "LOG2O"),
+    *("RED", "GREEN", "BLUE", "DEPTH"),
+    *("HALF_W", "HALF_H", "UNUSED_0", "UNUSED_1"),
+)
+"""A projected Gaussian in 64 bytes, a cache line: mean in whole pixels and the rest; the whitening W of
+docs/gradients.md times sqrt(log2(e) / 2), so that log2(alpha) = LOG2O - u^2 - v^2; colour; camera depth; half extents
+in pixels of the ellipse where alpha is 1/255."""
 
 SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
 """Partial gradients of one (tile, Gaussian) pair; the last two only where absolute gradients are kept."""

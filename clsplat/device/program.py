@@ -14,7 +14,7 @@ from clsplat.errors import KernelBuildError
 
 
 def build(context: cl.Context, device: cl.Device, stem: str, defines: Mapping[str, object], options: str) -> cl.Program:
-    """Compile `stem`.cl. Raises KernelBuildError with the device, the options, the log and the numbered source."""
+    """Compile `stem`.cl. Raises KernelBuildError with the device, the options, the log and the source."""
     source = kernel_source(stem)
     flags = [f"-D{name}" if value is True else f"-D{name}={value}" for name, value in sorted(defines.items())]
     all_options = [*flags, *options.split()]
@@ -24,9 +24,14 @@ def build(context: cl.Context, device: cl.Device, stem: str, defines: Mapping[st
             return cl.Program(context, source).build(options=all_options)
     except cl.Error as error:
         numbered = "\n".join(f"{number:4d}  {line}" for number, line in enumerate(source.splitlines(), 1))
+        log = str(error)
+        first = next((line.strip() for line in log.splitlines() if "error:" in line), log.splitlines()[0])
         raise KernelBuildError(
-            f"{stem}.cl does not build on {device.name.strip()} with {' '.join(all_options)}:\n{error}\n{numbered}"
-        ) from error
+            f"{stem}.cl does not build on {device.name.strip()} with {' '.join(all_options)}: {first} "
+            "(CLSPLAT_DEBUG=1 shows the log and the source)",
+            log,
+            numbered,
+        ) from None
 
 
 class Kernels:

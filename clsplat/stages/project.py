@@ -79,7 +79,7 @@ def download_gaussians(gaussians: DeviceGaussians) -> Gaussians:
 
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
-    """A camera in the order of `layout.CAMERA`, rounded to float32 once, here."""
+    """A camera in the order of `layout.CAMERA`: each value rounded to float32, and what that left of those with _LOW."""
     half_w, half_h = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
     values = {
         "FX": camera.fx,
@@ -97,7 +97,9 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         values["P" + "XYZ"[row]] = float(camera.position[row])
         for column in range(3):
             values[f"R{row}{column}"] = float(camera.rotation[row, column])
-    return np.array([values[name] for name in CAMERA], np.float32)
+    rounded = {name: np.float32(value) for name, value in values.items()}
+    rounded.update({f"{name}_LOW": np.float32(value - float(rounded[name])) for name, value in values.items()})
+    return np.array([rounded[name] for name in CAMERA], np.float32)
 
 
 def tiles_of(camera: Camera) -> tuple[int, int]:

@@ -36,13 +36,3 @@ def scan(
     launch_groups(device, kernels.scan_sums, groups, items, n, chunk, as_flags, values, sums)
     launch_groups(device, kernels.scan_top, 1, items, groups, sums, total)
     launch_groups(device, kernels.scan_chunks, groups, items, n, chunk, as_flags, values, sums, out)
-
-
-def total(device: Device, work: Workspace, values: DeviceArray, out: DeviceArray) -> None:
-    """out[0] = sum of the values."""
-    n = values.shape[0]
-    groups, chunk = chunking(device, n)
-    sums = work.array("scan_sums", (groups,), np.uint32)
-    kernels, items = device.kernels("scan"), device.shape.items
-    launch_groups(device, kernels.scan_sums, groups, items, n, chunk, 0, values, sums)
-    launch_groups(device, kernels.scan_top, 1, items, groups, sums, out)

@@ -15,7 +15,7 @@ BITONIC_MAX = 4096
 """Keys and positions of so many fill the 32 KiB of local memory that every device has."""
 
 BITONIC_WINS = {"cpu": 512, "gpu": BITONIC_MAX, "other": BITONIC_MAX}
-"""Up to this many keys one launch of bitonic sort beats the radix sort's dozen (tools/bench_sort.py)."""
+"""Up to this many keys one launch of bitonic sort beats the radix sort's dozen."""
 
 
 def radix_sort(

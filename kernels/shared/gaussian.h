@@ -3,6 +3,7 @@
 
 typedef struct {
   float x, y, z;        // mean in the camera's frame
+  float lx, ly, lz;     // what rounding it to float32 left
   float rx, ry;         // x/z and y/z as the Jacobian takes them, clamped
   float jx, jy, kx, ky; // Jacobian: rows (jx, 0, kx) and (0, jy, ky)
   float q[4];           // unit quaternion w x y z
@@ -27,13 +28,43 @@ static inline void rotation_of(const float *q, float *r) {
   r[8] = 1.0f - 2.0f * (x * x + y * y);
 }
 
-// Fills *p. Returns 0 where the Gaussian is to be culled; conditions are positive, so that NaN culls.
+// Row of cam_from_world times the mean (x, y, z). In float32 alone this would cost 1e-4 pixels, and a pixel at the edge
+// of an ellipse flips over that.
+#define CAMERA_ROW(row)                                                                                               \
+  camera_row(camera + CAMERA_R##row##0, camera + CAMERA_R##row##0_LOW, camera[CAMERA_T##row],                         \
+             camera[CAMERA_T##row##_LOW], x, y, z)
+
+static inline Double camera_row(__constant float *r, __constant float *r_low, float t, float t_low, float x, float y,
+                                float z) {
+  Double sum = {t, t_low};
+  sum = multiply_add2(r[0], r_low[0], x, sum);
+  sum = multiply_add2(r[1], r_low[1], y, sum);
+  return multiply_add2(r[2], r_low[2], z, sum);
+}
+
+// (2): focal * (x / z) + centre, as whole pixels and the rest in [0, 1).
+static inline void image_position(float x, float x_low, float z, float z_low, float focal, float focal_low,
+                                  float centre, float centre_low, __global float *whole, __global float *rest) {
+  const float ratio = x / z;
+  const float ratio_low = (fma1(-ratio, z, x) + fma1(-ratio, z_low, x_low)) / z;
+  const Double c = {centre, fma1(focal, ratio_low, centre_low)};
+  const Double at = multiply_add2(focal, focal_low, ratio, c);
+  const float floored = floor(at.high);
+  *whole = floored;
+  *rest = (at.high - floored) + at.low;
+}
+
+// Fills *p: (1), (3) to (7). Returns 0 where the Gaussian is to be culled; conditions are positive, so that NaN culls.
 static inline int project_gaussian(__global const float *mean, __global const float *quaternion,
                                    __global const float *log_scale, __constant float *camera, Projection *p) {
   const float x = mean[0], y = mean[1], z = mean[2];
-  p->x = fma1(camera[CAMERA_R00], x, fma1(camera[CAMERA_R01], y, fma1(camera[CAMERA_R02], z, camera[CAMERA_T0])));
-  p->y = fma1(camera[CAMERA_R10], x, fma1(camera[CAMERA_R11], y, fma1(camera[CAMERA_R12], z, camera[CAMERA_T1])));
-  p->z = fma1(camera[CAMERA_R20], x, fma1(camera[CAMERA_R21], y, fma1(camera[CAMERA_R22], z, camera[CAMERA_T2])));
+  const Double in_x = CAMERA_ROW(0), in_y = CAMERA_ROW(1), in_z = CAMERA_ROW(2);
+  p->x = in_x.high;
+  p->y = in_y.high;
+  p->z = in_z.high;
+  p->lx = in_x.low;
+  p->ly = in_y.low;
+  p->lz = in_z.low;
   if (!(p->z > camera[CAMERA_NEAR])) return 0;
 
   float norm2 = 0.0f;
@@ -58,8 +89,8 @@ static inline int project_gaussian(__global const float *mean, __global const fl
   p->kx = -p->jx * p->rx;
   p->ky = -p->jy * p->ry;
 
-  // (5): the square root M = J A S. Its entries give the covariance; the minors of its columns give the determinant
-  // as a sum of squares, where sxx * syy - sxy * sxy would cancel for a needle.
+  // (5) to (7): the square root M = J A S. Its entries give the covariance; the minors of its columns give the
+  // determinant as a sum of squares, where sxx * syy - sxy * sxy would cancel for a needle.
   float m1[3], m2[3];
   for (int k = 0; k < 3; ++k) {
     p->b1[k] = fma1(p->jx, p->a[k], p->kx * p->a[6 + k]);

@@ -50,3 +50,23 @@ static inline float log2_1(float x) {
 }
 
 static inline float sigmoid1(float x) { return 1.0f / (1.0f + exp1(-x)); }
+
+// A number as the unevaluated sum of two floats (Dekker 1971): 48 bits where a position needs them.
+typedef struct {
+  float high, low;
+} Double;
+
+static inline Double sum2(float a, float b) {
+  const float high = a + b;
+  const float rest = high - a;
+  const Double sum = {high, (a - (high - rest)) + (b - rest)};
+  return sum;
+}
+
+// s + (a + a_low) * b, with b exact.
+static inline Double multiply_add2(float a, float a_low, float b, Double s) {
+  const float product = a * b;
+  const Double sum = sum2(s.high, product);
+  const float low = s.low + sum.low + fma1(a_low, b, fma1(a, b, -product));
+  return sum2(sum.high, low);
+}

@@ -12,8 +12,8 @@ typedef struct {
 
 static inline Ellipse ellipse_of(__global const float *splat) {
   Ellipse e;
-  e.mx = splat[SPLAT_MX];
-  e.my = splat[SPLAT_MY];
+  e.mx = splat[SPLAT_PIXEL_X] + splat[SPLAT_SUB_X];
+  e.my = splat[SPLAT_PIXEL_Y] + splat[SPLAT_SUB_Y];
   e.l11 = splat[SPLAT_L11];
   e.l12 = splat[SPLAT_L12];
   e.l22 = splat[SPLAT_L22];
@@ -41,7 +41,8 @@ static inline int end_cell(float high, float size, int count) {
   return (int)(cell < (float)count ? cell : (float)count);
 }
 
-// The right edge of the ellipse, from the mean, over the offsets [d0, d1] in y; the left edge by symmetry.
+// The right edge of the ellipse, from the mean, over the offsets [d0, d1] in y; the left edge by symmetry
+// (docs/gradients.md, equation 47).
 static inline float right_edge(const Ellipse *e, float d0, float d1) {
   if (e->tangent >= d0 && e->tangent <= d1) return e->half_w;
   const float dy = e->tangent < d0 ? d0 : d1;

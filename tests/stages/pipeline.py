@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,12 @@ from clsplat.rendering import Frame, Rasterizer
 from clsplat.stages.project import DeviceGaussians, allocate_gaussians, download_gaussians, upload_gaussians
 
 BACKGROUND = (0.1, 0.2, 0.3)
+
+
+@cache
+def shaped(device: Device, lanes: int, items: int) -> Device:
+    """The device in another shape; one for the whole session, as each builds its own kernels."""
+    return device.with_shape(lanes=lanes, items=items)
 
 
 @dataclass

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
-from pipeline import BACKGROUND, Pipeline
+from pipeline import BACKGROUND, Pipeline, shaped
 
 from clsplat.device.context import Device
 from clsplat.reference import render as reference
@@ -17,12 +17,21 @@ from clsplat.reference import render as reference
 SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
 
 
-@pytest.mark.parametrize("name", scenes.NAMED)
-def test_image(shaped_device: Device, name: str) -> None:
+def assert_image(device: Device, name: str) -> None:
     scene = scenes.NAMED[name]()
     wanted = reference.forward(*scene, BACKGROUND, margins=True).blended
     # 2e-5 is the project's contract for a frame; the band is where a threshold may fall the other way.
-    assert_close_images(Pipeline.run(shaped_device, scene).image, wanted.image, 2e-5, ignore=wanted.margin < 1e-4)
+    assert_close_images(Pipeline.run(device, scene).image, wanted.image, 2e-5, ignore=wanted.margin < 1e-4)
+
+
+@pytest.mark.parametrize("name", scenes.NAMED)
+def test_image(device: Device, name: str) -> None:
+    assert_image(device, name)
+
+
+@pytest.mark.parametrize("name", scenes.SHAPE_MATTERS)
+def test_image_in_every_shape(shaped_device: Device, name: str) -> None:
+    assert_image(shaped_device, name)
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
@@ -40,7 +49,7 @@ def test_sizes_at_the_seams(shaped_device: Device, size: tuple[int, int]) -> Non
 def test_the_same_bits_in_every_shape(device: Device) -> None:
     scene = scenes.random_cloud(2000, 8, 150, 100)
     frames = [
-        Pipeline.run(device.with_shape(lanes=lanes, items=items), scene).frame.blended
+        Pipeline.run(shaped(device, lanes, items), scene).frame.blended
         for lanes, items in ((8, 1), (1, 1), (1, 64), (1, 256), (4, 1), (8, 16))
     ]
     for other in frames[1:]:

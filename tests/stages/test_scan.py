@@ -8,9 +8,9 @@ import pytest
 
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.stages.scan import scan, total
+from clsplat.stages.scan import scan
 
-SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 16 * 64 - 1, 16 * 64 + 1, 8 * 1024 + 1, 100_003)
+SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 8 * 1024 + 1, 100_003)
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -26,12 +26,10 @@ def test_exclusive_prefix_sum(shaped_device: Device, n: int, as_flags: bool) -> 
     assert sum_array.get()[0] == counted.sum()
 
 
-def test_scan_in_place_and_total(shaped_device: Device) -> None:
+def test_scan_in_place(shaped_device: Device) -> None:
     values = np.arange(5000, dtype=np.uint32)
     work = Workspace(shaped_device)
     array, out = upload(shaped_device, values), allocate(shaped_device, (1,), np.uint32)
-    total(shaped_device, work, array, out)
-    assert out.get()[0] == values.sum()
     scan(shaped_device, work, array, array, out)
     np.testing.assert_array_equal(array.get(), np.cumsum(values) - values)
 

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""density.cl against NumPy: rows are moved to the bit, statistics agree with the twin's ellipses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+from compare import assert_close
+from pipeline import Pipeline
+
+from clsplat.camera import Camera
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device
+from clsplat.device.layout import SPLAT
+from clsplat.gaussians import Gaussians
+from clsplat.reference import render as reference
+from clsplat.stages.density import NO_ROW, add_statistics, gather, new_statistics, widen
+from clsplat.stages.project import GROUPS, DeviceGaussians, group_shapes
+
+SIZES = (1, 2, 63, 64, 65, 127, 129, 1025)
+"""A launch is rounded up to groups of 64."""
+
+
+def numbered(device: Device, count: int, coefficients: int) -> tuple[DeviceGaussians, dict[str, np.ndarray]]:
+    """Arrays in which every element has its own value; on the device and on the host."""
+    rng = np.random.default_rng(count)
+    host = {
+        name: rng.permutation(int(np.prod(shape))).astype(np.float32).reshape(shape) + 1
+        for name, shape in group_shapes(count, coefficients).items()
+    }
+    arrays = {name: upload(device, values) for name, values in host.items()}
+    return DeviceGaussians(count, coefficients, arrays), host
+
+
+@pytest.mark.parametrize("count", SIZES)
+@pytest.mark.parametrize("coefficients", [1, 4, 16])
+def test_gather_takes_rows_and_zeros(device: Device, count: int, coefficients: int) -> None:
+    source, host = numbered(device, count, coefficients)
+    rng = np.random.default_rng(1)
+    for length in (1, count, 2 * count + 1):
+        rows = rng.integers(0, count, length).astype(np.uint32)
+        rows[::3] = NO_ROW
+        rows[-1] = count - 1
+        got = gather(device, rows, source)
+        assert (got.count, got.coefficients) == (length, coefficients)
+        for name in GROUPS:
+            wanted = host[name][np.where(rows == NO_ROW, 0, rows)]
+            wanted[rows == NO_ROW] = 0
+            np.testing.assert_array_equal(got[name].get(), wanted, err_msg=name)
+    for name in GROUPS:
+        np.testing.assert_array_equal(source[name].get(), host[name], err_msg=f"{name} of the source")
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 9), (1, 16), (9, 16)])
+def test_widen_keeps_values_and_adds_zeros(device: Device, before: int, after: int) -> None:
+    source, host = numbered(device, 65, before)
+    got = widen(device, source, after)
+    assert (got.count, got.coefficients) == (65, after)
+    rest = got["sh_rest"].get()
+    assert rest.shape == (65, after - 1, 3)
+    np.testing.assert_array_equal(rest[:, : before - 1], host["sh_rest"])
+    assert not rest[:, before - 1 :].any()
+    for name in GROUPS[:-1]:
+        np.testing.assert_array_equal(got[name].get(), host[name], err_msg=name)
+
+
+@pytest.mark.parametrize("visible", [0, *SIZES])
+def test_statistics_at_the_seams(device: Device, visible: int) -> None:
+    """Twice the same view and once another: sums and views add up, the radius is the largest; others stay."""
+    rng = np.random.default_rng(visible)
+    count, camera = 1100, scenes.straight_camera(60, 40)
+    ranks = rng.permutation(count)[:visible].astype(np.uint32)
+    statistics = new_statistics(device, count)
+    sums, seen, largest = np.zeros(count), np.zeros(count), np.zeros(count)
+    whiten = np.sqrt(np.log2(np.e) / 2)
+    for factor in (1.0, 1.0, 2.0):
+        screen = rng.normal(size=(count, 2)).astype(np.float32)
+        splats = rng.normal(size=(count, len(SPLAT))).astype(np.float32)
+        # axis-aligned ellipses of 3 sigma = 2.7 to 26.7 and 5.7 pixels, or a half of these: never near a whole number
+        splats[:, SPLAT.index("L11")] = whiten * factor / (0.9 + np.arange(count) % 9)
+        splats[:, SPLAT.index("L12")] = 0
+        splats[:, SPLAT.index("L22")] = whiten * factor / 1.9
+        add_statistics(
+            device,
+            statistics,
+            camera,
+            upload(device, ranks),
+            upload(device, screen),
+            upload(device, splats),
+        )
+        sums[ranks] += np.hypot(30 * screen[ranks, 0].astype(float), 20 * screen[ranks, 1].astype(float))
+        seen[ranks] += 1
+        radii = np.ceil(3 / factor * np.maximum(0.9 + np.arange(count) % 9, 1.9))
+        largest[ranks] = np.maximum(largest[ranks], radii[ranks])
+    # a square root and two sums in float32
+    assert_close(statistics.gradient_sums.get(), sums, relative=1e-6)
+    np.testing.assert_array_equal(statistics.seen.get(), seen)
+    np.testing.assert_array_equal(statistics.radii.get(), largest)
+
+
+def statistics_of(device: Device, scene: tuple[Gaussians, Camera]) -> tuple[Pipeline, np.ndarray, np.ndarray]:
+    """The run, its screen gradients for an image gradient of ones, and the radii that were noted."""
+    run = Pipeline.run(device, scene)
+    _, screen = run.backward(np.ones((run.camera.height, run.camera.width, 3)))
+    statistics = new_statistics(device, run.gaussians.count)
+    ranks = run.frame.pairs.gaussian_from_rank
+    add_statistics(device, statistics, run.camera, ranks, upload(device, screen), run.frame.projected.splats)
+    return run, screen, statistics.radii.get()
+
+
+@pytest.mark.parametrize("name", ["overlap", "off_frustum", "random_cloud"])
+def test_radii_are_three_sigma_of_the_ellipse(device: Device, name: str) -> None:
+    scene = scenes.NAMED[name]()
+    run, _, radii = statistics_of(device, scene)
+    projected = reference.forward(*scene).projected
+    a, b, c = projected.conics.T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        determinant = a * c - b * b
+        sxx, syy, sxy = c / determinant, a / determinant, -b / determinant
+        wanted = 3 * np.sqrt(0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy))
+    shown = run.visible
+    assert shown.any()
+    # rounded up to whole pixels; 1e-4 relative for a covariance in float32
+    assert np.all(radii[shown] >= np.ceil(wanted[shown] * (1 - 1e-4)))
+    assert np.all(radii[shown] <= np.ceil(wanted[shown] * (1 + 1e-4)))
+    assert not radii[~shown].any(), "what is not visible has no radius"
+
+
+def test_gradients_in_ndc_do_not_depend_on_the_resolution(device: Device) -> None:
+    """Twice the pixels: half the gradient a pixel of the mean's move, the same in NDC, as the threshold wants it."""
+    gaussians, camera = scenes.one(96, 64)
+    sums = []
+    for view in (camera, camera.resized(48, 32)):
+        run = Pipeline.run(device, (gaussians, view))
+        pixels = view.width * view.height
+        _, screen = run.backward(np.tile(np.linspace(0, 1, view.width)[None, :, None], (view.height, 1, 3)) / pixels)
+        statistics = new_statistics(device, 1)
+        ranks = run.frame.pairs.gaussian_from_rank
+        add_statistics(device, statistics, view, ranks, upload(device, screen), run.frame.projected.splats)
+        sums.append(float(statistics.gradient_sums.get()[0]))
+    # the low-pass of 0.3 square pixels and the pixel grid weigh more at half the size
+    assert sums[0] > 0
+    assert sums[1] == pytest.approx(sums[0], rel=0.1)
