@@ -79,7 +79,7 @@ def download_gaussians(gaussians: DeviceGaussians) -> Gaussians:
 
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
-    """A camera in the order of `layout.CAMERA`: each value rounded to float32, and what that left of those with _LOW."""
+    """A camera in the order of `layout.CAMERA`: its values rounded to float32, and as _LOW what that left of them."""
     half_w, half_h = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
     values = {
         "FX": camera.fx,
