@@ -17,18 +17,24 @@ GROUP __kernel void scan_sums(const uint n, const uint chunk, const int as_flags
   if (get_local_id(0) == 0) sums[get_group_id(0)] = total;
 }
 
-// One group. sums (groups) -> the same, scanned; total[0] their sum.
+// One group. sums (groups) -> the same, scanned; total[0] their sum, or 0xffffffff where that does not fit 32 bits.
 GROUP __kernel void scan_top(const uint groups, __global uint *sums, __global uint *total) {
   __local uint scratch[ITEMS];
+  __local int overflow;
+  if (get_local_id(0) == 0) overflow = 0;
+  BARRIER_LOCAL();
   uint running = 0;
   for (uint base = 0; base < groups; base += ITEMS) {
     const uint i = base + get_local_id(0);
     uint all;
-    const uint before = group_exclusive_scan(i < groups ? sums[i] : 0, scratch, &all);
-    if (i < groups) sums[i] = running + before;
+    const uint sum = i < groups ? sums[i] : 0;
+    const uint before = running + group_exclusive_scan(sum, scratch, &all);
+    if (i < groups) sums[i] = before;
+    if (before + sum < before) overflow = 1; // one item sees the wrap; all that do write the same
     running += all;
   }
-  if (get_local_id(0) == 0) total[0] = running;
+  BARRIER_LOCAL();
+  if (get_local_id(0) == 0) total[0] = overflow ? 0xffffffff : running;
 }
 
 // values (n), scanned sums (groups) -> out (n)

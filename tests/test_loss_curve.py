@@ -26,7 +26,7 @@ def test_losses_are_the_golden_ones(device: Device, scene: Scene) -> None:
     golden = json.loads(GOLDEN.read_text())["losses"]
     assert len(golden) == 20
     got = loss_curve(scene, device)
-    # All drivers give the same bits; sums in another order are 1e-7 off, and 20 steps may make 1e-5 of that.
-    # A learning rate that is one per cent off is 1e-4 off here.
-    assert_close(got, golden, relative=2e-5, name="loss")
+    # All drivers give the same bits. Means in two floats instead of one, a change of rounding alone, moved these by
+    # 3e-7; one per cent off a learning rate moves them by 5e-6 (SH bands) to 1e-3 (means).
+    assert_close(got, golden, relative=3e-6, name="loss")
     assert np.ptp(golden) > 0.03, "a curve, not a constant"

@@ -10,9 +10,13 @@ import numpy as np
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
+from clsplat.errors import CapacityError
 from clsplat.stages.project import Projected
 from clsplat.stages.scan import scan
 from clsplat.stages.sort import sort
+
+_OVERFLOW = 0xFFFFFFFF
+"""What scan gives for a total that does not fit."""
 
 _KEY_BITS = 31
 """Bits of a positive float32."""
@@ -41,6 +45,10 @@ def duplicate(device: Device, work: Workspace, projected: Projected, tiles: tupl
     first_slots = work.array("first_slots", (n,), np.uint32)
     scan(device, work, projected.tile_counts, first_slots, pairs_total)
     visible, pairs = int(visible_total.get()[0]), int(pairs_total.get()[0])
+    if pairs == _OVERFLOW:
+        raise CapacityError(
+            f"{visible} visible Gaussians reach more than {_OVERFLOW} tiles together: use a smaller image"
+        )
 
     gaussian_from_visible = work.array("gaussian_from_visible", (visible,), np.uint32)
     depth_keys = work.array("depth_keys", (visible,), np.uint32)

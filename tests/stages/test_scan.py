@@ -38,3 +38,10 @@ def test_nothing_to_scan(shaped_device: Device) -> None:
     out = upload(shaped_device, np.full(1, 7, np.uint32))
     scan(shaped_device, Workspace(shaped_device), allocate(shaped_device, (0,), np.uint32), out, out)
     assert out.get()[0] == 0
+
+
+def test_a_total_over_32_bits_is_told(shaped_device: Device) -> None:
+    values = upload(shaped_device, np.full(3000, 0x00200000, np.uint32))  # 6.3e9
+    total = allocate(shaped_device, (1,), np.uint32)
+    scan(shaped_device, Workspace(shaped_device), values, values, total)
+    assert total.get()[0] == 0xFFFFFFFF
