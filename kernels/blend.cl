@@ -9,6 +9,7 @@
 #include "shared/group.h"
 #include "shared/tile.h"
 #include "shared/alpha.h"
+#include "shared/prefetch.h"
 
 // ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), background (3) -> image (3, height, width),
 // transmittance (height, width): what is left at the end; stops (height, width): the sorted index from which on the
@@ -35,6 +36,7 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
   }
 
   for (int i = begin; i < end && alive > 0; ++i) {
+    PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[min(i + AHEAD, end - 1)]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
     int y0, y1, h0, h1;
     tile_box(splat, (float)tile_x, (float)tile_y, &y0, &y1, &h0, &h1);

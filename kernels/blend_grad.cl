@@ -10,6 +10,7 @@
 #include "shared/group.h"
 #include "shared/tile.h"
 #include "shared/alpha.h"
+#include "shared/prefetch.h"
 
 #define CENTRE (0.5f * TILE - 0.5f)
 #ifdef ABSOLUTE_GRADIENTS
@@ -85,6 +86,8 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
   }
 
   for (int i = last - 1; i >= begin; --i) {
+    PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[max(i - AHEAD, begin)]);
+    PREFETCH(slots + (size_t)SLOT_STRIDE * slot_from_sorted[max(i - AHEAD, begin)]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
     __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[i];
     int y0, y1, h0, h1;

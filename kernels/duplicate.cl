@@ -2,6 +2,7 @@
 // a stable sort by tile alone leaves each tile's Gaussians front to back.
 #include "shared/math.h"
 #include "shared/tile.h"
+#include "shared/prefetch.h"
 
 // tile_counts (n), rank (n): scan of the visible -> gaussian_from_visible, depth_keys (visible). A positive float's
 // bits sort as it does.
@@ -34,12 +35,13 @@ __kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y
                         __global uint *slot_from_pair, __global uint *gaussian_from_slot) {
   const uint rank = get_global_id(0);
   if (rank >= visible) return;
+  const uint ahead = gaussian_from_rank[min(rank + AHEAD, visible - 1)];
+  PREFETCH(splats + (size_t)SPLAT_SIZE * ahead);
+  PREFETCH(slots + ahead);
   const uint i = gaussian_from_rank[rank];
-  const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i);
-  const int y0 = first_cell(e.my - e.half_h, (float)TILE, tiles_y);
-  const int y1 = end_cell(e.my + e.half_h, (float)TILE, tiles_y);
+  const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i, tiles_x, tiles_y);
   uint pair = offsets[rank], slot = slots[i];
-  for (int ty = y0; ty < y1; ++ty) {
+  for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
     int x0, x1;
     tile_span(&e, ty, tiles_x, &x0, &x1);
     for (int tx = x0; tx < x1; ++tx, ++pair, ++slot) {

@@ -40,11 +40,9 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   splat[SPLAT_HALF_H] = sqrt(budget * p.syy) / WHITEN;
   splat[SPLAT_DEPTH] = p.z;
 
-  const Ellipse e = ellipse_of(splat);
-  const int y0 = first_cell(e.my - e.half_h, (float)TILE, tiles_y);
-  const int y1 = end_cell(e.my + e.half_h, (float)TILE, tiles_y);
+  const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
   uint count = 0;
-  for (int ty = y0; ty < y1; ++ty) {
+  for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
     int x0, x1;
     tile_span(&e, ty, tiles_x, &x0, &x1);
     count += x1 - x0;

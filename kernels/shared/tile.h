@@ -4,26 +4,6 @@
 // Slack in pixels over what float32 loses here; a tile too many only costs time, one too few would show.
 #define TILE_SLACK 0.01f
 
-typedef struct {
-  float mx, my, l11, l12, l22, half_w, half_h;
-  float budget;  // u^2 + v^2 where alpha is 1/255
-  float tangent; // dy / dx from the mean to the ellipse's rightmost point, times half_w
-} Ellipse;
-
-static inline Ellipse ellipse_of(__global const float *splat) {
-  Ellipse e;
-  e.mx = splat[SPLAT_PIXEL_X] + splat[SPLAT_SUB_X];
-  e.my = splat[SPLAT_PIXEL_Y] + splat[SPLAT_SUB_Y];
-  e.l11 = splat[SPLAT_L11];
-  e.l12 = splat[SPLAT_L12];
-  e.l22 = splat[SPLAT_L22];
-  e.half_w = splat[SPLAT_HALF_W];
-  e.half_h = splat[SPLAT_HALF_H];
-  e.budget = splat[SPLAT_LOG2O] - LOG2_ALPHA_MIN;
-  e.tangent = -e.l12 * e.l11 / (e.l22 * e.l22 + e.l12 * e.l12) * e.half_w;
-  return e;
-}
-
 // First index of the tiles (or rows, at size 1) whose last pixel centre is at or after `low`, within [0, count].
 // Rounding goes by integers after the clamp: ceil and floor are calls in some drivers, and here in the inner loop.
 static inline int first_cell(float low, float size, int count) {
@@ -41,6 +21,33 @@ static inline int end_cell(float high, float size, int count) {
   return (int)(cell < (float)count ? cell : (float)count);
 }
 
+typedef struct {
+  float mx, my, l11, l12, l22, half_w, half_h;
+  float budget;  // u^2 + v^2 where alpha is 1/255
+  float tangent; // dy / dx from the mean to the ellipse's rightmost point, times half_w
+  int tile_x0, tile_x1, tile_y0, tile_y1; // tiles that its box reaches
+} Ellipse;
+
+static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int tiles_y) {
+  Ellipse e;
+  e.mx = splat[SPLAT_PIXEL_X] + splat[SPLAT_SUB_X];
+  e.my = splat[SPLAT_PIXEL_Y] + splat[SPLAT_SUB_Y];
+  e.half_w = splat[SPLAT_HALF_W];
+  e.half_h = splat[SPLAT_HALF_H];
+  e.tile_x0 = first_cell(e.mx - e.half_w, (float)TILE, tiles_x);
+  e.tile_x1 = end_cell(e.mx + e.half_w, (float)TILE, tiles_x);
+  e.tile_y0 = first_cell(e.my - e.half_h, (float)TILE, tiles_y);
+  e.tile_y1 = end_cell(e.my + e.half_h, (float)TILE, tiles_y);
+  if (e.tile_x1 - e.tile_x0 > 1) {
+    e.l11 = splat[SPLAT_L11];
+    e.l12 = splat[SPLAT_L12];
+    e.l22 = splat[SPLAT_L22];
+    e.budget = splat[SPLAT_LOG2O] - LOG2_ALPHA_MIN;
+    e.tangent = -e.l12 * e.l11 / (e.l22 * e.l22 + e.l12 * e.l12) * e.half_w;
+  }
+  return e;
+}
+
 // The right edge of the ellipse, from the mean, over the offsets [d0, d1] in y; the left edge by symmetry
 // (docs/gradients.md, equation 47).
 static inline float right_edge(const Ellipse *e, float d0, float d1) {
@@ -50,8 +57,11 @@ static inline float right_edge(const Ellipse *e, float d0, float d1) {
   return (-e->l12 * dy + sqrt(rest > 0.0f ? rest : 0.0f)) / e->l11;
 }
 
-// The tiles [*x0, *x1) that the ellipse reaches in tile row ty.
+// The tiles [*x0, *x1) that the ellipse reaches in tile row ty. In a box one tile wide there is nothing to cut.
 static inline void tile_span(const Ellipse *e, int ty, int tiles_x, int *x0, int *x1) {
+  *x0 = e->tile_x0;
+  *x1 = e->tile_x1 > e->tile_x0 ? e->tile_x1 : e->tile_x0;
+  if (*x1 - *x0 <= 1) return;
   float d0 = (float)(ty * TILE) + 0.5f - TILE_SLACK - e->my;
   float d1 = (float)(ty * TILE + TILE) - 0.5f + TILE_SLACK - e->my;
   d0 = d0 > -e->half_h ? d0 : -e->half_h;
