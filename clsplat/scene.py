@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -61,13 +63,21 @@ class View:
         elif height is None:
             height = max(1, round(self.camera.height * width / self.camera.width))
         assert height is not None
+        image = self._read()
+        if self.lens.is_pinhole:
+            return downscale(image, width, height)
+        return undistort(image, self.lens, self.camera.resized(width, height))
+
+    def check(self) -> None:
+        """Raise InputError where `load` would."""
+        self._read()
+
+    def _read(self) -> Float32:
         image = read_image(self.path, orient=self.upright)
         if image.shape[:2] != (self.lens.height, self.lens.width):
             found = f"{image.shape[1]} x {image.shape[0]}"
             raise InputError(f"{self.path}: is {found} pixels now, expected {self.lens.width} x {self.lens.height}")
-        if self.lens.is_pinhole:
-            return downscale(image, width, height)
-        return undistort(image, self.lens, self.camera.resized(width, height))
+        return image
 
 
 @dataclass(eq=False)
@@ -95,6 +105,18 @@ class Scene:
     def test_views(self) -> list[View]:
         """Views held out, by name."""
         return [view for view in self.views if view.split == "test"]
+
+    def check_pictures(self) -> None:
+        """Decode every picture once, so that a cut one is named before training and not in the middle of it.
+
+        Raises InputError for the first by name that does not decode.
+        """
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            try:
+                for _ in pool.map(View.check, self.views):
+                    pass
+            finally:
+                pool.shutdown(cancel_futures=True)
 
     @cached_property
     def extent(self) -> float:

@@ -123,7 +123,14 @@ def train(verb: Train) -> int:
         raise InputError("SCENE is missing, expected the folder of the scene to train on")
     device = open_device(verb.device)
     scene = _load_scene(source, verb.config.resolution, verb.config.test_every)
+    scene.check_pictures()
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
+    print(
+        f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
+        f"{len(scene.points):,} points; on {device.name}, {device.driver.split('  ')[0].strip()} (the first steps may "
+        "wait for kernels to be built)",
+        file=sys.stderr,
+    )
     try:
         _train_verb(scene, run, device)
     except KeyboardInterrupt:

@@ -239,8 +239,10 @@ def test_ctrl_c_before_the_first_step(
     with monkeypatch.context() as patch:
         patch.setattr(trainer, "upload_gaussians", interrupt)
         assert train(scene, run, CONFIG) == 130
-    message = f"clsplat: interrupted before the first checkpoint; go on with: clsplat train -o {run} --resume\n"
-    assert capfd.readouterr().err == message
+    message = f"clsplat: interrupted before the first checkpoint; go on with: clsplat train -o {run} --resume"
+    started, interrupted = capfd.readouterr().err.splitlines()
+    assert started.startswith(f"{scene.name}: 8 pictures to train on, 2 held out, 40 points; on ")
+    assert interrupted == message
     assert main(["train", "-o", str(run), "--resume", "--iterations", "3"]) == 0
 
 

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
+from models import real_file
 from PIL import Image as Pillow
 
 from clsplat.camera import Camera
@@ -359,3 +360,20 @@ def sample(camera: Camera, image: np.ndarray, points: np.ndarray) -> np.ndarray:
     x, y = np.clip(np.floor(pixels), 0, [image.shape[1] - 1, image.shape[0] - 1]).astype(int).T
     found: np.ndarray = image[y, x]
     return found
+
+
+def test_a_cut_jpeg_is_found_before_training(tmp_path: Path) -> None:
+    """Its header is whole, so that load_scene cannot know."""
+    folder = tmp_path / "banana"
+    for source in sorted(real_file("banana").rglob("*")):  # copied without the modes: the data may be read-only
+        if source.is_file():
+            target = folder / source.relative_to(real_file("banana"))
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(source.read_bytes())
+    cut = sorted((folder / "images").iterdir())[8]
+    data = cut.read_bytes()
+    cut.unlink()
+    cut.write_bytes(data[: len(data) // 2])
+    scene = load_scene(folder)
+    with pytest.raises(InputError, match=cut.name):
+        scene.check_pictures()
