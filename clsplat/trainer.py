@@ -67,7 +67,7 @@ class Trainer:
         self.views = scene.train_views
         if not self.views:
             raise InputError(f"{scene.name}: no training views, use a larger --test-every")
-        self.rasterizer = Rasterizer(device)
+        self.rasterizer = Rasterizer(device, config.rasterizer)
         self.photographs = Photographs(self.views)
         self.rng = np.random.default_rng(config.seed)
         self.step = 0
