@@ -17,6 +17,7 @@ os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 import numpy as np
 import pyopencl as cl
 
+from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError
@@ -125,6 +126,7 @@ class Device:
         self.shape = shape or default_shape(device)
         self.max_allocation = int(device.max_mem_alloc_size)
         self.context = cl.Context([device])
+        self.profile = profile
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
         self.queue = cl.CommandQueue(self.context, device, properties)
         self._options = "-cl-std=CL1.2"
@@ -132,6 +134,7 @@ class Device:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
         self._switches: Mapping[str, object] = {}
+        self.recorder = Recorder()
         self._fma = self._probe_fma()
 
     def kernels(self, stem: str, **defines: object) -> Kernels:
@@ -149,7 +152,7 @@ class Device:
 
     def with_shape(self, **changes: int) -> Device:
         """A device like this with another shape."""
-        return Device(self.cl_device, replace(self.shape, **changes))
+        return Device(self.cl_device, replace(self.shape, **changes), profile=self.profile)
 
     def with_switches(self, switches: Mapping[str, object]) -> Device:
         """The same device, queue and cache of kernels, with these defines for the kernels whose text names them."""
