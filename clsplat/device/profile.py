@@ -22,18 +22,14 @@ OUTSIDE = "transfers"
 
 @dataclass
 class StageRecord:
-    """kernels: device milliseconds by kernel, copies and fills among them; wall_ms: from an idle device to an idle
-    device, so launches and the host's part are in it; bytes: of the arrays that the launches were given."""
+    """kernels: device milliseconds by kernel, copies and fills among them; ms: their sum; wall_ms: from an idle device
+    to an idle device, so launches and the host's part are in it; bytes: of the arrays that the launches were given."""
 
     kernels: dict[str, float] = field(default_factory=dict)
+    ms: float = 0.0
     wall_ms: float = 0.0
     launches: int = 0
     bytes: int = 0
-
-    @property
-    def ms(self) -> float:
-        """Device time."""
-        return sum(self.kernels.values())
 
 
 class Recorder:
@@ -59,8 +55,9 @@ class Recorder:
             yield stages
             device.finish()
             for stage, kernel, event in self._events:
-                times = stages[stage].kernels
-                times[kernel] = times.get(kernel, 0.0) + _milliseconds(event)
+                times, taken = stages[stage].kernels, _milliseconds(event)
+                times[kernel] = times.get(kernel, 0.0) + taken
+                stages[stage].ms += taken
         finally:
             self.on, self._stages, self._events = False, {}, []
 
