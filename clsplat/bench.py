@@ -405,3 +405,68 @@ def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, i
     order = depth_order(projected.depths, projected.visible & near)
     image: Float64 = blend(replace(projected, means2d=means), order, width, height).image
     return image
+
+
+def table(result: dict[str, Any]) -> str:
+    """What `bench` measured, for people."""
+    stages, limit, pairs = result["stages"], result["limit"], result["pairs"]
+    driver, size = result["driver"].split("  ")[0], f"{result['width']}x{result['height']}"
+    arithmetic, copying = limit["pairs_per_second"] * 1e-9, limit["copy_bytes_per_second"] * 1e-9
+    seen = f"{result['gaussians']:,} Gaussians, SH degree {result['sh_degree']}, {result['visible']:,} visible"
+    of_pixels = f"{pairs['contributing']:,} that contribute, {pairs['evaluated']:,} evaluated"
+    lines = [
+        f"{result['device']}, {driver}, {limit['lanes']} lanes x {limit['items']} items",
+        f"{result['source']}: {seen}, at {size}",
+        f"pairs: {pairs['listed']:,} of tiles; of pixels {of_pixels}",
+        f"limits: {arithmetic:.2f} Gpairs/s of blending arithmetic, {copying:.1f} GB/s of copying",
+        "",
+    ]
+    header = ("stage", "ms", "wall ms", "launches", "MB", "GB/s", "of copy", "Gpairs/s", "of arithmetic")
+    rows: list[tuple[str, ...]] = [header]
+    for name, row in stages.items():
+        rate = row.get("pairs_per_second")
+        rows.append(
+            (
+                name,
+                f"{row['ms']:.3f}",
+                f"{row['wall_ms']:.3f}",
+                str(row["launches"]),
+                f"{row['bytes'] * 1e-6:.1f}",
+                f"{row['bytes_per_second'] * 1e-9:.2f}",
+                f"{row['share_of_copy']:.0%}",
+                "" if rate is None else f"{rate * 1e-9:.3f}",
+                "" if rate is None else f"{row['share_of_arithmetic']:.0%}",
+            )
+        )
+    lines += _columns(rows)
+    note = "ms by events" if result["timer"] == "events" else "ms by wall time: the driver's events have none"
+    times = f"frame {result['frame_ms']:.2f} ms, training step {result['iteration_ms']:.2f} ms"
+    load = f"load average {result['load_average'] or 0:.1f}"
+    return "\n".join([*lines, "", f"{times}: medians of {result['repeat']}; {note}; {load}"])
+
+
+def settings_table(result: dict[str, Any]) -> str:
+    """What `compare` measured, for people."""
+    rows: list[tuple[str, ...]] = [("setting", "ms", "PSNR dB", "largest", "front")]
+    for point in result["points"]:
+        psnr = "same bits" if point["max_abs"] == 0 else f"{point['psnr']:.1f}"
+        front_mark = "*" if point["on_front"] else ""
+        rows.append((point["name"], f"{point['frame_ms']:.2f}", psnr, f"{point['max_abs']:.2g}", front_mark))
+    known, (_, _, width, height) = result["exact_against_float64"], result["crop"]
+    note = (
+        f"error against {result['error_is_against']}; exact against float64 on {width}x{height} pixels: "
+        f"{known['psnr']:.1f} dB, {known['max_abs']:.2g}"
+    )
+    return "\n".join([*_columns(rows), "", note])
+
+
+def _columns(rows: list[tuple[str, ...]]) -> list[str]:
+    """Aligned: the first column to the left, the others to the right."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.ljust(width) if column == 0 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
