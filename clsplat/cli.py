@@ -21,8 +21,8 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
-from clsplat.config import TrainConfig
-from clsplat.errors import ClsplatError
+from clsplat.config import PRESETS, Preset, RasterizerConfig, TrainConfig
+from clsplat.errors import ClsplatError, InputError
 
 Flag = Annotated[bool, FlagCreatePairsOff]
 Output = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
@@ -93,6 +93,8 @@ class Train:
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
     json: Flag = False
     """Print the final evaluation as JSON on standard output."""
+    preset: Preset = "default"
+    """Bundle of rasterizer settings; a --rasterizer flag goes before it."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
 
 
@@ -141,6 +143,8 @@ class Render:
     """Height in pixels; follows from the width, or from the camera, if not given."""
     scale: float = 1.0
     """Size relative to the camera's, where neither width nor height is given."""
+    preset: Annotated[Preset | None, arg(metavar="exact|default|fast")] = None
+    """Bundle of rasterizer settings; the run's own, or the default's, if not given."""
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
@@ -148,7 +152,34 @@ class Render:
     """Print the images written as JSON: name, path, width, height, seconds."""
 
 
-Verb = Devices | Demo | Sfm | Train | Eval | Render
+@dataclass(frozen=True)
+class Bench:
+    """Measure each stage of a frame and of a training step, and the device's own limits in the same run.
+
+    docs/performance.md says what the figures mean.
+    """
+
+    source: Annotated[Positional[Path | None], arg(metavar="SCENE|RUN|MODEL.ply")] = None
+    """A scene as training starts it, a run, or a model file; a made-up scene if not given."""
+    gaussians: int = 200_000
+    """Gaussians of the made-up scene."""
+    size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
+    """Size of the frame; the camera's, or 1024x768, if not given."""
+    repeat: int = 5
+    """Frames and steps of each kind, of which the median is taken."""
+    preset: Preset = "default"
+    """Bundle of rasterizer settings; a --rasterizer flag goes before it."""
+    plot: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Measure every setting of the rasterizer too, and plot run time against error: .svg or .png."""
+    device: Device = None
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
+    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    json: Flag = False
+    """Print the result as JSON."""
+    rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
+
+
+Verb = Devices | Demo | Sfm | Train | Eval | Render | Bench
 Commands = (
     Annotated[Devices, subcommand("devices")]
     | Annotated[Demo, subcommand("demo")]
@@ -156,6 +187,7 @@ Commands = (
     | Annotated[Train, subcommand("train")]
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Render, subcommand("render")]
+    | Annotated[Bench, subcommand("bench")]
 )
 DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
 
@@ -201,11 +233,21 @@ def parse(arguments: Sequence[str]) -> Verb:
     if isinstance(verb, Train) and verb.resume:
         from clsplat.runs import Run, check_output
 
+        if verb.preset != "default":
+            raise InputError(f"--preset {verb.preset} and --resume exclude each other: the run has its settings")
         check_output(verb.output, resume=True, overwrite=verb.overwrite)
         # Once more, with the run's settings as the defaults: only flags that are given differ from them.
         earlier = Run.open(verb.output)
         default = replace(verb, config=earlier.config, resume=False, overwrite=False)
         verb = replace(_tyro(Train, arguments[1:], prog="clsplat train", default=default), resume=True)
+    elif isinstance(verb, Train) and verb.preset != "default":
+        # Once more, as above, with the preset's settings as the defaults.
+        config = replace(TrainConfig(), rasterizer=PRESETS[verb.preset])
+        default = replace(verb, config=config, overwrite=False, json=False)
+        verb = _tyro(Train, arguments[1:], prog="clsplat train", default=default)
+    elif isinstance(verb, Bench) and verb.preset != "default":
+        bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False)
+        verb = _tyro(Bench, arguments[1:], prog="clsplat bench", default=bench)
     return verb
 
 

@@ -12,6 +12,56 @@ from typing import Literal
 from clsplat.errors import InputError
 
 Background = Literal["black", "white", "random"]
+Preset = Literal["exact", "default", "fast"]
+
+
+@dataclass(frozen=True)
+class RasterizerConfig:
+    """What the rasterizer skips. The error of each switch, and the time it buys, are in docs/performance.md.
+
+    `extent` "constant", `tile_test` "box" and the four `_skip` and `_stop` switches change no bit of a frame; they are
+    there to be measured. The others are approximate where they differ from the default.
+    """
+
+    extent: Literal["opacity", "constant", "3sigma"] = "opacity"
+    """How far a Gaussian reaches: to where its alpha is alpha-min; as far as an opaque one would, whatever its
+    opacity; or three standard deviations, which cuts what is visible of opaque ones (approximate)."""
+    tile_test: Literal["ellipse", "box"] = "ellipse"
+    """A Gaussian is listed in the tiles that its ellipse reaches, or in those that the ellipse's bounding box does."""
+    row_skip: bool = True
+    """Visit only the rows of a tile that the bounding box reaches."""
+    column_skip: bool = True
+    """Visit only the vectors of a row that the bounding box reaches."""
+    vector_skip: bool = True
+    """Leave a vector of pixels when the Gaussian contributes to none of them."""
+    early_stop: bool = True
+    """Leave a tile when all its pixels are opaque; else go on to its last Gaussian, to no effect."""
+    sh_degree_limit: int = 3
+    """Leave out the SH bands above this degree (approximate)."""
+    alpha_min: float = 1 / 255
+    """Skip a Gaussian at a pixel where its alpha is less (approximate above 1/255, less than one 8-bit step)."""
+    transmittance_min: float = 1e-4
+    """A Gaussian that would take a pixel's transmittance to this or less is left out and ends the pixel (approximate
+    above 1e-4)."""
+
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        flag = "--rasterizer."
+        if not 0 <= self.sh_degree_limit <= 3:
+            raise InputError(f"{flag}sh-degree-limit {self.sh_degree_limit}: expected 0 to 3")
+        if not 1e-3 <= self.alpha_min < 0.5:
+            raise InputError(f"{flag}alpha-min {self.alpha_min}: expected 0.001 to 0.5")
+        if not 1e-6 <= self.transmittance_min < 0.5:
+            raise InputError(f"{flag}transmittance-min {self.transmittance_min}: expected 1e-6 to 0.5")
+
+
+PRESETS: dict[Preset, RasterizerConfig] = {
+    "exact": RasterizerConfig(),
+    "default": RasterizerConfig(),
+    "fast": RasterizerConfig(alpha_min=2 / 255, transmittance_min=1e-3),
+}
+"""exact: nothing approximate; default: what is on unless asked for, equal to exact as long as every default has an
+error of zero; fast: approximations that are worth their error (a first guess until docs/performance.md has figures)."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +154,7 @@ class TrainConfig:
     """Steps at which the held-out views are evaluated, beside the end."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
+    rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
@@ -120,5 +171,6 @@ class TrainConfig:
         for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):
             if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
                 raise InputError(f"--{name} {','.join(map(str, steps))}: expected steps from 1 up, in order")
+        self.rasterizer.check()
         if not self.density.split_factor > 1:
             raise InputError(f"--density.split-factor {self.density.split_factor}: expected more than 1")

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device, open_device
+from clsplat.device.switches import kernel_defines
 from clsplat.gaussians import Gaussians
 from clsplat.stages.blend import Blended, blend, blend_grad
 from clsplat.stages.duplicate import Pairs, duplicate
@@ -43,11 +45,12 @@ class Frame:
 
 
 class Rasterizer:
-    """The pipeline on one device, with the memory that it works in."""
+    """The pipeline on one device, with the memory that it works in, which can be another's."""
 
-    def __init__(self, device: Device) -> None:
-        self.device = device
-        self.work = Workspace(device)
+    def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
+        self.config = config or RasterizerConfig()
+        self.device = device.with_switches(kernel_defines(self.config))
+        self.work = work or Workspace(device)
 
     def forward(self, gaussians: DeviceGaussians, camera: Camera, background: DeviceArray) -> Frame:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2)."""
@@ -108,9 +111,15 @@ class RenderResult:
 class Renderer:
     """Renders models; keeps the last one on the device. It can work in another's rasterizer and its memory."""
 
-    def __init__(self, device: Device | None = None, rasterizer: Rasterizer | None = None) -> None:
+    def __init__(
+        self,
+        device: Device | None = None,
+        rasterizer: Rasterizer | None = None,
+        *,
+        config: RasterizerConfig | None = None,
+    ) -> None:
         self.device = device or open_device()
-        self._rasterizer = rasterizer or Rasterizer(self.device)
+        self._rasterizer = rasterizer or Rasterizer(self.device, config)
         self._background = allocate(self.device, (3,), np.float32)
         self._held: tuple[Gaussians, DeviceGaussians] | None = None
 

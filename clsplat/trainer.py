@@ -62,18 +62,18 @@ class Photographs:
 class Trainer:
     """A model in training: parameters, moments, statistics and the random state, all of which a checkpoint holds."""
 
-    def __init__(self, scene: Scene, config: TrainConfig, device: Device) -> None:
+    def __init__(self, scene: Scene, config: TrainConfig, device: Device, initial: Gaussians | None = None) -> None:
         self.scene, self.config, self.device = scene, config, device
         self.views = scene.train_views
         if not self.views:
             raise InputError(f"{scene.name}: no training views, use a larger --test-every")
-        self.rasterizer = Rasterizer(device)
+        self.rasterizer = Rasterizer(device, config.rasterizer)
         self.photographs = Photographs(self.views)
         self.rng = np.random.default_rng(config.seed)
         self.step = 0
         self.queue: list[int] = []
         self.background = allocate(device, (3,), np.float32)
-        self._set_parameters(self._initial())
+        self._set_parameters(upload_gaussians(device, initial) if initial is not None else self._initial())
 
     def _initial(self) -> DeviceGaussians:
         scene = self.scene

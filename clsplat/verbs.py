@@ -11,11 +11,12 @@ from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from clsplat.cli import Demo, Devices, Eval, Render, Sfm, Train, Verb
+from clsplat.cli import Bench, Demo, Devices, Eval, Render, Sfm, Train, Verb
 from clsplat.errors import DeviceError, InputError
 
 if TYPE_CHECKING:
     from clsplat.camera import Camera
+    from clsplat.config import RasterizerConfig
     from clsplat.device.context import Device
     from clsplat.gaussians import Gaussians
     from clsplat.runs import Run
@@ -40,6 +41,8 @@ def run(verb: Verb) -> int:
             return evaluate(verb)
         case Render():
             return render(verb)
+        case Bench():
+            return bench(verb)
 
 
 def devices(verb: Devices) -> int:
@@ -175,7 +178,7 @@ def evaluate(verb: Eval) -> int:
         raise InputError(f"{verb.model}: the scene it was trained on is not known, expected --scene SCENE")
     resolution = config.resolution if verb.resolution is None else verb.resolution
     test_every = config.test_every if verb.test_every is None else verb.test_every
-    renderer = Renderer(open_device(verb.device))
+    renderer = Renderer(open_device(verb.device), config=config.rasterizer)
     scene = _load_scene(source, resolution, test_every)
     views = [view for view in scene.views if view.split == "test"]
     if not views:
@@ -226,7 +229,7 @@ def render(verb: Render) -> int:
         raise InputError(f"{verb.cameras}: has no images, expected at least one")
     paths = output_paths(verb.output, list(cameras))
     gaussians = _load_model(verb.model)
-    renderer = Renderer(open_device(verb.device))
+    renderer = Renderer(open_device(verb.device), config=_rasterizer(verb))
 
     written = []
     for name, camera in cameras.items():
@@ -244,6 +247,64 @@ def render(verb: Render) -> int:
     if verb.json:
         print(json.dumps(written, indent=2))
     return 0
+
+
+def _rasterizer(verb: Render) -> RasterizerConfig:
+    from clsplat.config import PRESETS
+    from clsplat.runs import Run
+
+    if verb.preset is None and verb.model.is_dir():
+        return Run.open(verb.model).config.rasterizer
+    return PRESETS[verb.preset or "default"]
+
+
+def bench(verb: Bench) -> int:
+    """Measure. What can be wrong with the call is found before anything is."""
+    from clsplat import bench as measure
+    from clsplat.device.context import Device, select
+    from clsplat.plots import check_plot, plot_settings
+    from clsplat.progress import StageProgress
+
+    size = parse_size(verb.size)
+    if verb.gaussians < 1:
+        raise InputError(f"--gaussians {verb.gaussians}: expected at least 1")
+    if verb.repeat < 1:
+        raise InputError(f"--repeat {verb.repeat}: expected at least 1")
+    verb.rasterizer.check()
+    if verb.plot is not None:
+        check_plot(verb.plot)
+    if verb.source is not None and not verb.source.exists():
+        raise InputError(f"{verb.source}: no such file or folder, expected a scene, a run or a model file")
+    progress = StageProgress()
+    device = Device(select(verb.device), profile=True)
+    if verb.source is None:
+        subject = measure.synthetic(verb.gaussians, *(size or (1024, 768)))
+    else:
+        subject = measure.load_subject(verb.source, size, progress)
+    result = measure.bench(subject, device, verb.rasterizer, repeat=verb.repeat, progress=progress)
+    if verb.plot is not None:
+        result["settings"] = measure.compare(subject, device, repeat=verb.repeat, progress=progress)
+        size_text = f"{result['width']}x{result['height']}, {result['gaussians']:,} Gaussians"
+        title = f"{subject.name}, {size_text}\n{device.name}, {device.driver.split('  ')[0]}"
+        plot_settings(verb.plot, result["settings"], title)
+        print(f"plot in {verb.plot}", file=sys.stderr)
+    if verb.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    print(measure.table(result))
+    if "settings" in result:
+        print("\n" + measure.settings_table(result["settings"]))
+    return 0
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """(width, height) of WIDTHxHEIGHT. Raises InputError."""
+    if text is None:
+        return None
+    words = text.split("x")
+    if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
+        raise InputError(f"--size {text}: expected a width and a height in pixels such as 1024x768")
+    return int(words[0]), int(words[1])
 
 
 def with_alpha(image: Any, alpha: Any) -> Any:

@@ -11,18 +11,34 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
+#ifdef NO_EARLY_STOP // RasterizerConfig.early_stop: go on behind an opaque tile, to no effect
+#define GOES_ON(alive) 1
+#else
+#define GOES_ON(alive) ((alive) > 0)
+#endif
+#ifdef COUNT_PAIRS // a build for `clsplat bench`
+#define COUNT(statements) statements
+#else
+#define COUNT(statements)
+#endif
+
 // ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), background (3) -> image (3, height, width),
 // transmittance (height, width): what is left at the end; stops (height, width): the sorted index from which on the
 // pixel takes no more. Sizes are padded to whole tiles; padding is black.
 GROUP __kernel void blend(const int tiles_x, const int width, const int height, __global const uint *ranges,
                           __global const uint *gaussian_from_sorted, __global const float *splats,
                           __global const float *background, __global float *image, __global float *transmittance,
-                          __global int *stops) {
+                          __global int *stops
+#ifdef COUNT_PAIRS
+                          , __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
+#endif
+) {
   const int tile = get_group_id(0);
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
   const int begin = ranges[2 * tile], end = ranges[2 * tile + 1];
   floatL t[OWNED], red[OWNED], green[OWNED], blue[OWNED];
   intL stop[OWNED];
+  COUNT(intL added = (intL)(0); uint evaluated = 0;)
 
   int alive = 0;
   for (int k = 0; k < OWNED; ++k) {
@@ -35,7 +51,7 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
     alive += ANYL(t[k] > 0.0f);
   }
 
-  for (int i = begin; i < end && alive > 0; ++i) {
+  for (int i = begin; i < end && GOES_ON(alive); ++i) {
     PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[min(i + AHEAD, end - 1)]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
     int y0, y1, h0, h1;
@@ -52,12 +68,14 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
         const floatL before = t[k];
         const floatL open = log2_alpha(offset_u, l12 * dy, fma1(-v, v, log2o));
         const floatL power = before > 0.0f ? open : (floatL)(FINISHED);
-        if (ANYL(power >= LOG2_ALPHA_MIN)) {
+        COUNT(evaluated += LANES;)
+        if (REACHES(open, power)) {
           floatL alpha = exp2L(power);
           alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
           alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);
           const floatL after = fmaL(-before, alpha, before);
           const floatL weight = after > TRANSMITTANCE_MIN ? before * alpha : (floatL)(0.0f);
+          COUNT(added += weight > 0.0f ? (intL)(1) : (intL)(0);)
           red[k] = fmaL(weight, (floatL)(c_red), red[k]);
           green[k] = fmaL(weight, (floatL)(c_green), green[k]);
           blue[k] = fmaL(weight, (floatL)(c_blue), blue[k]);
@@ -72,6 +90,18 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
       }
     }
   }
+
+#ifdef COUNT_PAIRS
+#if LANES == 1
+  counts[2 * get_global_id(0)] = added;
+#else
+  int lane_added[LANES];
+  CAT(vstore, LANES)(added, 0, lane_added);
+  counts[2 * get_global_id(0)] = 0;
+  for (int lane = 0; lane < LANES; ++lane) counts[2 * get_global_id(0)] += lane_added[lane];
+#endif
+  counts[2 * get_global_id(0) + 1] = evaluated;
+#endif
 
   const size_t stride = (size_t)tiles_x * TILE;
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);

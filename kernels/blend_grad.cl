@@ -79,6 +79,9 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
   barrier(CLK_LOCAL_MEM_FENCE);
   last = group_last;
 #endif
+#ifdef NO_EARLY_STOP
+  last = end;
+#endif
 
   for (int i = last + (int)get_local_id(0); i < end; i += ITEMS) {
     __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[i];
@@ -112,7 +115,7 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
         const float v = l22 * dy;
         const floatL open = log2_alpha(offset_u, l12 * dy, fma1(-v, v, log2o));
         const floatL power = (intL)(i) < stop[k] ? open : (floatL)(FINISHED);
-        if (ANYL(power >= LOG2_ALPHA_MIN)) {
+        if (REACHES(open, power)) {
           const floatL uncapped = power >= LOG2_ALPHA_MIN ? exp2L(power) : zero;
           const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
           const floatL inverse = 1.0f / (1.0f - alpha);

@@ -31,7 +31,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   const float l22 = WHITEN / sqrt(p.syy);
   const float l11 = WHITEN * sqrt(p.syy / p.det);
   const float log2o = log2_1(opacity);
-  const float budget = log2o - LOG2_ALPHA_MIN;
+  const float budget = EXTENT(log2o);
   splat[SPLAT_L11] = l11;
   splat[SPLAT_L12] = -(p.sxy / p.syy) * l11;
   splat[SPLAT_L22] = l22;
@@ -54,12 +54,12 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   const float length = sqrt(fma1(dx, dx, fma1(dy, dy, dz * dz)));
   if (!(length > 0.0f)) return;
   float basis[16];
-  sh_basis(coefficients, dx / length, dy / length, dz / length, basis);
+  sh_basis(SH_USED(coefficients), dx / length, dy / length, dz / length, basis);
   float red = fma1(basis[0], sh_dc[3 * i], 0.5f);
   float green = fma1(basis[0], sh_dc[3 * i + 1], 0.5f);
   float blue = fma1(basis[0], sh_dc[3 * i + 2], 0.5f);
   __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
-  for (int k = 1; k < coefficients; ++k, f += 3) {
+  for (int k = 1; k < SH_USED(coefficients); ++k, f += 3) {
     red = fma1(basis[k], f[0], red);
     green = fma1(basis[k], f[1], green);
     blue = fma1(basis[k], f[2], blue);

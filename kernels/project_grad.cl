@@ -118,19 +118,19 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   const float d_green = splat[SPLAT_GREEN] > 0.0f ? m[SLOT_GREEN] : 0.0f;
   const float d_blue = splat[SPLAT_BLUE] > 0.0f ? m[SLOT_BLUE] : 0.0f;
   float basis[16], weight[16], d_v[3];
-  sh_basis(coefficients, vx, vy, vz, basis);
+  sh_basis(SH_USED(coefficients), vx, vy, vz, basis);
   __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
   __global float *d_f = d_sh_rest + (size_t)3 * (coefficients - 1) * i;
   d_sh_dc[3 * i] = basis[0] * d_red;
   d_sh_dc[3 * i + 1] = basis[0] * d_green;
   d_sh_dc[3 * i + 2] = basis[0] * d_blue;
-  for (int k = 1; k < coefficients; ++k, f += 3, d_f += 3) {
+  for (int k = 1; k < SH_USED(coefficients); ++k, f += 3, d_f += 3) {
     d_f[0] = basis[k] * d_red;
     d_f[1] = basis[k] * d_green;
     d_f[2] = basis[k] * d_blue;
     weight[k] = fma1(d_red, f[0], fma1(d_green, f[1], d_blue * f[2]));
   }
-  sh_direction_gradient(coefficients, vx, vy, vz, weight, d_v);
+  sh_direction_gradient(SH_USED(coefficients), vx, vy, vz, weight, d_v);
   const float along = d_v[0] * vx + d_v[1] * vy + d_v[2] * vz;
   d_means[3 * i] = camera[CAMERA_R00] * d_x + camera[CAMERA_R10] * d_y + camera[CAMERA_R20] * d_z +
                    (d_v[0] - along * vx) / length;

@@ -18,7 +18,7 @@ from models import random_gaussians
 from clsplat import verbs
 from clsplat.camera import Camera
 from clsplat.cli import Eval, Train, main, parse
-from clsplat.config import TrainConfig
+from clsplat.config import RasterizerConfig, TrainConfig
 from clsplat.errors import ClsplatError, DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.runs import Run
@@ -74,8 +74,9 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         seconds: float = 1.0
 
     class Renderer:
-        def __init__(self, device: object) -> None:
+        def __init__(self, device: object, config: object = None) -> None:
             assert device == "device"
+            assert config == RasterizerConfig()
 
         def render(self, gaussians: Gaussians, camera: Camera, background: tuple[float, ...] = (0, 0, 0)) -> Result:
             pipe.calls.append(("render", len(gaussians), camera.width, camera.height, tuple(background)))

@@ -39,7 +39,8 @@ class DeviceArray:
         """A copy on the host; waits for the device."""
         host = np.empty(self.shape, self.dtype)
         if host.size:
-            cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=True)
+            event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=True)
+            self._note("read", event)
         return host
 
     def set(self, values: NDArray[Any]) -> None:
@@ -47,13 +48,19 @@ class DeviceArray:
         if values.shape != self.shape or values.dtype != self.dtype:
             raise ValueError(f"got {values.dtype}{values.shape}, expected {self.dtype}{self.shape}")
         if values.size:
-            cl.enqueue_copy(self.device.queue, self.buffer, np.ascontiguousarray(values), is_blocking=True)
+            event = cl.enqueue_copy(self.device.queue, self.buffer, np.ascontiguousarray(values), is_blocking=True)
+            self._note("write", event)
 
     def fill(self, value: float) -> None:
         """Set every element."""
         if self.size:
             pattern = np.asarray(value, self.dtype)
-            cl.enqueue_fill_buffer(self.device.queue, self.buffer, pattern, 0, self.nbytes)
+            event = cl.enqueue_fill_buffer(self.device.queue, self.buffer, pattern, 0, self.nbytes)
+            self._note("fill", event)
+
+    def _note(self, name: str, event: cl.Event) -> None:
+        if self.device.recorder.on:
+            self.device.recorder.add(name, event, self.nbytes)
 
     def reshaped(self, *shape: int) -> DeviceArray:
         """The same memory in another shape, not larger."""

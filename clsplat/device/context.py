@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -15,7 +17,9 @@ os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 import numpy as np
 import pyopencl as cl
 
+from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build
+from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError
 
 
@@ -122,16 +126,22 @@ class Device:
         self.shape = shape or default_shape(device)
         self.max_allocation = int(device.max_mem_alloc_size)
         self.context = cl.Context([device])
+        self.profile = profile
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
         self.queue = cl.CommandQueue(self.context, device, properties)
         self._options = "-cl-std=CL1.2"
         if device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
+        self._switches: Mapping[str, object] = {}
+        self.recorder = Recorder()
         self._fma = self._probe_fma()
 
     def kernels(self, stem: str, **defines: object) -> Kernels:
         """The kernels of `stem`.cl in this device's shape, built at the first call."""
+        if self._switches:
+            text = kernel_source(stem)
+            defines = {**{name: value for name, value in self._switches.items() if name in text}, **defines}
         key = (stem, tuple(sorted(defines.items())))
         found = self._kernels.get(key)
         if found is None:
@@ -142,7 +152,13 @@ class Device:
 
     def with_shape(self, **changes: int) -> Device:
         """A device like this with another shape."""
-        return Device(self.cl_device, replace(self.shape, **changes))
+        return Device(self.cl_device, replace(self.shape, **changes), profile=self.profile)
+
+    def with_switches(self, switches: Mapping[str, object]) -> Device:
+        """The same device, queue and cache of kernels, with these defines for the kernels whose text names them."""
+        device = copy(self)
+        device._switches = switches  # noqa: SLF001  # a copy of our own class
+        return device
 
     def finish(self) -> None:
         """Wait until the device has nothing to do."""

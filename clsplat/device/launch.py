@@ -28,17 +28,33 @@ def _arguments(arguments: tuple[Any, ...]) -> list[Any]:
     return values
 
 
+_UPDATED = {"adam": 4, "density_statistics": 3}
+"""Kernels that read and write some arrays in place: so many of their last ones."""
+
+
+def _enqueue(
+    device: Device, kernel: Any, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: tuple[Any, ...]
+) -> None:
+    event = kernel(device.queue, size, local, *_arguments(arguments))
+    if device.recorder.on:
+        name = kernel.function_name
+        arrays = [argument for argument in arguments if isinstance(argument, DeviceArray)]
+        updated = arrays[len(arrays) - _UPDATED.get(name, 0) :]
+        once = {id(array.buffer): array.nbytes for array in arrays}
+        device.recorder.add(name, event, sum(once.values()) + sum(array.nbytes for array in updated))
+
+
 def launch_items(device: Device, kernel: Any, items: int, *arguments: Any) -> None:
     """One work-item for each of `items`; the kernel guards the rounding up. Nothing for 0 items."""
     if items > 0:
         size = -(-items // _LOCAL) * _LOCAL
-        kernel(device.queue, (size,), (_LOCAL,), *_arguments(arguments))
+        _enqueue(device, kernel, (size,), (_LOCAL,), arguments)
 
 
 def launch_groups(device: Device, kernel: Any, groups: int, items: int, *arguments: Any) -> None:
     """`groups` work-groups of `items`. Nothing for 0 groups."""
     if groups > 0:
-        kernel(device.queue, (groups * items,), (items,), *_arguments(arguments))
+        _enqueue(device, kernel, (groups * items,), (items,), arguments)
 
 
 def launch_grid(device: Device, kernel: Any, size: tuple[int, ...], *arguments: Any) -> None:
@@ -48,4 +64,4 @@ def launch_grid(device: Device, kernel: Any, size: tuple[int, ...], *arguments: 
     """
     if all(size):
         local = (size[0], *(1 for _ in size[1:])) if device.kind == "cpu" and size[0] <= 1024 else None
-        kernel(device.queue, size, local, *_arguments(arguments))
+        _enqueue(device, kernel, size, local, arguments)

@@ -7,9 +7,11 @@ from collections.abc import Mapping
 
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
+from clsplat.device.profile import stage
 from clsplat.stages.project import GROUPS, DeviceGaussians
 
 
+@stage("adam")
 def adam(
     device: Device,
     step: int,

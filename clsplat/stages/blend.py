@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 from clsplat.device.layout import SLOT_ABSOLUTE, SLOT_PLAIN, TILE
+from clsplat.device.profile import stage
 from clsplat.stages.ranges import TileLists
 
 
@@ -27,6 +29,7 @@ def _items(device: Device) -> int:
     return min(device.shape.items, TILE * TILE // device.shape.lanes)
 
 
+@stage("blend")
 def blend(
     device: Device,
     work: Workspace,
@@ -62,6 +65,38 @@ def blend(
     return Blended(image, transmittance, stops)
 
 
+def count_pairs(
+    device: Device, work: Workspace, lists: TileLists, splats: DeviceArray, background: DeviceArray, camera: Camera
+) -> tuple[int, int]:
+    """(contributing, evaluated) pairs of a Gaussian and a pixel, by a build of blend.cl that counts them.
+
+    Contributing: added to the pixel's colour. Evaluated: alpha was worked out, in a lane of a vector that was visited.
+    """
+    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    items = _items(device)
+    planes = (3, tiles_y * TILE, tiles_x * TILE)
+    scratch = [work.array(f"count_{name}", planes) for name in ("image", "transmittance", "stops")]
+    counts = work.array("counts", (tiles_x * tiles_y * items, 2), np.uint32)
+    launch_groups(
+        device,
+        device.kernels("blend", ITEMS=items, COUNT_PAIRS=True).blend,
+        tiles_x * tiles_y,
+        items,
+        tiles_x,
+        camera.width,
+        camera.height,
+        lists.ranges,
+        lists.gaussian_from_sorted,
+        splats,
+        background,
+        *scratch,
+        counts,
+    )
+    contributing, evaluated = counts.get().sum(axis=0, dtype=np.uint64)
+    return int(contributing), int(evaluated)
+
+
+@stage("blend_grad")
 def blend_grad(
     device: Device,
     work: Workspace,

@@ -12,6 +12,7 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
+from clsplat.device.profile import stage
 from clsplat.stages.project import DeviceGaussians, Projected, group_shapes
 
 NO_ROW = np.uint32(0xFFFFFFFF)
@@ -35,6 +36,7 @@ def new_statistics(device: Device, count: int) -> DensityStatistics:
     return DensityStatistics(*arrays)
 
 
+@stage("statistics")
 def add_statistics(
     device: Device,
     statistics: DensityStatistics,

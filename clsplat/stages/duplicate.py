@@ -10,6 +10,7 @@ import numpy as np
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
+from clsplat.device.profile import stage
 from clsplat.errors import CapacityError
 from clsplat.stages.project import Projected
 from clsplat.stages.scan import scan
@@ -34,6 +35,7 @@ class Pairs:
     gaussian_from_slot: DeviceArray
 
 
+@stage("duplicate")
 def duplicate(device: Device, work: Workspace, projected: Projected, tiles: tuple[int, int]) -> Pairs:
     """Sort the visible Gaussians by depth and emit their pairs in that order."""
     n = projected.tile_counts.shape[0]

@@ -11,6 +11,7 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
 from clsplat.device.layout import PAD
+from clsplat.device.profile import stage
 
 _STRIPS = 64
 """Work-items a row on devices that are not CPUs."""
@@ -31,6 +32,7 @@ class Loss:
         return float((1 - self.weight) * absolute + self.weight * (1 - ssim)), float(squared)
 
 
+@stage("loss")
 def loss(
     device: Device, work: Workspace, image: DeviceArray, target: DeviceArray, width: int, height: int, weight: float
 ) -> Loss:

@@ -13,6 +13,7 @@ from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.layout import CAMERA, SPLAT, TILE
+from clsplat.device.profile import stage
 from clsplat.gaussians import Gaussians
 
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
@@ -115,6 +116,7 @@ class Projected:
     tile_counts: DeviceArray
 
 
+@stage("project")
 def project(
     device: Device, work: Workspace, gaussians: DeviceGaussians, camera: Camera, camera_array: DeviceArray
 ) -> Projected:
@@ -139,6 +141,7 @@ def project(
     return Projected(splats, tile_counts)
 
 
+@stage("project_grad")
 def project_grad(
     device: Device,
     gaussians: DeviceGaussians,

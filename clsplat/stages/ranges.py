@@ -10,6 +10,7 @@ import numpy as np
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
+from clsplat.device.profile import stage
 from clsplat.stages.duplicate import Pairs
 from clsplat.stages.sort import sort
 
@@ -23,6 +24,7 @@ class TileLists:
     slot_from_sorted: DeviceArray
 
 
+@stage("ranges")
 def tile_lists(device: Device, work: Workspace, pairs: Pairs, tiles: int) -> TileLists:
     """A stable sort by tile of pairs that are in order of depth: each tile's Gaussians front to back."""
     count = pairs.tile_keys.shape[0]

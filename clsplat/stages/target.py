@@ -12,8 +12,10 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
 from clsplat.device.layout import TILE
+from clsplat.device.profile import stage
 
 
+@stage("target")
 def target(device: Device, work: Workspace, image: NDArray[Any], background: DeviceArray) -> DeviceArray:
     """image (H, W, 3 or 4), uint8 or float32, straight alpha -> planes (3, rows, stride) over the background."""
     height, width, channels = image.shape

@@ -12,6 +12,16 @@
 
 #define FINISHED -100.0f // log2 of an alpha that reaches nothing, for pixels that take no more
 
+// Whether a vector has a pixel that the Gaussian reaches: `open` is log2(alpha), `power` the same but for FINISHED in
+// pixels that take no more. RasterizerConfig: vector_skip, early_stop.
+#ifdef NO_VECTOR_SKIP
+#define REACHES(open, power) 1
+#elif defined(NO_EARLY_STOP)
+#define REACHES(open, power) ANYL((open) >= LOG2_ALPHA_MIN)
+#else
+#define REACHES(open, power) ANYL((power) >= LOG2_ALPHA_MIN)
+#endif
+
 // log2 of alpha before the cap: base = LOG2O - v^2 of the row, u along the row.
 static inline floatL log2_alpha(floatL offset_u, float l12_dy, float base) {
   const floatL u = offset_u + l12_dy;
@@ -27,11 +37,16 @@ static inline void tile_box(__global const float *splat, float x, float y, int *
   const float mx = (splat[SPLAT_PIXEL_X] - x) + splat[SPLAT_SUB_X];
   const float my = (splat[SPLAT_PIXEL_Y] - y) + splat[SPLAT_SUB_Y];
   const float half_h = splat[SPLAT_HALF_H], half_w = splat[SPLAT_HALF_W];
+#ifdef NO_ROW_SKIP
+  *y0 = 0;
+  *y1 = TILE;
+#else
   *y0 = first_cell(my - half_h, 1.0f, TILE);
   *y1 = end_cell(my + half_h, 1.0f, TILE);
-#if HALVES == 1
+#endif
+#if HALVES == 1 || defined(NO_COLUMN_SKIP)
   *h0 = 0;
-  *h1 = 1;
+  *h1 = HALVES;
 #else
   *h0 = first_cell(mx - half_w, (float)LANES, HALVES);
   *h1 = end_cell(mx + half_w, (float)LANES, HALVES);

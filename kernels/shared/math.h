@@ -5,9 +5,13 @@
 #define LOG2E 1.44269504088896341f
 #define LOW_PASS 0.3f               // px^2 added to the projected covariance
 #define ALPHA_MAX 0.99f
+#ifndef ALPHA_MIN // these two can be set by RasterizerConfig
 #define ALPHA_MIN (1.0f / 255.0f)
 #define LOG2_ALPHA_MIN -7.99435344f // log2(1/255)
+#endif
+#ifndef TRANSMITTANCE_MIN
 #define TRANSMITTANCE_MIN 1e-4f
+#endif
 
 // a*b + c with one rounding. FMA_BY_CONTRACTION is set where a probe found that the driver's compiler fuses this
 // expression; its fma() is then a slower way to the same bits (and aborts some drivers at 16 lanes).

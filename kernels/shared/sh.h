@@ -1,5 +1,12 @@
 // Real spherical harmonics to degree 3, signs and order of Kerbl et al. 2023; basis[k] at the unit direction (x, y, z).
 
+// Of the coefficients that there are, how many are looked at (RasterizerConfig.sh_degree_limit).
+#ifdef SH_LIMIT
+#define SH_USED(coefficients) ((coefficients) < SH_LIMIT ? (coefficients) : SH_LIMIT)
+#else
+#define SH_USED(coefficients) (coefficients)
+#endif
+
 static inline void sh_basis(int coefficients, float x, float y, float z, float *basis) {
   basis[0] = 0.28209479177387814f;
   if (coefficients < 4) return;

@@ -4,6 +4,13 @@
 // Slack in pixels over what float32 loses here; a tile too many only costs time, one too few would show.
 #define TILE_SLACK 0.01f
 
+// u^2 + v^2 at the edge of a Gaussian's ellipse: where its alpha is ALPHA_MIN, unless RasterizerConfig.extent says other.
+#ifdef EXTENT_BUDGET
+#define EXTENT(log2o) EXTENT_BUDGET
+#else
+#define EXTENT(log2o) ((log2o) - LOG2_ALPHA_MIN)
+#endif
+
 // First index of the tiles (or rows, at size 1) whose last pixel centre is at or after `low`, within [0, count].
 // Rounding goes by integers after the clamp: ceil and floor are calls in some drivers, and here in the inner loop.
 static inline int first_cell(float low, float size, int count) {
@@ -23,7 +30,7 @@ static inline int end_cell(float high, float size, int count) {
 
 typedef struct {
   float mx, my, l11, l12, l22, half_w, half_h;
-  float budget;  // u^2 + v^2 where alpha is 1/255
+  float budget;  // u^2 + v^2 at its edge
   float tangent; // dy / dx from the mean to the ellipse's rightmost point, times half_w
   int tile_x0, tile_x1, tile_y0, tile_y1; // tiles that its box reaches
 } Ellipse;
@@ -42,7 +49,7 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
     e.l11 = splat[SPLAT_L11];
     e.l12 = splat[SPLAT_L12];
     e.l22 = splat[SPLAT_L22];
-    e.budget = splat[SPLAT_LOG2O] - LOG2_ALPHA_MIN;
+    e.budget = EXTENT(splat[SPLAT_LOG2O]);
     e.tangent = -e.l12 * e.l11 / (e.l22 * e.l22 + e.l12 * e.l12) * e.half_w;
   }
   return e;
@@ -61,6 +68,7 @@ static inline float right_edge(const Ellipse *e, float d0, float d1) {
 static inline void tile_span(const Ellipse *e, int ty, int tiles_x, int *x0, int *x1) {
   *x0 = e->tile_x0;
   *x1 = e->tile_x1 > e->tile_x0 ? e->tile_x1 : e->tile_x0;
+#ifndef BOX_TILE_TEST // RasterizerConfig.tile_test
   if (*x1 - *x0 <= 1) return;
   float d0 = (float)(ty * TILE) + 0.5f - TILE_SLACK - e->my;
   float d1 = (float)(ty * TILE + TILE) - 0.5f + TILE_SLACK - e->my;
@@ -72,4 +80,5 @@ static inline void tile_span(const Ellipse *e, int ty, int tiles_x, int *x0, int
   *x0 = first_cell(e->mx - left, (float)TILE, tiles_x);
   *x1 = end_cell(e->mx + right, (float)TILE, tiles_x);
   if (*x1 < *x0) *x1 = *x0;
+#endif
 }

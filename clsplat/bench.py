@@ -1,0 +1,472 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat bench`: what each stage of a frame and of a training step costs, held against the device's own limits, and
+run time against error for every switch of the rasterizer.
+
+docs/performance.md says what each figure means.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config import PRESETS, DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
+from clsplat.device.profile import StageRecord
+from clsplat.gaussians import Gaussians
+from clsplat.initialise import from_points, random_points
+from clsplat.rendering import Frame, Rasterizer
+from clsplat.runs import Run, is_run
+from clsplat.scene import Scene, View, load_scene
+from clsplat.stages.blend import count_pairs
+from clsplat.stages.limit import Limits, measure_limits
+from clsplat.stages.project import upload_gaussians
+from clsplat.trainer import Trainer
+from clsplat.undistort import Lens
+
+if TYPE_CHECKING:
+    from clsplat.reference.project import Projected
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Progress = Callable[[str, float | None], None]
+
+FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")
+"""Stages that are measured in a frame; the others in a training step."""
+CROP = 192
+"""Side in pixels of what is compared with the float64 reference, in the middle of the image; smaller ones are whole."""
+PSNR_MAX = 160.0
+"""PSNR of equal images, which would be infinite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What is measured: a model, a view of it, and the photograph (H, W, 3) uint8 that a training step compares with,
+    or None for one made up from the frame itself."""
+
+    name: str
+    gaussians: Gaussians
+    camera: Camera
+    photograph: NDArray[np.uint8] | None = None
+
+
+def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Subject:
+    """A made-up scene, the same every time; as it stands 1.0 M (tile, Gaussian) pairs, 56 M (Gaussian, pixel) ones."""
+    rng = np.random.default_rng(0)
+    focal = 0.9 * width
+    camera = Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), np.zeros(3))
+    depths = rng.uniform(2.0, 10.0, (count, 1))
+    pixels = rng.uniform(-0.05, 1.05, (count, 2)) * (width, height)
+    means = np.concatenate([(pixels - (camera.cx, camera.cy)) / focal * depths, depths], axis=1)
+    sizes = 1.5 * np.sqrt(width * height / count)
+    sizes = sizes * np.exp(rng.normal(0.0, 0.5, (count, 1)) + rng.normal(0.0, 0.5, (count, 3)))
+    opacities = 0.005 + 0.99 * rng.beta(0.6, 0.8, count)
+    sh = rng.normal(0.0, 0.1, (count, 16, 3))
+    sh[:, 0] = rng.uniform(-1.5, 1.5, (count, 3))
+    arrays = (
+        means,
+        rng.normal(size=(count, 4)),
+        np.log(sizes * depths / focal),
+        np.log(opacities) - np.log1p(-opacities),
+        sh,
+    )
+    gaussians = Gaussians(*(np.ascontiguousarray(array, np.float32) for array in arrays))
+    return Subject("synthetic", gaussians, camera)
+
+
+def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Progress | None = None) -> Subject:
+    """A run: its model from the first view of its scene. A model file: as a run's, if it lies in one, else from a
+    camera in front of it. A scene: the Gaussians that training starts from. Raises InputError."""
+    run = next((Run.open(folder) for folder in (path, path.parent) if is_run(folder)), None)
+    if run is not None and (path.is_dir() or path == run.model_path):
+        gaussians = Gaussians.load(run.model_path)
+        if run.scene is None or not run.scene.exists():
+            return Subject(str(path), gaussians, facing(gaussians, *(size or (1024, 768))))
+        config = run.config
+        scene = load_scene(run.scene, resolution=config.resolution, test_every=config.test_every, progress=progress)
+    elif path.suffix.lower() == ".ply":
+        gaussians = Gaussians.load(path)
+        return Subject(str(path), gaussians, facing(gaussians, *(size or (1024, 768))))
+    else:
+        scene = load_scene(path, progress=progress)
+        if len(scene.points) > 0:
+            gaussians = from_points(scene.points, scene.point_colors, sh_degree=0)
+        else:
+            points = random_points(TrainConfig().random_points, *scene.bounds, np.random.default_rng(0))
+            gaussians = from_points(*points, sh_degree=0)
+    view = (scene.train_views or scene.views)[0]
+    camera = view.camera.resized(*size) if size else view.camera
+    pixels = view.load(camera.width, camera.height)[:, :, :3]
+    return Subject(str(path), gaussians, camera, np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
+
+
+def facing(gaussians: Gaussians, width: int, height: int) -> Camera:
+    """A camera with the world's axes that has nine tenths of the Gaussians in its image."""
+    low, middle, high = np.quantile(gaussians.means.astype(np.float64), (0.05, 0.5, 0.95), axis=0)
+    focal = 0.9 * width
+    half = np.maximum(high - middle, middle - low)
+    distance = max(float(np.max(2 * focal * half[:2] / (width, height))) + float(half[2]), 0.1)
+    position = middle - np.array([0.0, 0.0, distance])
+    return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), -position)
+
+
+def bench(
+    subject: Subject,
+    device: Device,
+    config: RasterizerConfig | None = None,
+    *,
+    repeat: int = 5,
+    limits: Limits | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """What `clsplat bench --json` prints. The device's queue should have been made with profiling."""
+    say = progress or (lambda *_: None)
+    config = config or RasterizerConfig()
+    say("limits", None)
+    limits = limits or measure_limits(device)
+    say("frame", None)
+    trainer = _trainer(subject, device, config)
+    rasterizer, gaussians = trainer.rasterizer, trainer.parameters
+
+    def draw() -> Frame:
+        return rasterizer.forward(gaussians, subject.camera, trainer.background)
+
+    frame = draw()
+    contributing, evaluated = count_pairs(
+        rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background, subject.camera
+    )
+    visible, listed = frame.pairs.gaussian_from_rank.shape[0], frame.pairs.tile_keys.shape[0]
+    in_frame = _measure(device, draw, repeat)
+    say("training step", None)
+    in_step = _measure(device, trainer.train_step, repeat)
+
+    stages = {name: record for name, record in in_frame.stages.items() if name in FORWARD}
+    stages.update({name: record for name, record in in_step.stages.items() if name not in stages})
+    table = {name: _row(record, limits) for name, record in stages.items()}
+    for name in ("blend", "blend_grad"):
+        if name in table and table[name]["ms"] > 0:
+            rate = 1e3 * contributing / table[name]["ms"]
+            table[name].update(pairs_per_second=rate, share_of_arithmetic=rate / limits.pairs_per_second)
+    return {
+        "device": device.name,
+        "driver": device.driver,
+        "shape": {"lanes": device.shape.lanes, "items": device.shape.items},
+        "source": subject.name,
+        "rasterizer": asdict(config),
+        "gaussians": len(subject.gaussians),
+        "visible": visible,
+        "sh_degree": subject.gaussians.sh_degree,
+        "width": subject.camera.width,
+        "height": subject.camera.height,
+        "repeat": repeat,
+        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "timer": "wall" if in_frame.by_wall else "events",
+        "frame_ms": in_frame.ms,
+        "iteration_ms": in_step.ms,
+        "stages": table,
+        "pairs": {"listed": listed, "contributing": contributing, "evaluated": evaluated},
+        "limit": asdict(limits),
+    }
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """ms: wall time, nothing recorded; stages: medians; by_wall: the driver's events give no times."""
+
+    ms: float
+    stages: dict[str, StageRecord]
+    by_wall: bool
+
+
+def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Measured:
+    """Medians over `repeat` rounds: plain, with events, and waiting at the seams of the stages."""
+    for _ in range(2):
+        work()
+    walls: list[float] = []
+    by_events: list[dict[str, StageRecord]] = []
+    by_waiting: list[dict[str, StageRecord]] = []
+    for _ in range(repeat):
+        walls.append(_wall_ms(device, work))
+        for records, wait in ((by_events, False), (by_waiting, True)):
+            with device.recorder.recording(device, wait=wait) as stages:
+                work()
+            records.append(stages)
+    by_wall = not any(record.ms for stages in by_events for record in stages.values())
+    medians = {}
+    for name, record in by_events[0].items():
+        waits = [stages[name].wall_ms for stages in by_waiting]
+        times = [stages[name].kernels for stages in by_events]
+        kernels = {kernel: statistics.median(each.get(kernel, 0.0) for each in times) for kernel in record.kernels}
+        total = statistics.median(waits if by_wall else [sum(each.values()) for each in times])
+        medians[name] = replace(record, kernels=kernels, ms=total, wall_ms=statistics.median(waits))
+    return _Measured(statistics.median(walls), medians, by_wall)
+
+
+def _wall_ms(device: Device, work: Callable[[], object]) -> float:
+    device.finish()
+    start = time.perf_counter()
+    work()
+    device.finish()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def _row(record: StageRecord, limits: Limits) -> dict[str, Any]:
+    rate = 1e3 * record.bytes / record.ms if record.ms > 0 else 0.0
+    return {
+        "ms": record.ms,
+        "wall_ms": record.wall_ms,
+        "launches": record.launches,
+        "bytes": record.bytes,
+        "bytes_per_second": rate,
+        "share_of_copy": rate / limits.copy_bytes_per_second,
+        "kernels": record.kernels,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture(View):
+    """A view whose pixels are in memory."""
+
+    pixels: Float32 = field(kw_only=True)
+
+    def load(self, width: int | None = None, height: int | None = None) -> Float32:  # noqa: ARG002  # of one size
+        return self.pixels
+
+
+def _trainer(subject: Subject, device: Device, config: RasterizerConfig) -> Trainer:
+    """A trainer whose steps do all the work of a real one and leave the model as it is: every rate is zero."""
+    camera = subject.camera
+    photograph = subject.photograph
+    if photograph is None:  # the frame mirrored: a picture like it, with a gradient everywhere
+        rasterizer = Rasterizer(device, config)
+        black = upload(device, np.zeros(3, np.float32))
+        frame = rasterizer.forward(upload_gaussians(device, subject.gaussians), camera, black)
+        mirrored = _picture(frame)[:, ::-1]
+        photograph = np.rint(255 * np.clip(mirrored, 0, 1)).astype(np.uint8)
+    lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
+    pixels = (photograph / np.float32(255)).astype(np.float32)
+    view = _Picture("bench", camera, Path("bench"), "train", lens, pixels=pixels)
+    scene = Scene("bench", [view], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (np.zeros(3), np.ones(3)))
+    names = [each.name for each in fields(OptimiserConfig)]
+    still = {name: 0.0 for name in names if "_rate" in name and name != "means_rate_steps"}
+    settings = TrainConfig(
+        sh_degree=subject.gaussians.sh_degree,
+        warmup=(),
+        optimiser=OptimiserConfig(**still),  # type: ignore[arg-type]  # all of them are floats
+        density=DensityConfig(every=0),
+        rasterizer=config,
+    )
+    return Trainer(scene, settings, device, subject.gaussians)
+
+
+def _picture(frame: Frame) -> Float32:
+    """(H, W, 3) on the host."""
+    camera = frame.camera
+    planes: Float32 = frame.blended.image.get()[:, : camera.height, : camera.width]
+    return np.ascontiguousarray(planes.transpose(1, 2, 0))
+
+
+@dataclass(frozen=True)
+class Error:
+    """Of a picture: PSNR over all pixels and channels in dB, at most PSNR_MAX, and the largest absolute difference."""
+
+    psnr: float
+    max_abs: float
+
+    @classmethod
+    def of(cls, picture: NDArray[Any], wanted: NDArray[Any]) -> Error:
+        """Compared in float64, not clamped."""
+        difference = np.asarray(picture, np.float64) - np.asarray(wanted, np.float64)
+        mse = float(np.mean(np.square(difference)))
+        psnr = min(-10 * float(np.log10(mse)), PSNR_MAX) if mse > 0 else PSNR_MAX
+        return cls(psnr, float(np.abs(difference).max()))
+
+
+def settings() -> dict[str, RasterizerConfig]:
+    """The points of the plot: presets, and each switch away from its default alone, and the exact ones together."""
+    named = {f"preset {name}": config for name, config in PRESETS.items()}
+    changes: dict[str, dict[str, Any]] = {
+        "extent constant": {"extent": "constant"},
+        "tile-test box": {"tile_test": "box"},
+        "no row-skip": {"row_skip": False},
+        "no column-skip": {"column_skip": False},
+        "no vector-skip": {"vector_skip": False},
+        "no early-stop": {"early_stop": False},
+    }
+    together: dict[str, Any] = {key: value for change in changes.values() for key, value in change.items()}
+    changes["all exact switches off"] = together
+    changes["extent 3sigma"] = {"extent": "3sigma"}
+    changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
+    changes.update({f"alpha-min {steps}/255": {"alpha_min": steps / 255} for steps in (2, 4)})
+    changes.update({f"transmittance-min {value:g}": {"transmittance_min": value} for value in (1e-3, 1e-2)})
+    named.update({name: replace(RasterizerConfig(), **change) for name, change in changes.items()})
+    merged: dict[RasterizerConfig, str] = {}
+    for name, config in named.items():
+        merged[config] = f"{merged[config]} = {name.removeprefix('preset ')}" if config in merged else name
+    return {name: config for config, name in merged.items()}
+
+
+def compare(
+    subject: Subject,
+    device: Device,
+    candidates: dict[str, RasterizerConfig] | None = None,
+    *,
+    repeat: int = 5,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Run time against error of each setting: median time of a frame, the settings taken in turn; its difference from
+    the float64 reference on a crop, and from the exact preset's frame on the whole image."""
+    say = progress or (lambda *_: None)
+    candidates = candidates or settings()
+    on_device, work = upload_gaussians(device, subject.gaussians), Workspace(device)
+    background = upload(device, np.zeros(3, np.float32))
+    camera = subject.camera
+    x0, y0, width, height = crop = _crop(camera)
+    say("float64 reference", None)
+    reference = reference_crop(subject.gaussians, camera, crop)
+
+    def errors(picture: Float32) -> tuple[Error, Error]:
+        part = picture[y0 : y0 + height, x0 : x0 + width]
+        return Error.of(part, reference), Error.of(picture, exact)
+
+    def draw(rasterizer: Rasterizer) -> Frame:
+        return rasterizer.forward(on_device, camera, background)
+
+    exact = _picture(draw(Rasterizer(device, PRESETS["exact"], work)))
+    rasterizers = {name: Rasterizer(device, config, work) for name, config in candidates.items()}
+    found = {}
+    for done, (name, rasterizer) in enumerate(rasterizers.items()):
+        say("settings", done / len(rasterizers))
+        found[name] = errors(_picture(draw(rasterizer)))
+    times: dict[str, list[float]] = {name: [] for name in rasterizers}
+    for done in range(repeat):
+        say("times", done / repeat)
+        for name, rasterizer in rasterizers.items():
+            times[name].append(_wall_ms(device, partial(draw, rasterizer)))
+    whole = (width, height) == (camera.width, camera.height)
+    points = []
+    for name, (from_reference, from_exact) in found.items():
+        points.append(
+            {
+                "name": name,
+                "frame_ms": statistics.median(times[name]),
+                "against_float64": asdict(from_reference),
+                "against_exact": asdict(from_exact),
+                **asdict(from_reference if whole else from_exact),
+            }
+        )
+    on_front = front([(point["frame_ms"], point["psnr"]) for point in points])
+    for point, best in zip(points, on_front, strict=True):
+        point["on_front"] = best
+    return {
+        "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
+        "crop": list(crop),
+        "exact_against_float64": asdict(errors(exact)[0]),
+        "points": points,
+    }
+
+
+def front(points: list[tuple[float, float]]) -> list[bool]:
+    """Of (cost, quality) pairs those that none beats in one without losing in the other."""
+    return [
+        not any(c <= cost and q >= quality and (c < cost or q > quality) for c, q in points) for cost, quality in points
+    ]
+
+
+def _crop(camera: Camera) -> tuple[int, int, int, int]:
+    """x, y, width, height."""
+    width, height = min(CROP, camera.width), min(CROP, camera.height)
+    return (camera.width - width) // 2, (camera.height - height) // 2, width, height
+
+
+def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, int, int]) -> Float64:
+    """A part of the frame in float64, over black, (height, width, 3): the twin, but for Gaussians that cannot reach."""
+    from clsplat.reference.blend import blend
+    from clsplat.reference.project import project
+    from clsplat.reference.render import parameters
+    from clsplat.reference.sort import depth_order
+
+    x, y, width, height = crop
+    projected: Projected = project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
+    means = projected.means2d - (x, y)
+    reach = 1.1 * projected.half_extents + 1.0
+    near = (means > -reach).all(axis=1) & (means < np.array([width, height]) + reach).all(axis=1)
+    order = depth_order(projected.depths, projected.visible & near)
+    image: Float64 = blend(replace(projected, means2d=means), order, width, height).image
+    return image
+
+
+def table(result: dict[str, Any]) -> str:
+    """What `bench` measured, for people."""
+    stages, limit, pairs = result["stages"], result["limit"], result["pairs"]
+    driver, size = result["driver"].split("  ")[0], f"{result['width']}x{result['height']}"
+    arithmetic, copying = limit["pairs_per_second"] * 1e-9, limit["copy_bytes_per_second"] * 1e-9
+    seen = f"{result['gaussians']:,} Gaussians, SH degree {result['sh_degree']}, {result['visible']:,} visible"
+    of_pixels = f"{pairs['contributing']:,} that contribute, {pairs['evaluated']:,} evaluated"
+    lines = [
+        f"{result['device']}, {driver}, {limit['lanes']} lanes x {limit['items']} items",
+        f"{result['source']}: {seen}, at {size}",
+        f"pairs: {pairs['listed']:,} of tiles; of pixels {of_pixels}",
+        f"limits: {arithmetic:.2f} Gpairs/s of blending arithmetic, {copying:.1f} GB/s of copying",
+        "",
+    ]
+    header = ("stage", "ms", "wall ms", "launches", "MB", "GB/s", "of copy", "Gpairs/s", "of arithmetic")
+    rows: list[tuple[str, ...]] = [header]
+    for name, row in stages.items():
+        rate = row.get("pairs_per_second")
+        rows.append(
+            (
+                name,
+                f"{row['ms']:.3f}",
+                f"{row['wall_ms']:.3f}",
+                str(row["launches"]),
+                f"{row['bytes'] * 1e-6:.1f}",
+                f"{row['bytes_per_second'] * 1e-9:.2f}",
+                f"{row['share_of_copy']:.0%}",
+                "" if rate is None else f"{rate * 1e-9:.3f}",
+                "" if rate is None else f"{row['share_of_arithmetic']:.0%}",
+            )
+        )
+    lines += _columns(rows)
+    note = "ms by events" if result["timer"] == "events" else "ms by wall time: the driver's events have none"
+    times = f"frame {result['frame_ms']:.2f} ms, training step {result['iteration_ms']:.2f} ms"
+    load = f"load average {result['load_average'] or 0:.1f}"
+    return "\n".join([*lines, "", f"{times}: medians of {result['repeat']}; {note}; {load}"])
+
+
+def settings_table(result: dict[str, Any]) -> str:
+    """What `compare` measured, for people."""
+    rows: list[tuple[str, ...]] = [("setting", "ms", "PSNR dB", "largest", "front")]
+    for point in result["points"]:
+        psnr = "same bits" if point["max_abs"] == 0 else f"{point['psnr']:.1f}"
+        front_mark = "*" if point["on_front"] else ""
+        rows.append((point["name"], f"{point['frame_ms']:.2f}", psnr, f"{point['max_abs']:.2g}", front_mark))
+    known, (_, _, width, height) = result["exact_against_float64"], result["crop"]
+    note = (
+        f"error against {result['error_is_against']}; exact against float64 on {width}x{height} pixels: "
+        f"{known['psnr']:.1f} dB, {known['max_abs']:.2g}"
+    )
+    return "\n".join([*_columns(rows), "", note])
+
+
+def _columns(rows: list[tuple[str, ...]]) -> list[str]:
+    """Aligned: the first column to the left, the others to the right."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.ljust(width) if column == 0 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches limit.cl: what the device does at most, to hold the stages against."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import allocate, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_groups, launch_items
+from clsplat.device.layout import SPLAT, TILE
+
+_SPLATS = 64
+_GROUPS = {"cpu": 4, "gpu": 32, "other": 32}
+"""Groups a compute unit: enough to keep it busy to the end."""
+_COPY_BYTES = 256 * 2**20
+
+
+@dataclass(frozen=True)
+class Limits:
+    """pairs_per_second: blending's arithmetic alone, with every lane in use; copy_bytes_per_second: bytes read and
+    bytes written of a copy that no cache holds; lanes and items: the shape of both."""
+
+    pairs_per_second: float
+    copy_bytes_per_second: float
+    lanes: int
+    items: int
+
+
+def measure_limits(device: Device, *, seconds: float = 0.1, repeat: int = 5, copy_bytes: int = _COPY_BYTES) -> Limits:
+    """The best of `repeat` runs each; those of the arithmetic are made to last about `seconds`."""
+    items = min(device.shape.items, TILE * TILE // device.shape.lanes)
+    return Limits(
+        _pairs_per_second(device, items, seconds, repeat),
+        _copy_rate(device, copy_bytes, repeat),
+        device.shape.lanes,
+        items,
+    )
+
+
+def _splats() -> NDArray[np.float32]:
+    """Wide, faint Gaussians that reach every pixel of a tile, all different."""
+    index = np.arange(_SPLATS)
+    splats = np.zeros((_SPLATS, len(SPLAT)), np.float32)
+    columns = {"L11": 0.02, "L12": 0.005, "L22": 0.02, "RED": 0.3, "GREEN": 0.5, "BLUE": 0.7}
+    for name, value in columns.items():
+        splats[:, SPLAT.index(name)] = value + 1e-4 * index
+    splats[:, SPLAT.index("PIXEL_X")] = splats[:, SPLAT.index("PIXEL_Y")] = index % TILE
+    splats[:, SPLAT.index("LOG2O")] = -6.0
+    return splats
+
+
+def _pairs_per_second(device: Device, items: int, seconds: float, repeat: int) -> float:
+    kernel = device.kernels("limit", ITEMS=items).limit_blend
+    groups = _GROUPS[device.kind] * int(device.cl_device.max_compute_units)
+    splats = upload(device, _splats())
+    sums = allocate(device, (groups * items,), np.float32)
+
+    def run(rounds: int) -> float:
+        device.finish()
+        start = time.perf_counter()
+        launch_groups(device, kernel, groups, items, rounds, splats, sums)
+        device.finish()
+        return time.perf_counter() - start
+
+    run(64)
+    rounds = 256
+    while (taken := run(rounds)) < seconds / 2 and rounds < 2**24:
+        rounds = min(2 * rounds if taken < seconds / 16 else int(rounds * seconds / taken), 2**24)
+    pairs = groups * rounds * TILE * TILE
+    return max(pairs / run(rounds) for _ in range(repeat))
+
+
+def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
+    lanes = device.shape.lanes
+    n = min(nbytes, device.max_allocation // 4) // 4 // lanes * lanes
+    source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
+    source.fill(1.0)
+    copy.fill(0.0)  # so that its pages are there
+    kernel = device.kernels("limit").limit_copy
+
+    def run() -> float:
+        device.finish()
+        start = time.perf_counter()
+        launch_items(device, kernel, n // lanes, n, source, copy)
+        device.finish()
+        return time.perf_counter() - start
+
+    return max(8 * n / run() for _ in range(repeat + 1))

@@ -1,0 +1,393 @@
+# SPDX-License-Identifier: Apache-2.0
+"""clsplat bench: the contract of its JSON, counts against a brute-force count, limits, the plot, wrong calls."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+from pipeline import BACKGROUND, Pipeline, shaped
+from tiny import write_scene
+
+from clsplat import bench as measure
+from clsplat import plots
+from clsplat.cli import main
+from clsplat.config import PRESETS, RasterizerConfig
+from clsplat.device.context import Device
+from clsplat.device.layout import SPLAT, TILE
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.reference import render as reference
+from clsplat.rendering import Rasterizer
+from clsplat.stages.blend import count_pairs
+from clsplat.stages.limit import Limits, measure_limits
+
+SMALL = ["--gaussians", "400", "--size", "70x50", "--repeat", "1"]
+FRAME = {"project", "duplicate", "ranges", "blend"}
+STEP = {"target", "loss", "blend_grad", "project_grad", "statistics", "adam"}
+Capture = pytest.CaptureFixture[str]
+
+quick_limits = partial(measure_limits, seconds=1e-3, repeat=1, copy_bytes=2**16)
+
+
+@pytest.fixture
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measure, "measure_limits", quick_limits)
+
+
+@pytest.fixture(scope="session")
+def profiled(default_device: Device) -> Device:
+    """With a queue that profiles, as the verb opens it."""
+    return Device(default_device.cl_device, profile=True)
+
+
+def counted(pipeline: Pipeline) -> tuple[int, int]:
+    frame, rasterizer = pipeline.frame, pipeline.rasterizer
+    return count_pairs(
+        rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background, pipeline.camera
+    )
+
+
+def first_cell(low: float, size: float, count: int) -> int:
+    return int(np.ceil(np.clip((low - 0.01 - (size - 0.5)) / size, 0, count)))
+
+
+def end_cell(high: float, size: float, count: int) -> int:
+    return int(np.clip((high + 0.01 - 0.5) / size + 1, 0, count))
+
+
+def boxes(splat: np.ndarray, x: int, y: int, lanes: int) -> np.ndarray:
+    """Whether each vector (16, 16 / lanes) of the tile at (x, y) is in the Gaussian's box."""
+    of = dict(zip(SPLAT, splat.astype(np.float64), strict=True))
+    mx, my = of["PIXEL_X"] - x + of["SUB_X"], of["PIXEL_Y"] - y + of["SUB_Y"]
+    parts = TILE // lanes
+    inside = np.zeros((TILE, parts), np.bool_)
+    rows = slice(first_cell(my - of["HALF_H"], 1, TILE), end_cell(my + of["HALF_H"], 1, TILE))
+    columns = slice(0, 1)
+    if parts > 1:
+        columns = slice(first_cell(mx - of["HALF_W"], lanes, parts), end_cell(mx + of["HALF_W"], lanes, parts))
+    inside[rows, columns] = True
+    return inside
+
+
+def brute_force_evaluated(pipeline: Pipeline, lanes: int, items: int) -> int:
+    """Lanes of the vectors in each Gaussian's box, up to where the last pixel that the work-item owns has ended."""
+    frame = pipeline.frame
+    ranges, listed = frame.lists.ranges.get().astype(int), frame.lists.gaussian_from_sorted.get()
+    splats, stops = frame.projected.splats.get(), frame.blended.stops.get()
+    tiles_x = -(-pipeline.camera.width // TILE)
+    owner = np.arange(TILE * TILE // lanes).reshape(TILE, TILE // lanes) % items
+    total = 0
+    for tile, (begin, end) in enumerate(ranges):
+        x, y = tile % tiles_x * TILE, tile // tiles_x * TILE
+        last = stops[y : y + TILE, x : x + TILE].reshape(TILE, TILE // lanes, lanes).max(axis=2)
+        last_of_item = np.array([last[owner == item].max() for item in range(items)])[owner]
+        for i in range(begin, end):
+            total += lanes * int((boxes(splats[listed[i]], x, y, lanes) & (i <= last_of_item)).sum())
+    return total
+
+
+@pytest.mark.parametrize("name", ["overlap", "saturating", "many_per_tile", "random_cloud"])
+def test_contributing_pairs_are_those_of_the_reference(default_device: Device, name: str) -> None:
+    scene = scenes.NAMED[name]()
+    wanted = reference.forward(*scene, BACKGROUND, margins=True).blended
+    got, _ = counted(Pipeline.run(shaped(default_device, 8, 1), scene))
+    doubtful = wanted.margin < 1e-5  # pixels where a threshold may fall the other way, by one Gaussian or so
+    assert abs(got - wanted.count.sum()) <= doubtful.sum()
+    assert got > 0
+
+
+def test_contributing_pairs_exactly(default_device: Device) -> None:
+    scene = scenes.NAMED["one"]()
+    wanted = reference.forward(*scene, BACKGROUND, margins=True).blended
+    assert wanted.margin.min() > 1e-5
+    assert counted(Pipeline.run(default_device, scene))[0] == wanted.count.sum()
+
+
+@pytest.mark.parametrize("name", ["overlap", "saturating", "random_cloud"])
+@pytest.mark.parametrize("shape", [(8, 1), (1, 1), (1, 64), (8, 16)], ids=str)
+def test_evaluated_pairs_are_those_of_a_brute_force_count(
+    default_device: Device, shape: tuple[int, int], name: str
+) -> None:
+    pipeline = Pipeline.run(shaped(default_device, *shape), scenes.NAMED[name]())
+    contributing, evaluated = counted(pipeline)
+    assert evaluated == brute_force_evaluated(pipeline, *shape)
+    assert contributing == counted(Pipeline.run(shaped(default_device, 8, 1), scenes.NAMED[name]()))[0]
+
+
+def test_switches_show_in_the_counts(default_device: Device) -> None:
+    scene = scenes.random_cloud(1000, 8, 100, 70)
+    counts = {}
+    for name, config in {"default": RasterizerConfig(), "rows": RasterizerConfig(row_skip=False)}.items():
+        pipeline = Pipeline.run(shaped(default_device, 8, 1), scene)
+        pipeline.rasterizer = Rasterizer(pipeline.rasterizer.device, config)
+        counts[name] = counted(pipeline)
+    assert counts["rows"][0] == counts["default"][0]
+    assert counts["rows"][1] > counts["default"][1]
+
+
+def test_limits_are_finite_in_every_shape(shaped_device: Device) -> None:
+    limits = quick_limits(shaped_device)
+    for value in (limits.pairs_per_second, limits.copy_bytes_per_second):
+        assert np.isfinite(value)
+        assert value > 0
+    assert limits.lanes == shaped_device.shape.lanes
+
+
+@pytest.mark.parametrize("shape", [None, (1, 64)], ids=str)
+def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
+    device = profiled.with_shape(lanes=shape[0], items=shape[1]) if shape else profiled
+    result = measure.bench(measure.synthetic(300, 50, 40), device, repeat=2, limits=Limits(1e9, 1e10, 8, 1))
+    assert set(result["stages"]) >= FRAME | STEP
+    assert result["timer"] == "events"
+    for name in FRAME | STEP:
+        row = result["stages"][name]
+        assert row["ms"] > 0
+        assert row["wall_ms"] > 0
+        assert row["launches"] > 0
+        assert row["bytes"] > 0
+        assert sum(row["kernels"].values()) == pytest.approx(row["ms"], rel=0.5)  # medians of each, and of the sums
+    blend = result["stages"]["blend"]
+    assert blend["pairs_per_second"] == pytest.approx(1e3 * result["pairs"]["contributing"] / blend["ms"])
+    assert blend["share_of_arithmetic"] == pytest.approx(blend["pairs_per_second"] / 1e9)
+    adam = result["stages"]["adam"]
+    # Parameters, gradients and both moments of 59 floats, read and written.
+    assert adam["bytes"] == 300 * 59 * 4 * 4 * 2
+
+
+def test_wall_time_where_events_have_none(default_device: Device) -> None:
+    result = measure.bench(measure.synthetic(200, 40, 30), default_device, repeat=1, limits=Limits(1e9, 1e10, 8, 1))
+    assert result["timer"] == "wall"
+    assert all(result["stages"][name]["ms"] == result["stages"][name]["wall_ms"] for name in FRAME | STEP)
+
+
+def test_nothing_is_recorded_unless_asked(profiled: Device) -> None:
+    assert not profiled.recorder.on
+    with profiled.recorder.recording(profiled, wait=False) as stages:
+        pass
+    assert stages == {}
+    assert not profiled.recorder.on
+
+
+def test_measuring_leaves_the_model_as_it_is(profiled: Device) -> None:
+    subject = measure.synthetic(200, 40, 30)
+    trainer = measure._trainer(subject, profiled, RasterizerConfig())
+    for _ in range(3):
+        trainer.train_step()
+    after = trainer.gaussians()
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(subject.gaussians, name))
+    assert trainer.first["means"].get().any(), "there was a gradient"
+
+
+def test_synthetic_scene_is_the_same_every_time() -> None:
+    first, second = measure.synthetic(50, 40, 30), measure.synthetic(50, 40, 30)
+    np.testing.assert_array_equal(first.gaussians.means, second.gaussians.means)
+    first.gaussians.check()
+
+
+@pytest.mark.usefixtures("_quick")
+def test_json_has_the_contract(capsys: Capture) -> None:
+    assert main(["bench", *SMALL, "--json", "--preset", "fast", "--rasterizer.sh-degree-limit", "1"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert {"device", "driver", "stages", "frame_ms", "iteration_ms", "gaussians", "width", "height", "pairs"} <= set(
+        result
+    )
+    assert (result["gaussians"], result["width"], result["height"]) == (400, 70, 50)
+    assert all("ms" in stage for stage in result["stages"].values())
+    assert {"contributing", "evaluated"} <= set(result["pairs"])
+    assert 0 < result["pairs"]["contributing"] <= result["pairs"]["evaluated"]
+    assert result["limit"]["pairs_per_second"] > 0
+    fast = PRESETS["fast"]
+    assert result["rasterizer"]["alpha_min"] == fast.alpha_min
+    assert result["rasterizer"]["sh_degree_limit"] == 1, "a flag goes before the preset"
+
+
+@pytest.mark.usefixtures("_quick")
+def test_table(capsys: Capture) -> None:
+    assert main(["bench", *SMALL]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert {line.split()[0] for line in lines if line} >= FRAME | STEP
+    assert "synthetic: 400 Gaussians" in "\n".join(lines)
+
+
+@pytest.mark.usefixtures("_quick")
+def test_scene_run_and_model(tmp_path: Path, capsys: Capture) -> None:
+    scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
+    assert main(["train", str(scene), "-o", str(run), "--iterations", "2"]) == 0
+    loose = tmp_path / "loose.ply"
+    Gaussians.load(run / "model.ply").save(loose)
+    capsys.readouterr()
+    for source, size in ((scene, (48, 40)), (run, (48, 40)), (run / "model.ply", (48, 40)), (loose, (24, 20))):
+        extra = ["--size", "24x20"] if source == loose else []
+        assert main(["bench", str(source), "--repeat", "1", "--json", *extra]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert (result["width"], result["height"]) == size
+        assert result["pairs"]["contributing"] > 0
+        assert result["source"] == str(source)
+
+
+def test_facing_camera_sees_the_model() -> None:
+    gaussians = measure.synthetic(500, 64, 48).gaussians
+    camera = measure.facing(gaussians, 80, 60)
+    p = gaussians.means @ camera.rotation.T + camera.translation
+    pixels = p[:, :2] / p[:, 2:] * camera.fx + (camera.cx, camera.cy)
+    seen = (p[:, 2] > camera.near) & (pixels > 0).all(axis=1) & (pixels < (80, 60)).all(axis=1)
+    assert seen.mean() > 0.8
+
+
+@pytest.mark.parametrize("crop", [(0, 0, 70, 50), (13, 9, 30, 20)], ids=str)
+def test_crop_of_the_reference_is_part_of_it(crop: tuple[int, int, int, int]) -> None:
+    gaussians, camera = scenes.NAMED["random_cloud"]()
+    whole, _ = reference.render(gaussians, camera)
+    x, y, width, height = crop
+    part = measure.reference_crop(gaussians, camera, crop)
+    np.testing.assert_allclose(part, whole[y : y + height, x : x + width], atol=1e-12)
+
+
+def test_settings_hold_every_switch_and_preset() -> None:
+    named = measure.settings()
+    assert "preset exact = default" in named
+    assert set(PRESETS.values()) <= set(named.values())
+    for field in RasterizerConfig.__dataclass_fields__:
+        assert any(getattr(config, field) != getattr(RasterizerConfig(), field) for config in named.values()), field
+
+
+def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measure, "CROP", 48)
+    candidates = {
+        "exact": PRESETS["exact"],
+        "no row-skip": RasterizerConfig(row_skip=False),
+        "coarse": RasterizerConfig(alpha_min=8 / 255),
+    }
+    result = measure.compare(measure.synthetic(300, 70, 50), profiled, candidates, repeat=1)
+    exact, rows, coarse = result["points"]
+    assert result["error_is_against"] == "the exact preset's frame"
+    assert result["crop"] == [11, 1, 48, 48]
+    assert exact["max_abs"] == rows["max_abs"] == 0.0
+    assert exact["psnr"] == measure.PSNR_MAX
+    assert 0 < coarse["max_abs"] < 0.3
+    assert 20 < coarse["psnr"] < 80
+    assert result["exact_against_float64"]["max_abs"] < 2e-5
+    assert any(point["on_front"] for point in result["points"])
+
+
+def test_small_frames_are_compared_with_float64(profiled: Device) -> None:
+    result = measure.compare(measure.synthetic(200, 40, 30), profiled, {"exact": PRESETS["exact"]}, repeat=1)
+    assert result["error_is_against"] == "the float64 reference"
+    assert result["crop"] == [0, 0, 40, 30]
+    assert 90 < result["points"][0]["psnr"] < measure.PSNR_MAX
+
+
+def test_front() -> None:
+    assert measure.front([(1, 1), (2, 2), (3, 1), (1, 0), (2, 2)]) == [True, True, False, False, True]
+
+
+@pytest.fixture
+def result() -> dict[str, object]:
+    points = [
+        {"name": "exact", "frame_ms": 9.0, "psnr": 160.0, "max_abs": 0.0, "on_front": True},
+        {"name": "fast", "frame_ms": 5.0, "psnr": 50.0, "max_abs": 0.02, "on_front": True},
+        {"name": "slow", "frame_ms": 12.0, "psnr": 40.0, "max_abs": 0.03, "on_front": False},
+    ]
+    return {
+        "error_is_against": "the exact preset's frame",
+        "crop": [1, 2, 3, 4],
+        "exact_against_float64": {"psnr": 120.0, "max_abs": 1e-6},
+        "points": points,
+    }
+
+
+@pytest.mark.parametrize("name", ["plot.svg", "plot.PNG"])
+def test_plot_is_written(tmp_path: Path, result: dict[str, object], name: str) -> None:
+    pytest.importorskip("matplotlib")
+    path, again = tmp_path / name, tmp_path / f"again_{name}"
+    for file in (path, again):
+        plots.check_plot(file)
+        plots.plot_settings(file, result, "a title")
+    assert path.read_bytes().startswith(b"\x89PNG" if name.endswith("PNG") else b"<?xml")
+    assert path.read_bytes() == again.read_bytes()
+    if name.endswith("svg"):
+        text = path.read_text()
+        for words in ("a title", "fast", "the exact preset's frame", "3x4 pixels"):
+            assert words.replace("'", "&#39;") in text or words in text
+
+
+@pytest.mark.usefixtures("_quick")
+def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    some = {"exact": PRESETS["exact"], "fast": PRESETS["fast"]}
+    monkeypatch.setattr(measure, "settings", lambda: some)
+    path = tmp_path / "plot.svg"
+    assert main(["bench", *SMALL, "--plot", str(path), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [point["name"] for point in result["settings"]["points"]] == list(some)
+    assert path.exists()
+
+
+def test_plot_without_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(InputError, match=r"pip install 'clsplat\[plot\]'"):
+        plots.check_plot(tmp_path / "a.svg")
+    assert main(["bench", *SMALL, "--plot", str(tmp_path / "a.svg")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--size", "100"], "--size 100"),
+        (["--size", "0x5"], "--size 0x5"),
+        (["--gaussians", "0"], "--gaussians 0"),
+        (["--repeat", "0"], "--repeat 0"),
+        (["nowhere.ply"], "nowhere.ply"),
+        (["--plot", "a.pdf"], "a.pdf"),
+        (["--plot", "nowhere/a.svg"], "nowhere"),
+        (["--rasterizer.alpha-min", "0"], "--rasterizer.alpha-min 0.0"),
+        (["--preset", "quick"], "quick"),
+        (["--device", "no such device"], "no such device"),
+    ],
+    ids=str,
+)
+def test_wrong_calls_are_one_line(arguments: list[str], named: str, capsys: Capture) -> None:
+    assert main(["bench", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert named in captured.err
+    assert captured.err.startswith("clsplat: error: ")
+
+
+def test_preset_in_training(tmp_path: Path, capsys: Capture) -> None:
+    scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
+    assert main(["train", str(scene), "-o", str(run), "--iterations", "1", "--preset", "fast"]) == 0
+    assert "alpha_min = 0.0078" in (run / "config.toml").read_text()
+    assert main(["train", "-o", str(run), "--resume", "--preset", "fast"]) == 2
+    assert "--preset fast and --resume" in capsys.readouterr().err
+
+
+def test_plot_of_training(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    run = tmp_path / "run"
+    scene = write_scene(tmp_path / "scene")
+    assert main(["train", str(scene), "-o", str(run), "--iterations", "4", "--eval-at", "2"]) == 0
+    tool = Path(__file__).parents[1] / "tools" / "plot_training.py"
+    output = tmp_path / "training.svg"
+    done = subprocess.run(
+        [sys.executable, str(tool), str(run), "-o", str(output)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("run  ")
+    assert done.stdout.count(" dB") == 2
+    assert "run" in output.read_text()
+    wrong = subprocess.run(
+        [sys.executable, str(tool), str(scene), "-o", str(output)], capture_output=True, text=True, check=False
+    )
+    assert wrong.returncode == 2
+    assert wrong.stderr.count("\n") == 1

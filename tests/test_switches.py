@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rasterizer's switches: the default's bits are known, exact switches keep them, others lose a known amount."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+from compare import assert_same_bits
+from golden_frames import checksums
+from numpy.typing import NDArray
+from pipeline import BACKGROUND, Pipeline, shaped
+
+from clsplat.config import PRESETS, RasterizerConfig
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device
+from clsplat.device.switches import kernel_defines
+from clsplat.errors import InputError
+from clsplat.rendering import Rasterizer
+from clsplat.stages.project import upload_gaussians
+
+EXACT_OFF = {
+    "constant extent": RasterizerConfig(extent="constant"),
+    "box": RasterizerConfig(tile_test="box"),
+    "rows": RasterizerConfig(row_skip=False),
+    "columns": RasterizerConfig(column_skip=False),
+    "vectors": RasterizerConfig(vector_skip=False),
+    "early stop": RasterizerConfig(early_stop=False),
+    "all": RasterizerConfig("constant", "box", False, False, False, False),
+}
+"""Every exact switch turned off, alone and together."""
+
+APPROXIMATE = {
+    "3sigma": (RasterizerConfig(extent="3sigma"), 0.05),
+    "no SH": (RasterizerConfig(sh_degree_limit=0), 1.0),
+    "SH 2": (RasterizerConfig(sh_degree_limit=2), 1.0),
+    "alpha 2/255": (RasterizerConfig(alpha_min=2 / 255), 0.1),
+    "transmittance 1e-3": (RasterizerConfig(transmittance_min=1e-3), 0.1),
+    "fast": (PRESETS["fast"], 0.2),
+}
+"""With the largest difference that a channel of the scenes' frames may have: see `test_approximate_switches`."""
+
+NAMES = ("overlap", "saturating", "needles", "cloud")
+
+
+def scene(name: str) -> scenes.Scene:
+    return scenes.random_cloud(1000, 8, 100, 70) if name == "cloud" else scenes.NAMED[name]()
+
+
+def run(device: Device, name: str, config: RasterizerConfig) -> Pipeline:
+    gaussians, camera = scene(name)
+    rasterizer = Rasterizer(device, config)
+    on_device = upload_gaussians(device, gaussians)
+    frame = rasterizer.forward(on_device, camera, upload(device, np.array(BACKGROUND, np.float32)))
+    return Pipeline(rasterizer, on_device, camera, frame)
+
+
+def gradients(pipeline: Pipeline) -> dict[str, NDArray[np.float32]]:
+    camera = pipeline.camera
+    d_image = np.random.default_rng(2).random((camera.height, camera.width, 3)) - 0.5
+    found, screen = pipeline.backward(d_image)
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    arrays = {name: getattr(found, name) for name in names}
+    return {**arrays, "screen": np.where(pipeline.visible[:, None], screen, np.float32(0))}
+
+
+def test_default_bits_are_the_stored_ones(device: Device) -> None:
+    wanted = json.loads((Path(__file__).parent / "golden" / "frames.json").read_text())["checksums"]
+    assert checksums(device) == wanted, "see tools/make_golden.py if the change is meant to change bits"
+
+
+def test_default_is_the_plain_text() -> None:
+    assert kernel_defines(RasterizerConfig()) == {}
+    assert PRESETS["exact"] == PRESETS["default"] == RasterizerConfig()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("switch", EXACT_OFF)
+def test_exact_switches_change_no_bit(default_device: Device, switch: str, name: str) -> None:
+    device = shaped(default_device, 8, 1)
+    wanted, got = run(device, name, RasterizerConfig()), run(device, name, EXACT_OFF[switch])
+    for array in ("image", "transmittance"):
+        assert_same_bits(getattr(got.frame.blended, array).get(), getattr(wanted.frame.blended, array).get(), array)
+    wanted_gradients, got_gradients = gradients(wanted), gradients(got)
+    for array, values in wanted_gradients.items():
+        # a sum that is zero may be so with either sign
+        assert_same_bits(got_gradients[array] + np.float32(0), values + np.float32(0), array)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 64), (4, 1), (8, 16)], ids=str)
+def test_exact_switches_in_every_shape(default_device: Device, shape: tuple[int, int]) -> None:
+    wanted = run(shaped(default_device, *shape), "saturating", RasterizerConfig())
+    got = run(shaped(default_device, *shape), "saturating", EXACT_OFF["all"])
+    assert_same_bits(got.frame.blended.image.get(), wanted.frame.blended.image.get())
+
+
+def test_switches_that_are_off_do_more_work(default_device: Device) -> None:
+    device = shaped(default_device, 8, 1)
+    pairs = {
+        name: run(device, "cloud", config).frame.lists.gaussian_from_sorted.shape[0]
+        for name, config in {"default": RasterizerConfig(), **EXACT_OFF}.items()
+    }
+    assert pairs["constant extent"] > pairs["default"]
+    assert pairs["box"] > pairs["default"]
+    assert pairs["all"] > max(pairs["box"], pairs["constant extent"])
+    assert pairs["rows"] == pairs["default"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("switch", APPROXIMATE)
+def test_approximate_switches(default_device: Device, switch: str, name: str) -> None:
+    """3sigma leaves out alpha of at most exp(-4.5) a Gaussian; alpha_min up to 2/255 a Gaussian, of which several lie
+    at a pixel; transmittance_min the last Gaussian of a pixel, whose weight is at most 1e-3 / (1 - 0.99). Bands of SH
+    are worth what they hold."""
+    device = shaped(default_device, 8, 1)
+    config, bound = APPROXIMATE[switch]
+    wanted, got = run(device, name, RasterizerConfig()), run(device, name, config)
+    difference = np.abs(got.image - wanted.image).max()
+    assert difference <= bound
+    if name == "cloud":
+        assert difference > 0, "the switch does something"
+    assert all(np.isfinite(values).all() for values in gradients(got).values())
+
+
+def test_approximate_switches_in_every_shape_and_on_every_device(device: Device, default_device: Device) -> None:
+    config = RasterizerConfig("3sigma", sh_degree_limit=1, alpha_min=3 / 255, transmittance_min=1e-2)
+    wanted = run(shaped(default_device, 8, 1), "cloud", config)
+    for lanes, items in ((1, 64), (8, 1)):
+        got = run(shaped(device, lanes, items), "cloud", config)
+        assert_same_bits(got.frame.blended.image.get(), wanted.frame.blended.image.get())
+
+
+def test_gradient_of_bands_left_out_is_zero(default_device: Device) -> None:
+    got = gradients(run(shaped(default_device, 8, 1), "overlap", RasterizerConfig(sh_degree_limit=1)))["sh"]
+    assert got[:, 1:4].any()
+    assert not got[:, 4:].any()
+
+
+@pytest.mark.parametrize(
+    "change", [{"sh_degree_limit": 4}, {"alpha_min": 0.0}, {"alpha_min": float("nan")}, {"transmittance_min": 1.0}]
+)
+def test_values_that_make_no_sense(change: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="expected"):
+        replace(RasterizerConfig(), **change).check()
