@@ -52,13 +52,12 @@ def find_images(folder: Path) -> list[Path]:
 def require_images(paths: Iterable[Path], listed_in: Path) -> None:
     """Raise InputError that names the files of `paths` that do not exist; `listed_in` is what lists them."""
     if missing := [path for path in paths if not path.is_file()]:
-        raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {name_some(missing)}")
+        raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {name_all(missing)}")
 
 
-def name_some(paths: Sequence[Path]) -> str:
-    """The first ten paths, and how many more there are, for a message of one line."""
-    more = f" and {len(paths) - 10} more" if len(paths) > 10 else ""
-    return ", ".join(str(path) for path in paths[:10]) + more
+def name_all(paths: Sequence[Path]) -> str:
+    """The paths, for a message of one line; however many, as each has to be looked for."""
+    return ", ".join(str(path) for path in paths)
 
 
 def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:

@@ -99,7 +99,8 @@ class Run:
         return cls(path, config, scene)
 
     def save_model(self, gaussians: Gaussians) -> None:
-        """Write model.ply."""
+        """Write model.ply. An evaluation of an earlier model goes first: it would be taken for one of this."""
+        self.eval_path.unlink(missing_ok=True)
         gaussians.save(self.model_path)
 
     def write_eval(self, result: Mapping[str, Any]) -> None:

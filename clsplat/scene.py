@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from clsplat import colmap, transforms
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.images import downscale, find_images, image_size, name_some, read_image, require_images
+from clsplat.images import downscale, find_images, image_size, name_all, read_image, require_images
 from clsplat.transforms import Frame
 from clsplat.undistort import Lens, undistort
 
@@ -105,6 +105,13 @@ class Scene:
     def test_views(self) -> list[View]:
         """Views held out, by name."""
         return [view for view in self.views if view.split == "test"]
+
+    def require_training_views(self) -> list[View]:
+        """Views to train on. Raises InputError where there are none."""
+        if not self.train_views:
+            count = len(self.views)
+            raise InputError(f"{self.name}: all {count} views are held out; use --test-every 0 to hold out none")
+        return self.train_views
 
     def check_pictures(self) -> None:
         """Decode every picture once, so that a cut one is named before training and not in the middle of it.
@@ -293,7 +300,7 @@ def _read_transforms(path: Path, kind: Kind, heard: list[str]) -> transforms.Tra
 def _warn_of_unlisted(present: list[Path], frames: list[Frame], listed_in: Path, heard: list[str]) -> None:
     listed = {frame.path for frame in frames}
     if unlisted := sorted(path for path in present if path not in listed):
-        heard.append(f"{listed_in}: does not list {len(unlisted)} image(s) that are there: {name_some(unlisted)}")
+        heard.append(f"{listed_in}: does not list {len(unlisted)} image(s) that are there: {name_all(unlisted)}")
 
 
 def _view(frame: Frame, split: Split, resolution: int, smaller: list[Path]) -> View:

@@ -54,7 +54,10 @@ class Photographs:
                 max(camera.width // factor, 1), max(camera.height // factor, 1)
             )
             levels = np.rint(image * 255)
-            exact = np.array_equal((levels / np.float32(255)).astype(np.float32), image) and levels.max() <= 255
+            exact = (
+                np.array_equal((levels / np.float32(255)).astype(np.float32), image)
+                and 0 <= levels.min() <= levels.max() <= 255
+            )
             self._held[index] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
         return self._held[index]
 
@@ -64,9 +67,7 @@ class Trainer:
 
     def __init__(self, scene: Scene, config: TrainConfig, device: Device, initial: Gaussians | None = None) -> None:
         self.scene, self.config, self.device = scene, config, device
-        self.views = scene.train_views
-        if not self.views:
-            raise InputError(f"{scene.name}: no training views, use a larger --test-every")
+        self.views = scene.require_training_views()
         self.rasterizer = Rasterizer(device, config.rasterizer)
         self.photographs = Photographs(self.views)
         self.rng = np.random.default_rng(config.seed)

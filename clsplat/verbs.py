@@ -126,7 +126,11 @@ def train(verb: Train) -> int:
         raise InputError("SCENE is missing, expected the folder of the scene to train on")
     device = open_device(verb.device)
     scene = _load_scene(source, verb.config.resolution, verb.config.test_every)
-    scene.check_pictures()
+    _check_scene(scene)
+    if verb.resume and (done := max((step for step, _ in earlier.checkpoints()), default=0)) > verb.config.iterations:
+        raise InputError(
+            f"--iterations {verb.config.iterations}: {verb.output} is at step {done} already, expected more"
+        )
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
     print(
         f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
@@ -378,6 +382,20 @@ def _load_model(path: Path) -> Gaussians:
     if not trained.model_path.exists():
         raise InputError(f"{trained.model_path}: no such file, the run has not written its model yet")
     return Gaussians.load(trained.model_path)
+
+
+def _check_scene(scene: Scene) -> None:
+    """What would end a training later on: no views to train on, a view too small to measure, a picture that is cut."""
+    from clsplat.metrics import SSIM_WINDOW
+
+    scene.require_training_views()
+    for view in scene.test_views:
+        if min(view.camera.width, view.camera.height) < SSIM_WINDOW:
+            raise InputError(
+                f"{view.path}: is {view.camera.width} x {view.camera.height} at this --resolution, expected at least "
+                f"{SSIM_WINDOW} pixels a side to measure SSIM"
+            )
+    scene.check_pictures()
 
 
 def _load_scene(path: Path, resolution: int, test_every: int) -> Scene:

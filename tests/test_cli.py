@@ -41,6 +41,12 @@ class FakeView:
 
 
 @dataclass
+class FakeDevice:
+    name: str = "processor"
+    driver: str = "OpenCL 3.0 driver 1.0"
+
+
+@dataclass
 class Pipeline:
     """What the fakes were asked for, and what they are to do."""
 
@@ -59,6 +65,22 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
     class Scene:
         views: list[FakeView]
         warnings: list[str]
+        name: str = "photos"
+        points: tuple[float, ...] = ()
+
+        @property
+        def train_views(self) -> list[FakeView]:
+            return [view for view in self.views if view.split == "train"]
+
+        @property
+        def test_views(self) -> list[FakeView]:
+            return [view for view in self.views if view.split == "test"]
+
+        def require_training_views(self) -> list[FakeView]:
+            return self.train_views
+
+        def check_pictures(self) -> None:
+            """Real pictures are cut in test_scene.py."""
 
     @dataclass
     class Result:
@@ -75,7 +97,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
 
     class Renderer:
         def __init__(self, device: object, config: object = None) -> None:
-            assert device == "device"
+            assert isinstance(device, FakeDevice)
             assert config == RasterizerConfig()
 
         def render(self, gaussians: Gaussians, camera: Camera, background: tuple[float, ...] = (0, 0, 0)) -> Result:
@@ -90,7 +112,9 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         views = [FakeView("0.jpg", "test"), FakeView("1.jpg", "train")]
         return Scene(views if test_every else views[1:], ["one photo is dark"])
 
-    def train(scene: Scene, config: TrainConfig, *, device: str, run: Run, resume: bool, on_step: Any) -> Gaussians:
+    def train(
+        scene: Scene, config: TrainConfig, *, device: FakeDevice, run: Run, resume: bool, on_step: Any
+    ) -> Gaussians:
         pipe.calls.append(("train", config.iterations, config.seed, resume))
         on_step(Report(1))
         pipe.training(run, on_step)
@@ -100,10 +124,10 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         run.write_eval({"step": 1, "gaussians": 4, "seconds": 2.5, "mean": {"psnr": 20.0, "ssim": 0.5}, "views": [{}]})
         return gaussians
 
-    def open_device(selector: str | None) -> str:
+    def open_device(selector: str | None) -> FakeDevice:
         if selector == "nosuch":
             raise DeviceError("--device nosuch: no such device")
-        return "device"
+        return FakeDevice()
 
     def write_image(path: Path, image: np.ndarray, *, alpha: str = "straight") -> None:
         assert image.shape[2] == 3 or alpha == "associated"

@@ -500,3 +500,16 @@ def test_an_unknown_device(verb: str, scene: Path, trained: Path, tmp_path: Path
     line = one_error(capfd)
     assert "--device abacus: no such device; there are 0: " in line
     assert not list(tmp_path.iterdir())
+
+
+def test_overwriting_with_what_cannot_be_trained_keeps_the_run(scene: Path, tmp_path: Path, capfd: Capture) -> None:
+    run = tmp_path / "run"
+    assert train(scene, run, CONFIG) == 0
+    model = (run / "model.ply").read_bytes()
+    for wrong in (["--test-every", "1"], ["--resolution", "8"]):
+        capfd.readouterr()
+        assert main(["train", str(scene), "-o", str(run), "--overwrite", "--iterations", "3", *wrong]) == 2
+        assert len(capfd.readouterr().err.splitlines()) == 1
+        assert (run / "model.ply").read_bytes() == model
+    assert main(["train", "-o", str(run), "--resume", "--iterations", "3"]) == 2
+    assert "is at step 40 already" in capfd.readouterr().err

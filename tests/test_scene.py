@@ -145,12 +145,13 @@ def test_missing_and_unlisted_pictures_are_named(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_many_missing_pictures_are_counted(tmp_path: Path) -> None:
+def test_every_missing_picture_is_named(tmp_path: Path) -> None:
     make_colmap(tmp_path, 20)
     for index in range(2, 19):
         (tmp_path / "images" / f"{index}.png").unlink()
-    with pytest.raises(InputError, match=r"lists 17 image\(s\) that are missing: .*10\.png, .*/2\.png and 7 more"):
+    with pytest.raises(InputError, match=r"lists 17 image\(s\) that are missing: ") as caught:
         load_scene(tmp_path)
+    assert all(f"/images/{index}.png" in str(caught.value) for index in range(2, 19))
 
 
 def test_undecodable_pictures_are_found_before_training(tmp_path: Path) -> None:

@@ -17,8 +17,10 @@ from clsplat.reference.project import ALPHA_MIN, Projected
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-ALPHA_MAX = 0.99
-TRANSMITTANCE_MIN = 1e-4
+ALPHA_MAX = float(np.float32(0.99))
+TRANSMITTANCE_MIN = float(np.float32(1e-4))
+"""The kernels' constants to the bit: two layers at the cap leave (1 - 0.99)^2, in decimals the limit itself."""
+
 
 BOX_SLACK = 0.1
 """Added to the reach q <= 2 ln(255 o) of a Gaussian's box, so that alphas down to 5 % under 1/255 are looked at

@@ -103,3 +103,17 @@ def test_saturated_pixels_stop_where_the_contract_says(shaped_device: Device) ->
     got = run.crop(run.frame.blended.transmittance.get())
     assert_close(got[clear], wanted.transmittance[clear], relative=1e-4, absolute=1e-7)
     assert got.min() > 1e-4, "the Gaussian that would end a pixel is not added"
+
+
+def test_stacked_opaque_gaussians(shaped_device: Device) -> None:
+    """Two layers at the cap leave (1 - 0.99)^2, a hair under the limit in float32: both sides decide alike."""
+    gaussians, camera = scenes.one(96, 64)
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    arrays = {name: np.repeat(getattr(gaussians, name), 3, axis=0) for name in names}
+    arrays["means"][:, 2] += np.float32([0, 0.5, 1])
+    arrays["opacity_logits"][:] = 12
+    arrays["sh"][1] = 0.8
+    scene = (replace(gaussians, **arrays), camera)
+    wanted = reference.forward(*scene, BACKGROUND).blended.image
+    assert_close_images(Pipeline.run(shaped_device, scene).image, wanted, 2e-5, flips=1e-3)
+    assert np.abs(wanted - wanted[0, 0]).max() > 0.1, "the Gaussians are to be seen"
