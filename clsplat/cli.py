@@ -194,6 +194,16 @@ DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line, `sys.argv` if none is given; returns the exit status."""
+    try:
+        status = _run(arguments)
+        sys.stdout.flush()  # here and not at the interpreter's end, where a reader that has gone would be a traceback
+    except BrokenPipeError:  # as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return status
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = os.environ.get("CLSPLAT_DEBUG", "") not in ("", "0")
     with warnings.catch_warnings():
@@ -217,9 +227,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 traceback.print_exc()
             print("clsplat: interrupted", file=sys.stderr)
             return 130
-        except BrokenPipeError:  # the reader of our output has gone, as `| head` does
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 1
+        except BrokenPipeError:
+            raise
         except (ClsplatError, OSError, MemoryError) as error:
             if debug:
                 traceback.print_exc()

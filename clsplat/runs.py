@@ -99,8 +99,7 @@ class Run:
         return cls(path, config, scene)
 
     def save_model(self, gaussians: Gaussians) -> None:
-        """Write model.ply. An evaluation of an earlier model goes first: it would be taken for one of this."""
-        self.eval_path.unlink(missing_ok=True)
+        """Write model.ply."""
         gaussians.save(self.model_path)
 
     def write_eval(self, result: Mapping[str, Any]) -> None:
@@ -110,9 +109,12 @@ class Run:
     def model_record(self) -> dict[str, Any]:
         """`step` and `seconds` of model.ply, where they are known.
 
-        From eval.json, which is written with the model: a run that was resumed and stopped has later metrics.
+        From eval.json, which is written after the model: a run that was resumed and stopped has later metrics. An
+        older eval.json is of the model before, as when the evaluation was interrupted.
         """
         with suppress(OSError, ValueError):
+            if self.eval_path.stat().st_mtime_ns < self.model_path.stat().st_mtime_ns:
+                raise ValueError("of an earlier model")
             record = json.loads(self.eval_path.read_text("utf-8"))
             if isinstance(record, dict) and isinstance(record.get("step"), int):
                 return record

@@ -2,6 +2,7 @@
 """The run folder: what may be put where, settings there and back, metrics and checkpoints after a crash."""
 
 import json
+import os
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -132,8 +133,12 @@ def test_what_the_model_was_trained_for(tmp_path: Path) -> None:
     assert run.model_record() == {}
     run.append_metrics({"step": 7, "seconds": 1.0})
     assert run.model_record()["step"] == 7
+    run.save_model(random_gaussians(3))
     run.write_eval({"step": 5, "seconds": 0.5})
     assert run.model_record() == {"step": 5, "seconds": 0.5}
+    os.utime(run.eval_path, (1, 1))  # of the model before: an interrupted evaluation leaves it so
+    assert run.model_record()["step"] == 7
+    os.utime(run.eval_path)
     run.eval_path.write_text('{"st')
     assert run.model_record()["step"] == 7
 

@@ -450,7 +450,7 @@ def test_nothing_left_stops_it(scene: Scene, default_device: Device) -> None:
 
 def test_no_training_views(scene: Scene, default_device: Device) -> None:
     nothing = Scene("empty", scene.test_views, scene.points, scene.point_colors, scene.bounds)
-    with pytest.raises(InputError, match="empty: all 0 views are held out"):
+    with pytest.raises(InputError, match="empty: all 2 views are held out; use --test-every 0"):
         train(nothing, CONFIG, device=default_device)
 
 
