@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from models import random_gaussians
 
 import clsplat
 from clsplat.config import DensityConfig, OptimiserConfig, TrainConfig
