@@ -6,6 +6,7 @@
 // moments of g = alpha * dL/dalpha; they are taken about the tile's centre, where no ellipse is far off in units of its
 // own width, and moved to (u, v) at the end.
 #include "shared/math.h"
+#include "shared/splat.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
 #include "shared/tile.h"
@@ -13,11 +14,6 @@
 #include "shared/prefetch.h"
 
 #define CENTRE (0.5f * TILE - 0.5f)
-#ifdef ABSOLUTE_GRADIENTS
-#define SLOT_STRIDE SLOT_SIZE
-#else
-#define SLOT_STRIDE SLOT_PLAIN
-#endif
 
 #if ITEMS > 1
 // slot[field] = the sum of value over the group, in a fixed tree.

@@ -1,7 +1,6 @@
 // What adaptive density control (Kerbl et al. 2023, section 5) asks of the device: statistics and moving rows.
 #include "shared/math.h"
-
-#define WHITEN 0.84932180028801904f // sqrt(log2(e) / 2)
+#include "shared/splat.h"
 
 // One work-item a Gaussian; those with tiles are seen. screen (n, 2): gradient of the mean on the image in pixels;
 // x_scale, y_scale to NDC -> gradient_sums (n): norms added up (docs/gradients.md, equation 43); seen (n): views;

@@ -1,11 +1,10 @@
 // Projection (Kerbl et al. 2023, section 4; docs/gradients.md, equations 1 to 13 and 44 to 47): each Gaussian to its
 // ellipse, colour, depth and number of tiles. One work-item a Gaussian.
 #include "shared/math.h"
+#include "shared/splat.h"
 #include "shared/tile.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
-
-#define WHITEN 0.84932180028801904f // sqrt(log2(e) / 2)
 
 // means (n, 3), quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n, 3),
 // sh_rest (n, coefficients - 1, 3); splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.

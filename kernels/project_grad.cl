@@ -1,15 +1,9 @@
 // The gradient of projection: sums a Gaussian's slots in the order of its tiles, then the chain rule back to its
 // parameters (docs/gradients.md, equations 25 to 41 in the forms 50 to 52). One work-item a Gaussian.
 #include "shared/math.h"
+#include "shared/splat.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
-
-#ifdef ABSOLUTE_GRADIENTS
-#define SLOT_STRIDE SLOT_SIZE
-#else
-#define SLOT_STRIDE SLOT_PLAIN
-#endif
-#define INVERSE_WHITEN2 1.38629436111989062f // 2 ln 2: the slots' moments are of W times sqrt(log2(e) / 2)
 
 // tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project
 // -> gradients of the parameters (same shapes; rows of Gaussians that are not visible are left as they are) and of

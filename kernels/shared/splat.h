@@ -1,0 +1,12 @@
+// What the kernels that write and read a splat or a slot must agree on, beside the layouts on top of every text.
+
+// A splat's L11, L12 and L22 are the whitening W times this, sqrt(log2(e) / 2); the slots' moments are of that product.
+#define WHITEN 0.84932180028801904f
+#define INVERSE_WHITEN2 1.38629436111989062f // 1 / WHITEN^2 = 2 ln 2
+
+// Floats from one pair's slot to the next.
+#ifdef ABSOLUTE_GRADIENTS
+#define SLOT_STRIDE SLOT_SIZE
+#else
+#define SLOT_STRIDE SLOT_PLAIN
+#endif
