@@ -84,6 +84,10 @@ class OptimiserConfig:
     """Rate of the log scales."""
     quaternions_rate: float = 1e-3
     """Rate of the raw quaternions."""
+    cooldown: int = 0
+    """Over the last so many steps every rate falls, exponentially, to `cooldown_to` of itself; 0 for none."""
+    cooldown_to: float = 0.1
+    """What is left of every rate after the cooldown's last step."""
     beta1: float = 0.9
     """Decay of Adam's first moment."""
     beta2: float = 0.999
@@ -129,7 +133,7 @@ class TrainConfig:
     """One training run."""
 
     iterations: int = 30_000
-    """Number of steps; learning rates and density control do not depend on it."""
+    """Number of steps; learning rates and density control do not depend on it, but for --optimiser.cooldown."""
     seed: int = 0
     """Seed of everything random; the same seed on the same device gives the same model."""
     sh_degree: int = 3
@@ -172,5 +176,9 @@ class TrainConfig:
             if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
                 raise InputError(f"--{name} {','.join(map(str, steps))}: expected steps from 1 up, in order")
         self.rasterizer.check()
+        if self.optimiser.cooldown < 0:
+            raise InputError(f"--optimiser.cooldown {self.optimiser.cooldown}: expected at least 0")
+        if not 0 < self.optimiser.cooldown_to <= 1:
+            raise InputError(f"--optimiser.cooldown-to {self.optimiser.cooldown_to}: expected more than 0, at most 1")
         if not self.density.split_factor > 1:
             raise InputError(f"--density.split-factor {self.density.split_factor}: expected more than 1")

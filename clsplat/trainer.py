@@ -141,11 +141,13 @@ class Trainer:
         return result
 
     def rates(self) -> dict[str, float]:
-        """Learning rate of each group at this step; the means' falls exponentially."""
+        """Learning rate of each group at this step; the means' falls exponentially, all of them in the cooldown."""
         optimiser = self.config.optimiser
+        into = optimiser.cooldown - max(self.config.iterations - self.step, 0)
+        cooled = optimiser.cooldown_to ** (into / optimiser.cooldown) if into > 0 else 1.0
         fraction = min(self.step / optimiser.means_rate_steps, 1.0)
         means_rate = optimiser.means_rate ** (1 - fraction) * optimiser.means_rate_end**fraction
-        return {
+        rates = {
             "means": means_rate * self.scene.extent,
             "quaternions": optimiser.quaternions_rate,
             "log_scales": optimiser.scales_rate,
@@ -153,6 +155,7 @@ class Trainer:
             "sh_dc": optimiser.sh_dc_rate,
             "sh_rest": optimiser.sh_rest_rate,
         }
+        return {group: rate * cooled for group, rate in rates.items()}
 
     def _factor(self) -> int:
         return 1 << sum(self.step <= end for end in self.config.warmup)

@@ -1,20 +1,22 @@
 // Blending front to back until alpha saturates (Kerbl et al. 2023, section 6 and algorithm 2). A group owns a tile.
-// On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each only the rows that its ellipse reaches,
-// LANES pixels at a time; on a GPU (LANES == 1) each work-item has pixels of its own. The bits are the same.
+// On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each only the cells that its ellipse reaches and
+// that have a pixel left to fill; on a GPU (LANES == 1) each work-item has pixels of its own. The bits are the same.
 //
-// Transmittance is kept negative in a pixel that is finished, which no test then lets continue. Each mask comes from
-// one comparison: of several joined by & some compilers make 16-bit lanes and back.
+// `t` is the transmittance of pixels that go on and 0 in those that are finished, whose own is put aside in `kept`: there
+// no alpha has a weight, and no test is needed. Each mask comes from one comparison: of several joined by & some
+// compilers make 16-bit lanes and back.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
 #include "shared/tile.h"
+#include "shared/cells.h"
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
 #ifdef NO_EARLY_STOP // RasterizerConfig.early_stop: go on behind an opaque tile, to no effect
-#define GOES_ON(alive) 1
+#define GOES_ON(open) 1
 #else
-#define GOES_ON(alive) ((alive) > 0)
+#define GOES_ON(open) ((open) != 0)
 #endif
 #ifdef COUNT_PAIRS // a build for `clsplat bench`
 #define COUNT(statements) statements
@@ -36,56 +38,54 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
   const int tile = get_group_id(0);
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
   const int begin = ranges[2 * tile], end = ranges[2 * tile + 1];
-  floatL t[OWNED], red[OWNED], green[OWNED], blue[OWNED];
+  PIXEL_TABLES
+  floatL t[OWNED], kept[OWNED], red[OWNED], green[OWNED], blue[OWNED];
   intL stop[OWNED];
   COUNT(intL added = (intL)(0); uint evaluated = 0;)
 
-  int alive = 0;
+  Open open = 0;
   for (int k = 0; k < OWNED; ++k) {
-    const int vector = get_local_id(0) + k * ITEMS;
-    const floatL x = (floatL)(tile_x + (vector % HALVES) * LANES) + LANE_INDEX;
-    const int inside = tile_y + vector / HALVES < height;
-    t[k] = inside ? (x < (floatL)(width) ? (floatL)(1.0f) : (floatL)(-1.0f)) : (floatL)(-1.0f);
+    const int cell = get_local_id(0) + k * ITEMS;
+    const floatL y = (floatL)(tile_y) + PIXELS_Y(cell);
+    t[k] = (floatL)(tile_x) + PIXELS_X(cell) < (floatL)(width) ? (floatL)(1.0f) : (floatL)(0.0f);
+    t[k] = y < (floatL)(height) ? t[k] : (floatL)(0.0f);
+    kept[k] = (floatL)(1.0f);
     red[k] = green[k] = blue[k] = (floatL)(0.0f);
     stop[k] = t[k] > 0.0f ? (intL)(end) : (intL)(0);
-    alive += ANYL(t[k] > 0.0f);
+    if (ANYL(t[k] > 0.0f)) OPEN_CELL(open, cell);
   }
 
-  for (int i = begin; i < end && GOES_ON(alive); ++i) {
-    PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[min(i + AHEAD, end - 1)]);
+  for (int i = begin; i < end && GOES_ON(open); ++i) {
+    PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i + AHEAD < end ? i + AHEAD : end - 1]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
-    int y0, y1, h0, h1;
-    tile_box(splat, (float)tile_x, (float)tile_y, &y0, &y1, &h0, &h1);
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     const float log2o = splat[SPLAT_LOG2O];
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
     const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
-    FOR_PARTS(part) {
-      const floatL offset_u = l11 * (mx - ((floatL)(part * LANES) + LANE_INDEX));
-      FOR_ROWS(row, k, part) {
-        const float dy = my - (float)row;
-        const float v = l22 * dy;
+    const Reach reach = reach_of(splat, tile_x, tile_y);
+    FOR_CELLS(cell, IN_OPEN(reach, open)) {
+      const int k = cell / ITEMS;
+      const floatL dy = my - AT_Y(cell);
+      const floatL u = l11 * (mx - AT_X(cell)) + l12 * dy;
+      const floatL power = log2_alpha(u, l22 * dy, log2o);
+      COUNT(evaluated += LANES;)
+      if (REACHES(power)) {
         const floatL before = t[k];
-        const floatL open = log2_alpha(offset_u, l12 * dy, fma1(-v, v, log2o));
-        const floatL power = before > 0.0f ? open : (floatL)(FINISHED);
-        COUNT(evaluated += LANES;)
-        if (REACHES(open, power)) {
-          floatL alpha = exp2L(power);
-          alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
-          alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);
-          const floatL after = fmaL(-before, alpha, before);
-          const floatL weight = after > TRANSMITTANCE_MIN ? before * alpha : (floatL)(0.0f);
-          COUNT(added += weight > 0.0f ? (intL)(1) : (intL)(0);)
-          red[k] = fmaL(weight, (floatL)(c_red), red[k]);
-          green[k] = fmaL(weight, (floatL)(c_green), green[k]);
-          blue[k] = fmaL(weight, (floatL)(c_blue), blue[k]);
-          t[k] = after > TRANSMITTANCE_MIN ? after : before;
-          const floatL ended = after > TRANSMITTANCE_MIN ? (floatL)(0.0f) : before;
-          if (ANYL(ended > 0.0f)) {
-            t[k] = ended > 0.0f ? -before : t[k];
-            stop[k] = ended > 0.0f ? (intL)(i) : stop[k];
-            if (!ANYL(t[k] > 0.0f)) --alive;
-          }
+        floatL alpha = exp2L(power);
+        alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
+        alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);
+        const floatL after = fmaL(-before, alpha, before);
+        const floatL weight = after > TRANSMITTANCE_MIN ? before * alpha : (floatL)(0.0f);
+        COUNT(added += weight > 0.0f ? (intL)(1) : (intL)(0);)
+        red[k] = fmaL(weight, (floatL)(c_red), red[k]);
+        green[k] = fmaL(weight, (floatL)(c_green), green[k]);
+        blue[k] = fmaL(weight, (floatL)(c_blue), blue[k]);
+        t[k] = after > TRANSMITTANCE_MIN ? after : (floatL)(0.0f);
+        const floatL ended = after > TRANSMITTANCE_MIN ? (floatL)(0.0f) : before;
+        if (ANYL(ended > 0.0f)) {
+          kept[k] = ended > 0.0f ? before : kept[k];
+          stop[k] = ended > 0.0f ? (intL)(i) : stop[k];
+          if (!ANYL(t[k] > 0.0f)) CLOSE_CELL(open, cell);
         }
       }
     }
@@ -106,18 +106,15 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
   const size_t stride = (size_t)tiles_x * TILE;
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
   for (int k = 0; k < OWNED; ++k) {
-    const int vector = get_local_id(0) + k * ITEMS;
-    const size_t pixel = stride * (tile_y + vector / HALVES) + tile_x + (vector % HALVES) * LANES;
+    const int cell = get_local_id(0) + k * ITEMS;
+    const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
     const intL shown = (stop[k] > 0) | (t[k] > 0.0f);
-    const floatL left = shown ? fabs(t[k]) : (floatL)(0.0f);
-    STOREL(fmaL(left, (floatL)(background[0]), red[k]), image + pixel);
-    STOREL(fmaL(left, (floatL)(background[1]), green[k]), image + plane + pixel);
-    STOREL(fmaL(left, (floatL)(background[2]), blue[k]), image + 2 * plane + pixel);
-    STOREL(fabs(t[k]), transmittance + pixel);
-#if LANES == 1
-    stops[pixel] = stop[k];
-#else
-    CAT(vstore, LANES)(stop[k], 0, stops + pixel);
-#endif
+    const floatL at_end = t[k] > 0.0f ? t[k] : kept[k];
+    const floatL left = shown ? at_end : (floatL)(0.0f);
+    STORE_CELL(float, fmaL(left, (floatL)(background[0]), red[k]), image + pixel, stride);
+    STORE_CELL(float, fmaL(left, (floatL)(background[1]), green[k]), image + plane + pixel, stride);
+    STORE_CELL(float, fmaL(left, (floatL)(background[2]), blue[k]), image + 2 * plane + pixel, stride);
+    STORE_CELL(float, at_end, transmittance + pixel, stride);
+    STORE_CELL(int, stop[k], stops + pixel, stride);
   }
 }

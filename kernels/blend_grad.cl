@@ -3,17 +3,17 @@
 //
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
-// moments of g = alpha * dL/dalpha; they are taken about the tile's centre, where no ellipse is far off in units of its
-// own width, and moved to (u, v) at the end.
+// moments of g = alpha * dL/dalpha in (u, v).
 #include "shared/math.h"
 #include "shared/splat.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
 #include "shared/tile.h"
+#include "shared/cells.h"
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#define CENTRE (0.5f * TILE - 0.5f)
+#define NOT_YET -100.0f // log2 of an alpha that reaches nothing, for pixels that ended before this Gaussian
 
 #if ITEMS > 1
 // slot[field] = the sum of value over the group, in a fixed tree.
@@ -49,24 +49,20 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
   const size_t stride = (size_t)tiles_x * TILE;
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
 
+  PIXEL_TABLES
   floatL t[OWNED], behind[OWNED], g_red[OWNED], g_green[OWNED], g_blue[OWNED];
   intL stop[OWNED];
   int last = begin;
   for (int k = 0; k < OWNED; ++k) {
-    const int vector = get_local_id(0) + k * ITEMS;
-    const size_t pixel = stride * (tile_y + vector / HALVES) + tile_x + (vector % HALVES) * LANES;
-    t[k] = LOADL(transmittance + pixel);
-    g_red[k] = LOADL(image_gradient + pixel);
-    g_green[k] = LOADL(image_gradient + plane + pixel);
-    g_blue[k] = LOADL(image_gradient + 2 * plane + pixel);
+    const int cell = get_local_id(0) + k * ITEMS;
+    const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
+    t[k] = LOAD_CELL(float, transmittance + pixel, stride);
+    g_red[k] = LOAD_CELL(float, image_gradient + pixel, stride);
+    g_green[k] = LOAD_CELL(float, image_gradient + plane + pixel, stride);
+    g_blue[k] = LOAD_CELL(float, image_gradient + 2 * plane + pixel, stride);
     behind[k] = t[k] * (g_red[k] * background[0] + g_green[k] * background[1] + g_blue[k] * background[2]);
-#if LANES == 1
-    stop[k] = stops[pixel];
-    last = max(last, stop[k]);
-#else
-    stop[k] = CAT(vload, LANES)(0, stops + pixel);
-    for (int lane = 0; lane < LANES; ++lane) last = max(last, stops[pixel + lane]);
-#endif
+    stop[k] = LOAD_CELL(int, stops + pixel, stride);
+    last = max(last, maxL(stop[k]));
   }
 #if ITEMS > 1
   if (get_local_id(0) == 0) group_last = begin;
@@ -85,77 +81,62 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
   }
 
   for (int i = last - 1; i >= begin; --i) {
-    PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[max(i - AHEAD, begin)]);
-    PREFETCH(slots + (size_t)SLOT_STRIDE * slot_from_sorted[max(i - AHEAD, begin)]);
+    PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i - AHEAD > begin ? i - AHEAD : begin]);
+    PREFETCH(slots + (size_t)SLOT_STRIDE * slot_from_sorted[i - AHEAD > begin ? i - AHEAD : begin]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
     __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[i];
-    int y0, y1, h0, h1;
-    tile_box(splat, (float)tile_x, (float)tile_y, &y0, &y1, &h0, &h1);
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     const float log2o = splat[SPLAT_LOG2O];
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
     const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
-    // (49), in (u, v) with y from the tile's centre row: u = uc - l12 y, v = vc - l22 y.
-    const float uy = l12 * (my - CENTRE), vc = l22 * (my - CENTRE);
+    const Reach reach = reach_of(splat, tile_x, tile_y);
     const floatL zero = (floatL)(0.0f);
-    floatL m0 = zero, m1 = zero, m2 = zero, mu = zero, mu1 = zero, muu = zero;
+    floatL sum_g = zero, sum_gu = zero, sum_gv = zero, sum_guu = zero, sum_guv = zero, sum_gvv = zero;
     floatL d_red = zero, d_green = zero, d_blue = zero;
 #ifdef ABSOLUTE_GRADIENTS
     floatL abs_x = zero, abs_y = zero;
 #endif
-    FOR_PARTS(part) {
-      const floatL offset_u = l11 * (mx - ((floatL)(part * LANES) + LANE_INDEX));
-      floatL s0 = zero, s1 = zero, s2 = zero;
-      FOR_ROWS(row, k, part) {
-        const float dy = my - (float)row;
-        const float v = l22 * dy;
-        const floatL open = log2_alpha(offset_u, l12 * dy, fma1(-v, v, log2o));
-        const floatL power = (intL)(i) < stop[k] ? open : (floatL)(FINISHED);
-        if (REACHES(open, power)) {
-          const floatL uncapped = power >= LOG2_ALPHA_MIN ? exp2L(power) : zero;
-          const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
-          const floatL inverse = 1.0f / (1.0f - alpha);
-          const floatL before = t[k] * inverse;
-          const floatL shade = fmaL(g_red[k], (floatL)(c_red), fmaL(g_green[k], (floatL)(c_green), g_blue[k] * c_blue));
-          const floatL weight = alpha * before;
-          const floatL d_alpha = fmaL(before, shade, -(behind[k] * inverse));
-          const floatL g = uncapped < ALPHA_MAX ? alpha * d_alpha : zero;
-          behind[k] = fmaL(weight, shade, behind[k]);
-          t[k] = before;
-          d_red = fmaL(weight, g_red[k], d_red);
-          d_green = fmaL(weight, g_green[k], d_green);
-          d_blue = fmaL(weight, g_blue[k], d_blue);
-          const float y = (float)row - CENTRE;
-          const floatL gy = g * y;
-          s0 += g;
-          s1 += gy;
-          s2 = fmaL(gy, (floatL)(y), s2);
+    FOR_CELLS(cell, reach) {
+      const int k = cell / ITEMS;
+      const floatL dy = my - AT_Y(cell);
+      const floatL u = l11 * (mx - AT_X(cell)) + l12 * dy, v = l22 * dy;
+      const floatL all = log2_alpha(u, v, log2o);
+      const floatL power = (intL)(i) < stop[k] ? all : (floatL)(NOT_YET);
+      if (REACHES(power)) {
+        const floatL uncapped = power >= LOG2_ALPHA_MIN ? exp2L(power) : zero;
+        const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
+        const floatL inverse = 1.0f / (1.0f - alpha);
+        const floatL before = t[k] * inverse;
+        const floatL shade = fmaL(g_red[k], (floatL)(c_red), fmaL(g_green[k], (floatL)(c_green), g_blue[k] * c_blue));
+        const floatL weight = alpha * before;
+        const floatL d_alpha = fmaL(before, shade, -(behind[k] * inverse));
+        const floatL g = uncapped < ALPHA_MAX ? alpha * d_alpha : zero;
+        behind[k] = fmaL(weight, shade, behind[k]);
+        t[k] = before;
+        d_red = fmaL(weight, g_red[k], d_red);
+        d_green = fmaL(weight, g_green[k], d_green);
+        d_blue = fmaL(weight, g_blue[k], d_blue);
+        const floatL gu = g * u, gv = g * v;
+        sum_g += g;
+        sum_gu += gu;
+        sum_gv += gv;
+        sum_guu = fmaL(gu, u, sum_guu);
+        sum_guv = fmaL(gu, v, sum_guv);
+        sum_gvv = fmaL(gv, v, sum_gvv);
 #ifdef ABSOLUTE_GRADIENTS
-          const floatL u = offset_u + l12 * dy;
-          abs_x += fabs(g * (l11 * u));
-          abs_y += fabs(g * fmaL((floatL)(l12), u, (floatL)(l22 * v)));
+        abs_x += fabs(g * (l11 * u));
+        abs_y += fabs(g * fmaL((floatL)(l12), u, l22 * v));
 #endif
-        }
       }
-      const floatL uc = offset_u + uy;
-      const floatL first = fmaL(uc, s0, -(l12 * s1));
-      const floatL cross = fmaL(uc, s1, -(l12 * s2));
-      m0 += s0;
-      m1 += s1;
-      m2 += s2;
-      mu += first;
-      mu1 += cross;
-      muu += fmaL(uc, first, -(l12 * cross));
     }
 
     float values[SLOT_STRIDE];
-    const float g = sumL(m0), g1 = sumL(m1), g2 = sumL(m2), gu = sumL(mu), gu1 = sumL(mu1);
-    values[SLOT_G] = g;
-    values[SLOT_GU] = gu;
-    values[SLOT_GV] = fma1(vc, g, -(l22 * g1));
-    values[SLOT_GUU] = sumL(muu);
-    values[SLOT_GUV] = fma1(vc, gu, -(l22 * gu1));
-    values[SLOT_GVV] = fma1(vc * vc, g, fma1(-2.0f * vc * l22, g1, l22 * l22 * g2));
+    values[SLOT_G] = sumL(sum_g);
+    values[SLOT_GU] = sumL(sum_gu);
+    values[SLOT_GV] = sumL(sum_gv);
+    values[SLOT_GUU] = sumL(sum_guu);
+    values[SLOT_GUV] = sumL(sum_guv);
+    values[SLOT_GVV] = sumL(sum_gvv);
     values[SLOT_RED] = sumL(d_red);
     values[SLOT_GREEN] = sumL(d_green);
     values[SLOT_BLUE] = sumL(d_blue);

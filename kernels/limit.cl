@@ -3,6 +3,7 @@
 #include "shared/lanes.h"
 #include "shared/group.h"
 #include "shared/tile.h"
+#include "shared/cells.h"
 #include "shared/alpha.h"
 
 #define LIMIT_SPLATS 64
@@ -14,15 +15,13 @@ GROUP __kernel void limit_blend(const int rounds, __global const float *splats, 
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {
     const int vector = get_local_id(0) + k * ITEMS;
-    const float row = (float)(vector / HALVES);
-    const floatL x = (floatL)((vector % HALVES) * LANES) + LANE_INDEX;
+    const floatL x = PIXELS_X(k), y = PIXELS_Y(k);
     floatL t = (floatL)(1.0f), red = (floatL)(0.0f), green = (floatL)(0.0f), blue = (floatL)(0.0f);
     for (int i = 0; i < rounds; ++i) {
       __global const float *splat = splats + SPLAT_SIZE * (i % LIMIT_SPLATS);
-      const float dy = splat[SPLAT_PIXEL_Y] - row;
-      const float v = splat[SPLAT_L22] * dy;
-      const floatL power = log2_alpha(splat[SPLAT_L11] * (splat[SPLAT_PIXEL_X] - x), splat[SPLAT_L12] * dy,
-                                      fma1(-v, v, splat[SPLAT_LOG2O]));
+      const floatL dy = splat[SPLAT_PIXEL_Y] - y;
+      const floatL power = log2_alpha(splat[SPLAT_L11] * (splat[SPLAT_PIXEL_X] - x) + splat[SPLAT_L12] * dy,
+                                      splat[SPLAT_L22] * dy, splat[SPLAT_LOG2O]);
       floatL alpha = exp2L(power);
       alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
       alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);

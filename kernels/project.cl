@@ -38,6 +38,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   splat[SPLAT_HALF_W] = sqrt(budget * p.sxx) / WHITEN;
   splat[SPLAT_HALF_H] = sqrt(budget * p.syy) / WHITEN;
   splat[SPLAT_DEPTH] = p.z;
+  splat[SPLAT_INVERSE_L11] = 1.0f / l11;
 
   const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
   uint count = 0;

@@ -44,10 +44,22 @@ APPROXIMATE = {
 }
 """With the largest difference that a channel of the scenes' frames may have: see `test_approximate_switches`."""
 
-NAMES = ("overlap", "saturating", "needles", "cloud")
+
+def sheaf() -> scenes.Scene:
+    """Ellipses of every size, direction and slimness, many far longer than the image."""
+    gaussians, camera = scenes.random_cloud(2000, 5, 100, 70)
+    rng = np.random.default_rng(5)
+    gaussians.log_scales[:] = rng.uniform(-8, 3, gaussians.log_scales.shape)
+    gaussians.opacity_logits[:] = rng.uniform(-6, 1, len(gaussians))
+    return gaussians, camera
+
+
+NAMES = ("overlap", "saturating", "needles", "cloud", "sheaf")
 
 
 def scene(name: str) -> scenes.Scene:
+    if name == "sheaf":
+        return sheaf()
     return scenes.random_cloud(1000, 8, 100, 70) if name == "cloud" else scenes.NAMED[name]()
 
 

@@ -337,6 +337,17 @@ def test_the_means_rate_falls_exponentially(scene: Scene, default_device: Device
     assert set(trainer.rates()) == set(GROUPS)
 
 
+def test_every_rate_falls_in_the_cooldown(scene: Scene, default_device: Device) -> None:
+    plain = replace(CONFIG, iterations=100)
+    cooled = replace(plain, optimiser=replace(plain.optimiser, cooldown=40, cooldown_to=0.01))
+    trainers = [Trainer(scene, config, default_device) for config in (plain, cooled)]
+    for step, wanted in ((1, 1.0), (60, 1.0), (80, 0.1), (100, 0.01), (120, 0.01)):
+        for trainer in trainers:
+            trainer.step = step
+        full, got = (trainer.rates() for trainer in trainers)
+        np.testing.assert_allclose([got[group] / full[group] for group in GROUPS], wanted)
+
+
 def trained_to(scene: Scene, device: Device, step: int, config: TrainConfig = CONFIG) -> Trainer:
     trainer = Trainer(scene, config, device)
     while trainer.step < step:

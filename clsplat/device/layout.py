@@ -28,7 +28,7 @@ SPLAT = (
     *("PIXEL_X", "PIXEL_Y", "SUB_X", "SUB_Y"),
     *("L11", "L12", "L22", "LOG2O"),
     *("RED", "GREEN", "BLUE", "DEPTH"),
-    *("HALF_W", "HALF_H", "UNUSED_0", "UNUSED_1"),
+    *("HALF_W", "HALF_H", "INVERSE_L11", "UNUSED"),
 )
 """A projected Gaussian in 64 bytes, a cache line: mean in whole pixels and the rest; the whitening W of
 docs/gradients.md times sqrt(log2(e) / 2), so that log2(alpha) = LOG2O - u^2 - v^2; colour; camera depth; half extents

@@ -17,8 +17,8 @@ def kernel_defines(config: RasterizerConfig) -> dict[str, object]:
     default = RasterizerConfig()
     defines: dict[str, object] = {}
     if config.extent == "3sigma":
-        # Columns are skipped by whole vectors, so that what is cut would depend on the kernels' shape.
-        defines.update(EXTENT_BUDGET=_literal(9 * _HALF_LOG2E), NO_COLUMN_SKIP=True)
+        # Within a tile whole cells are skipped, so that what is cut would depend on the kernels' shape.
+        defines.update(EXTENT_BUDGET=_literal(9 * _HALF_LOG2E), NO_ROW_SKIP=True, NO_COLUMN_SKIP=True)
     elif config.extent == "constant":
         defines["EXTENT_BUDGET"] = _literal(-math.log2(config.alpha_min))
     flags = {

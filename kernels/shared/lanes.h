@@ -60,6 +60,24 @@ static inline floatL fmaL(floatL a, floatL b, floatL c) {
 #endif
 }
 
+static inline int maxL(intL x) {
+#if LANES == 16
+  const int8 a = max(x.lo, x.hi);
+  const int4 b = max(a.lo, a.hi);
+  const int2 c = max(b.lo, b.hi);
+  return max(c.x, c.y);
+#elif LANES == 8
+  const int4 b = max(x.lo, x.hi);
+  const int2 c = max(b.lo, b.hi);
+  return max(c.x, c.y);
+#elif LANES == 4
+  const int2 c = max(x.lo, x.hi);
+  return max(c.x, c.y);
+#else
+  return x;
+#endif
+}
+
 // The sum of the lanes in a fixed order: pairs at distance L/2, L/4, ... 1.
 static inline float sumL(floatL x) {
 #if LANES == 16
@@ -79,16 +97,16 @@ static inline float sumL(floatL x) {
 #endif
 }
 
-// 2^x for x in [-126, 1], relative error under 1e-7: round to the nearest integer with the magic number 1.5 * 2^23,
-// degree 6 minimax on [-1/2, 1/2], exponent by integer addition. A lane under -126 is some finite number.
+// 2^x for x in [-126, 1], relative error under 2.1e-7: round to the nearest integer with the magic number 1.5 * 2^23,
+// degree 5 minimax on [-1/2, 1/2] that is 1 at 0, exponent by integer addition. A lane under -126 is some number. The
+// polynomial is in Estrin's order: blending waits for what its longest chain of operations takes.
 static inline floatL exp2L(floatL x) {
   const floatL t = x + 12582912.0f;
   const floatL f = x - (t - 12582912.0f);
-  floatL p = fmaL(f, (floatL)(1.53534157e-4f), (floatL)(1.33988768e-3f));
-  p = fmaL(p, f, (floatL)(9.61844087e-3f));
-  p = fmaL(p, f, (floatL)(5.55032884e-2f));
-  p = fmaL(p, f, (floatL)(2.40226510e-1f));
-  p = fmaL(p, f, (floatL)(6.93147182e-1f));
-  p = fmaL(p, f, (floatL)(1.0f));
+  const floatL f2 = f * f;
+  const floatL low = fmaL(f, (floatL)(6.931469025e-1f), (floatL)(1.0f));
+  const floatL middle = fmaL(f, (floatL)(5.550900067e-2f), (floatL)(2.402225277e-1f));
+  const floatL high = fmaL(f, (floatL)(1.321160340e-3f), (floatL)(9.671293494e-3f));
+  const floatL p = fmaL(f2, fmaL(f2, high, middle), low);
   return AS_FLOATL(AS_INTL(p) + (AS_INTL(t) << 23));
 }

@@ -1,0 +1,193 @@
+// A tile as cells: a vector has the pixels of a block of CELL_W x CELL_H, row by row, as an ellipse's edge cuts fewer
+// blocks than rows of as many pixels. Cell c is the one at column c % COLUMNS and row c / COLUMNS. A group has ITEMS
+// work-items; item i owns cells i, i + ITEMS, ... as its own 0, 1, ...
+#define CELL_W (LANES == 1 ? 1 : 4)
+#define CELL_H (LANES / CELL_W)
+#define COLUMNS (TILE / CELL_W)
+#define ROWS (TILE / CELL_H)
+#define CELLS (COLUMNS * ROWS)
+#define OWNED (CELLS / ITEMS)
+#define CELL_X(cell) ((cell) % COLUMNS * CELL_W)
+#define CELL_Y(cell) ((cell) / COLUMNS * CELL_H)
+
+// Coordinates of a cell's pixels in the tile, and the cell's part of a plane whose rows are `stride` apart.
+#define PIXELS_X(cell) ((floatL)(CELL_X(cell)) + LANE_X)
+#define PIXELS_Y(cell) ((floatL)(CELL_Y(cell)) + LANE_Y)
+#if LANES == 1
+#define LANE_X 0.0f
+#define LANE_Y 0.0f
+#define LOAD_CELL(type, p, stride) (*(p))
+#define STORE_CELL(type, x, p, stride) (*(p) = (x))
+#else
+typedef float4 float4U __attribute__((aligned(4)));
+typedef int4 int4U __attribute__((aligned(4)));
+#define LOAD4(type, p) (*(__global const type##4U *)(p))
+#define STORE4(type, x, p) (*(__global type##4U *)(p) = (x))
+#if LANES == 4
+#define LANE_X ((floatL)(0, 1, 2, 3))
+#define LANE_Y ((floatL)(0.0f))
+#define LOAD_CELL(type, p, stride) LOAD4(type, p)
+#define STORE_CELL(type, x, p, stride) STORE4(type, x, p)
+#elif LANES == 8
+#define LANE_X ((floatL)(0, 1, 2, 3, 0, 1, 2, 3))
+#define LANE_Y ((floatL)(0, 0, 0, 0, 1, 1, 1, 1))
+#define LOAD_CELL(type, p, stride) ((type##8)(LOAD4(type, p), LOAD4(type, (p) + (stride))))
+#define STORE_CELL(type, x, p, stride) (STORE4(type, (x).lo, p), STORE4(type, (x).hi, (p) + (stride)))
+#else
+#define LANE_X ((floatL)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3))
+#define LANE_Y ((floatL)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3))
+#define LOAD_CELL(type, p, stride)                                                                                    \
+  ((type##16)(LOAD4(type, p), LOAD4(type, (p) + (stride)), LOAD4(type, (p) + 2 * (stride)),                           \
+              LOAD4(type, (p) + 3 * (stride))))
+#define STORE_CELL(type, x, p, stride)                                                                                \
+  (STORE4(type, (x).lo.lo, p), STORE4(type, (x).lo.hi, (p) + (stride)), STORE4(type, (x).hi.lo, (p) + 2 * (stride)),  \
+   STORE4(type, (x).hi.hi, (p) + 3 * (stride)))
+#endif
+#endif
+
+// From the first pixel's centre to the mean: whole pixels apart from the rest, which a float32 of the sum would cut.
+#define FROM_TILE(splat, axis, origin)                                                                                \
+  ((splat[SPLAT_PIXEL_##axis] - (float)(origin)) + (splat[SPLAT_SUB_##axis] - 0.5f))
+
+// The cells that a Gaussian reaches: those that have a pixel in its ellipse, as bits, where one work-item walks
+// a tile of at most 32; else those that its box reaches.
+#if LANES >= 8 && ITEMS == 1
+typedef uint Reach;
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_ctz)
+#define LOWEST(bits) __builtin_ctz(bits)
+#endif
+#endif
+#ifndef LOWEST
+#define LOWEST(bits) (31 - clz((bits) & -(bits)))
+#endif
+
+// sqrt(x) or up to 0.2 % more: Newton's step on the bits' estimate of 1 / sqrt(x). sqrt of a vector is a call in PoCL.
+static inline float8 over_sqrt(float8 x) {
+  const float8 y = as_float8((int8)(0x5f375a86) - (as_int8(x) >> 1));
+  const float8 root = x * y;
+  return root * (1.502f - 0.5f * (root * y));
+}
+
+// In eight rows of pixels, the ellipse's chord from *low to *end, in pixels and not clamped:
+// |l11 (mx - x) + l12 (my - y)| <= sqrt(rest), rest = budget - (l22 (my - y))^2; a point where rest < 0.
+static inline float8 chord(float8 dy, float mx, float l12, float l22, float inverse_l11, float budget, float8 *low,
+                           float8 *end) {
+  const float8 v = l22 * dy, shift = l12 * dy;
+  const float8 rest = budget - v * v;
+  const float8 reach = over_sqrt(rest > 0.0f ? rest : (float8)(0.0f));
+  *low = (shift - reach) * inverse_l11 + mx;
+  *end = (shift + reach) * inverse_l11 + mx;
+  return rest;
+}
+
+// Bits of the columns that the ellipse reaches in eight pairs of rows of pixels.
+static inline int8 reached_columns(float my, float mx, float l12, float l22, float inverse_l11, float budget) {
+  const float8 dy = my - (float8)(0, 2, 4, 6, 8, 10, 12, 14);
+  float8 low, end, low2, end2;
+  const float8 rest = chord(dy, mx, l12, l22, inverse_l11, budget, &low, &end);
+  const float8 rest2 = chord(dy - 1.0f, mx, l12, l22, inverse_l11, budget, &low2, &end2);
+  low = (low < low2 ? low : low2) - TILE_SLACK;
+  end = (end > end2 ? end : end2) + (TILE_SLACK + 1.0f);
+  low = low > 0.0f ? low : (float8)(0.0f);
+  low = low < (float)TILE ? low : (float8)(TILE);
+  end = end > 0.0f ? end : (float8)(0.0f);
+  end = end < (float)TILE ? end : (float8)(TILE);
+  const int8 whole = convert_int8(low);
+  const int8 first = whole - (convert_float8(whole) < low), last = convert_int8(end) - 1; // a comparison is -1
+  const int8 bits = ((int8)(2) << (last >> 2)) - ((int8)(1) << (first >> 2));
+  const int8 none = (int8)(0);
+  const int8 some = last >= first ? bits : none;
+  return (rest > rest2 ? rest : rest2) > 0.0f ? some : none;
+}
+
+static inline uint join_rows(int8 bits) {
+  const int4 a = bits.lo | bits.hi;
+  const int2 b = a.lo | a.hi;
+  return (uint)(b.x | b.y);
+}
+
+static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) {
+#if defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP)
+  return CELLS == 32 ? 0xffffffffu : (1u << (CELLS % 32)) - 1;
+#else
+  const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
+  const float l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22], inverse = splat[SPLAT_INVERSE_L11];
+  const float budget = EXTENT(splat[SPLAT_LOG2O]) + 0.01f;
+  int8 bits = reached_columns(my, mx, l12, l22, inverse, budget);
+#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip
+  bits = bits != 0 ? (int8)(15) : (int8)(0);
+#endif
+#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip
+  bits = (int8)((int)join_rows(bits));
+#endif
+#if LANES == 8
+  return join_rows(bits << (int8)(0, 4, 8, 12, 16, 20, 24, 28));
+#else
+  return join_rows(bits << (int8)(0, 0, 4, 4, 8, 8, 12, 12));
+#endif
+#endif
+}
+
+// Pixels' coordinates by table: conversions from integers in the inner loop made a chain through it in some compilers.
+#define PIXEL_TABLES                                                                                                  \
+  floatL table_x[COLUMNS], table_y[ROWS];                                                                             \
+  for (int column = 0; column < COLUMNS; ++column) table_x[column] = PIXELS_X(column);                                \
+  for (int row = 0; row < ROWS; ++row) table_y[row] = PIXELS_Y(row * COLUMNS);
+#define AT_X(cell) table_x[(cell) % COLUMNS]
+#define AT_Y(cell) table_y[(cell) / COLUMNS]
+
+// Cells that have a pixel left to fill.
+typedef uint Open;
+#define OPEN_CELL(open, cell) ((open) |= 1u << (cell))
+#define CLOSE_CELL(open, cell) ((open) &= ~(1u << (cell)))
+#ifdef NO_EARLY_STOP
+#define IN_OPEN(reach, open) (reach)
+#else
+#define IN_OPEN(reach, open) ((reach) & (open))
+#endif
+
+#define FOR_CELLS(cell, reach)                                                                                        \
+  for (uint left = (reach), cell = 0; left && ((cell = LOWEST(left)), 1); left &= left - 1)
+#else
+typedef struct {
+  int x0, x1, y0, y1;
+} Reach;
+
+static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) {
+  Reach reach = {0, COLUMNS, 0, ROWS};
+  const float x = (splat[SPLAT_PIXEL_X] - (float)tile_x) + splat[SPLAT_SUB_X];
+  const float y = (splat[SPLAT_PIXEL_Y] - (float)tile_y) + splat[SPLAT_SUB_Y];
+#ifndef NO_COLUMN_SKIP
+  reach.x0 = first_cell(x - splat[SPLAT_HALF_W], (float)CELL_W, COLUMNS);
+  reach.x1 = end_cell(x + splat[SPLAT_HALF_W], (float)CELL_W, COLUMNS);
+#endif
+#ifndef NO_ROW_SKIP
+  reach.y0 = first_cell(y - splat[SPLAT_HALF_H], (float)CELL_H, ROWS);
+  reach.y1 = end_cell(y + splat[SPLAT_HALF_H], (float)CELL_H, ROWS);
+#endif
+  return reach;
+}
+
+#define PIXEL_TABLES
+#define AT_X(cell) PIXELS_X(cell)
+#define AT_Y(cell) PIXELS_Y(cell)
+
+typedef int Open; // how many of the item's
+#define OPEN_CELL(open, cell) (++(open))
+#define CLOSE_CELL(open, cell) (--(open))
+#define IN_OPEN(reach, open) (reach)
+
+#if ITEMS == 1
+#define FOR_CELLS(cell, reach)                                                                                        \
+  for (int row = (reach).y0; row < (reach).y1; ++row)                                                                 \
+    for (int cell = row * COLUMNS + (reach).x0, end_ = cell + (reach).x1 - (reach).x0; cell < end_; ++cell)
+#else
+#define IN_REACH(cell, reach)                                                                                         \
+  ((cell) % COLUMNS >= (reach).x0 && (cell) % COLUMNS < (reach).x1 && (cell) / COLUMNS >= (reach).y0 &&               \
+   (cell) / COLUMNS < (reach).y1)
+#define FOR_CELLS(cell, reach)                                                                                        \
+  for (int cell = get_local_id(0); cell < CELLS; cell += ITEMS)                                                       \
+    if (IN_REACH(cell, reach))
+#endif
+#endif
