@@ -1,6 +1,7 @@
 // One wrapper for each shared function, so that tests can call it alone.
 #include "shared/math.h"
 #include "shared/lanes.h"
+#include "shared/elementary.h"
 
 // out[LANES], out[LANES..2 LANES): what fma1 and fmaL make of factor * factor + addend.
 __kernel void probe_fma(__global float *out, const float factor, const float addend) {
@@ -8,16 +9,13 @@ __kernel void probe_fma(__global float *out, const float factor, const float add
   for (int lane = 0; lane < LANES; ++lane) out[LANES + lane] = fma1(factor, factor, addend);
 }
 
-// out[0, 1, 2] += exp1, log2_1, sigmoid1 of x[i] at i, n + i, 2n + i; exp2L in the fourth quarter.
+// x (n) -> out (4, n): expL, log2L, sigmoidL and exp2L, each in the first lane.
 __kernel void probe_elementary(__global const float *x, __global float *out, const uint n) {
   const uint i = get_global_id(0);
-  out[i] = exp1(x[i]);
-  out[n + i] = log2_1(x[i]);
-  out[2 * n + i] = sigmoid1(x[i]);
-  const floatL power = exp2L((floatL)(x[i]));
-#if LANES == 1
-  out[3 * n + i] = power;
-#else
-  out[3 * n + i] = power.s0;
-#endif
+  Lanes values[4];
+  values[0].all = expL((floatL)(x[i]));
+  values[1].all = log2L((floatL)(x[i]));
+  values[2].all = sigmoidL((floatL)(x[i]));
+  values[3].all = exp2L((floatL)(x[i]));
+  for (uint k = 0; k < 4; ++k) out[k * n + i] = values[k].lane[0];
 }

@@ -1,6 +1,9 @@
 // Projection (Kerbl et al. 2023, section 4; docs/gradients.md, equations 1 to 13 and 44 to 47): each Gaussian to its
-// ellipse, colour, depth and number of tiles. One work-item a Gaussian.
+// ellipse, colour, depth and number of tiles. A work-item has LANES Gaussians: in vectors as far as all have the same to
+// do, then the visible ones by turns.
 #include "shared/math.h"
+#include "shared/lanes.h"
+#include "shared/elementary.h"
 #include "shared/splat.h"
 #include "shared/tile.h"
 #include "shared/gaussian.h"
@@ -13,59 +16,60 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
                       __global const float *log_scales, __global const float *opacity_logits,
                       __global const float *sh_dc, __global const float *sh_rest, __global float *splats,
                       __global uint *tile_counts) {
-  const uint i = get_global_id(0);
-  if (i >= n) return;
-  tile_counts[i] = 0;
+  ROWS_OF_ITEM(n)
+  for (uint lane = 0; lane < lanes_used; ++lane) tile_counts[first_row + lane] = 0;
   Projection p;
-  if (!project_gaussian(means + 3 * i, quaternions + 4 * i, log_scales + 3 * i, camera, &p)) return;
-  const float opacity = sigmoid1(opacity_logits[i]);
-  if (!(opacity > ALPHA_MIN)) return;
+  if (!project_gaussians(row, means, quaternions, log_scales, camera, &p)) return;
+  const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
+  floatL dx = GATHER(means, 3, 0) - camera[CAMERA_PX], dy = GATHER(means, 3, 1) - camera[CAMERA_PY];
+  floatL dz = GATHER(means, 3, 2) - camera[CAMERA_PZ];
+  const floatL length = sqrt(fmaL(dx, dx, fmaL(dy, dy, dz * dz)));
+  IntLanes valid;
+  valid.all = p.valid & (opacity > ALPHA_MIN) & (length > 0.0f);
+  if (!ANYL(valid.all)) return;
 
-  __global float *splat = splats + (size_t)SPLAT_SIZE * i;
+  Lanes field[SPLAT_SIZE];
   image_position(p.x, p.lx, p.z, p.lz, camera[CAMERA_FX], camera[CAMERA_FX_LOW], camera[CAMERA_CX],
-                 camera[CAMERA_CX_LOW], splat + SPLAT_PIXEL_X, splat + SPLAT_SUB_X);
+                 camera[CAMERA_CX_LOW], &field[SPLAT_PIXEL_X].all, &field[SPLAT_SUB_X].all);
   image_position(p.y, p.ly, p.z, p.lz, camera[CAMERA_FY], camera[CAMERA_FY_LOW], camera[CAMERA_CY],
-                 camera[CAMERA_CY_LOW], splat + SPLAT_PIXEL_Y, splat + SPLAT_SUB_Y);
+                 camera[CAMERA_CY_LOW], &field[SPLAT_PIXEL_Y].all, &field[SPLAT_SUB_Y].all);
   // (8), (44): Sigma^-1 = W^T W with W upper triangular, stored as WHITEN W.
-  const float l22 = WHITEN / sqrt(p.syy);
-  const float l11 = WHITEN * sqrt(p.syy / p.det);
-  const float log2o = log2_1(opacity);
-  const float budget = EXTENT(log2o);
-  splat[SPLAT_L11] = l11;
-  splat[SPLAT_L12] = -(p.sxy / p.syy) * l11;
-  splat[SPLAT_L22] = l22;
-  splat[SPLAT_LOG2O] = log2o;
-  splat[SPLAT_HALF_W] = sqrt(budget * p.sxx) / WHITEN;
-  splat[SPLAT_HALF_H] = sqrt(budget * p.syy) / WHITEN;
-  splat[SPLAT_DEPTH] = p.z;
-  splat[SPLAT_INVERSE_L11] = 1.0f / l11;
+  const floatL l11 = WHITEN * sqrt(p.syy / p.det);
+  const floatL log2o = log2L(opacity);
+  const floatL budget = (floatL)(EXTENT(log2o));
+  field[SPLAT_L11].all = l11;
+  field[SPLAT_L12].all = -(p.sxy / p.syy) * l11;
+  field[SPLAT_L22].all = WHITEN / sqrt(p.syy);
+  field[SPLAT_LOG2O].all = log2o;
+  field[SPLAT_HALF_W].all = sqrt(budget * p.sxx) / WHITEN;
+  field[SPLAT_HALF_H].all = sqrt(budget * p.syy) / WHITEN;
+  field[SPLAT_DEPTH].all = p.z;
+  field[SPLAT_INVERSE_L11].all = 1.0f / l11;
+  Lanes basis[16];
+  sh_basis(SH_USED(coefficients), dx / length, dy / length, dz / length, &basis[0].all);
 
-  const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
-  uint count = 0;
-  for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
-    int x0, x1;
-    tile_span(&e, ty, tiles_x, &x0, &x1);
-    count += x1 - x0;
+  for (uint lane = 0; lane < lanes_used; ++lane) {
+    if (!valid.lane[lane]) continue;
+    const uint i = first_row + lane;
+    __global float *splat = splats + (size_t)SPLAT_SIZE * i;
+    const int fields[] = {SPLAT_PIXEL_X, SPLAT_PIXEL_Y, SPLAT_SUB_X, SPLAT_SUB_Y,  SPLAT_L11,    SPLAT_L12,
+                          SPLAT_L22,     SPLAT_LOG2O,   SPLAT_DEPTH, SPLAT_HALF_W, SPLAT_HALF_H, SPLAT_INVERSE_L11};
+    for (uint k = 0; k < sizeof(fields) / sizeof(fields[0]); ++k) splat[fields[k]] = field[fields[k]].lane[lane];
+    const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
+    uint count = 0;
+    for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
+      int x0, x1;
+      tile_span(&e, ty, tiles_x, &x0, &x1);
+      count += x1 - x0;
+    }
+    if (count == 0) continue;
+    tile_counts[i] = count;
+    float4 colour = sh_fma(SH_CONSTANT, (float4)(sh_dc[3 * i], sh_dc[3 * i + 1], sh_dc[3 * i + 2], 0.0f), (float4)(0.5f));
+    __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
+    for (int k = 1; k < SH_USED(coefficients); ++k, f += 3)
+      colour = sh_fma(basis[k].lane[lane], sh_channels(f, k + 1 == coefficients), colour);
+    splat[SPLAT_RED] = colour.x > 0.0f ? colour.x : 0.0f;
+    splat[SPLAT_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
+    splat[SPLAT_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
   }
-  if (count == 0) return;
-
-  float dx = means[3 * i] - camera[CAMERA_PX], dy = means[3 * i + 1] - camera[CAMERA_PY];
-  float dz = means[3 * i + 2] - camera[CAMERA_PZ];
-  const float length = sqrt(fma1(dx, dx, fma1(dy, dy, dz * dz)));
-  if (!(length > 0.0f)) return;
-  float basis[16];
-  sh_basis(SH_USED(coefficients), dx / length, dy / length, dz / length, basis);
-  float red = fma1(basis[0], sh_dc[3 * i], 0.5f);
-  float green = fma1(basis[0], sh_dc[3 * i + 1], 0.5f);
-  float blue = fma1(basis[0], sh_dc[3 * i + 2], 0.5f);
-  __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
-  for (int k = 1; k < SH_USED(coefficients); ++k, f += 3) {
-    red = fma1(basis[k], f[0], red);
-    green = fma1(basis[k], f[1], green);
-    blue = fma1(basis[k], f[2], blue);
-  }
-  splat[SPLAT_RED] = red > 0.0f ? red : 0.0f;
-  splat[SPLAT_GREEN] = green > 0.0f ? green : 0.0f;
-  splat[SPLAT_BLUE] = blue > 0.0f ? blue : 0.0f;
-  tile_counts[i] = count;
 }

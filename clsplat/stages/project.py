@@ -128,7 +128,7 @@ def project(
     launch_items(
         device,
         device.kernels("project").project,
-        n,
+        -(-n // device.shape.lanes),
         n,
         gaussians.coefficients,
         tiles_x,
@@ -160,7 +160,7 @@ def project_grad(
     launch_items(
         device,
         device.kernels("project_grad", **defines).project_grad,
-        n if slots.shape[0] else 0,
+        -(-n // device.shape.lanes) if slots.shape[0] else 0,
         n,
         gaussians.coefficients,
         camera_array,

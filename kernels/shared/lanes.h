@@ -10,6 +10,8 @@ typedef float floatL;
 typedef int intL;
 #define AS_INTL(x) as_int(x)
 #define AS_FLOATL(x) as_float(x)
+#define TO_INTL(x) ((int)(x))
+#define TO_FLOATL(x) ((float)(x))
 #define LOADL(p) (*(p))
 #define STOREL(x, p) (*(p) = (x))
 #define ANYL(m) ((m) != 0)
@@ -19,6 +21,8 @@ typedef CAT(float, LANES) floatL;
 typedef CAT(int, LANES) intL;
 #define AS_INTL(x) CAT(as_int, LANES)(x)
 #define AS_FLOATL(x) CAT(as_float, LANES)(x)
+#define TO_INTL(x) CAT(convert_int, LANES)(x)
+#define TO_FLOATL(x) CAT(convert_float, LANES)(x)
 typedef floatL floatU __attribute__((aligned(4))); // vload and vstore are slow calls in PoCL 3.0
 #define LOADL(p) (*(__global const floatU *)(p))
 #define STOREL(x, p) (*(__global floatU *)(p) = (x))
@@ -110,3 +114,36 @@ static inline floatL exp2L(floatL x) {
   const floatL p = fmaL(f2, fmaL(f2, high, middle), low);
   return AS_FLOATL(AS_INTL(p) + (AS_INTL(t) << 23));
 }
+
+// One element of `width`-wide rows for each of LANES items: row[0] to row[LANES - 1].
+#define ROW_(array, width, field, lane) (array)[(size_t)(width) * row[lane] + (field)]
+#define ROW4_(a, w, f, i) ROW_(a, w, f, i), ROW_(a, w, f, i + 1), ROW_(a, w, f, i + 2), ROW_(a, w, f, i + 3)
+#if LANES == 1
+#define GATHER(array, width, field) ROW_(array, width, field, 0)
+#elif LANES == 4
+#define GATHER(array, width, field) ((floatL)(ROW4_(array, width, field, 0)))
+#elif LANES == 8
+#define GATHER(array, width, field) ((floatL)(ROW4_(array, width, field, 0), ROW4_(array, width, field, 4)))
+#else
+#define GATHER(array, width, field)                                                                                   \
+  ((floatL)(ROW4_(array, width, field, 0), ROW4_(array, width, field, 4), ROW4_(array, width, field, 8),              \
+            ROW4_(array, width, field, 12)))
+#endif
+
+// The rows of a work-item that has LANES of n, the last one again where they end.
+#define ROWS_OF_ITEM(n)                                                                                               \
+  const uint first_row = get_global_id(0) * LANES;                                                                    \
+  if (first_row >= (n)) return;                                                                                       \
+  uint row[LANES];                                                                                                    \
+  for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < (n) ? first_row + lane : (n) - 1;          \
+  const uint lanes_used = (n) - first_row < LANES ? (n) - first_row : LANES;
+
+// A vector to be had lane by lane.
+typedef union {
+  floatL all;
+  float lane[LANES];
+} Lanes;
+typedef union {
+  intL all;
+  int lane[LANES];
+} IntLanes;

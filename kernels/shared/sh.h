@@ -1,5 +1,7 @@
 // Real spherical harmonics to degree 3, signs and order of Kerbl et al. 2023; basis[k] at the unit direction (x, y, z).
 
+#define SH_CONSTANT 0.28209479177387814f
+
 // Of the coefficients that there are, how many are looked at (RasterizerConfig.sh_degree_limit).
 #ifdef SH_LIMIT
 #define SH_USED(coefficients) ((coefficients) < SH_LIMIT ? (coefficients) : SH_LIMIT)
@@ -7,14 +9,14 @@
 #define SH_USED(coefficients) (coefficients)
 #endif
 
-static inline void sh_basis(int coefficients, float x, float y, float z, float *basis) {
-  basis[0] = 0.28209479177387814f;
+static inline void sh_basis(int coefficients, floatL x, floatL y, floatL z, floatL *basis) {
+  basis[0] = (floatL)(SH_CONSTANT);
   if (coefficients < 4) return;
   basis[1] = -0.4886025119029199f * y;
   basis[2] = 0.4886025119029199f * z;
   basis[3] = -0.4886025119029199f * x;
   if (coefficients < 9) return;
-  const float xx = x * x, yy = y * y, zz = z * z;
+  const floatL xx = x * x, yy = y * y, zz = z * z;
   basis[4] = 1.0925484305920792f * x * y;
   basis[5] = -1.0925484305920792f * y * z;
   basis[6] = 0.31539156525252005f * (2.0f * zz - xx - yy);
@@ -31,8 +33,9 @@ static inline void sh_basis(int coefficients, float x, float y, float z, float *
 }
 
 // d[3]: sum over k of weight[k] times the gradient of basis[k] by (x, y, z).
-static inline void sh_direction_gradient(int coefficients, float x, float y, float z, const float *weight, float *d) {
-  d[0] = d[1] = d[2] = 0.0f;
+static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, floatL z,
+                                         const floatL *weight, floatL *d) {
+  d[0] = d[1] = d[2] = (floatL)(0.0f);
   if (coefficients < 4) return;
   d[0] = -0.4886025119029199f * weight[3];
   d[1] = -0.4886025119029199f * weight[1];
@@ -43,7 +46,7 @@ static inline void sh_direction_gradient(int coefficients, float x, float y, flo
   d[1] += c4 * x * weight[4] - c4 * z * weight[5] - 2.0f * c6 * y * weight[6] - 2.0f * c8 * y * weight[8];
   d[2] += -c4 * y * weight[5] + 4.0f * c6 * z * weight[6] - c4 * x * weight[7];
   if (coefficients < 16) return;
-  const float xx = x * x, yy = y * y, zz = z * z;
+  const floatL xx = x * x, yy = y * y, zz = z * z;
   const float c9 = 0.5900435899266435f, c10 = 2.890611442640554f, c11 = 0.4570457994644658f;
   const float c12 = 0.3731763325901154f, c14 = 1.445305721320277f;
   d[0] += -6.0f * c9 * x * y * weight[9] + c10 * y * z * weight[10] + 2.0f * c11 * x * y * weight[11] -
@@ -55,4 +58,19 @@ static inline void sh_direction_gradient(int coefficients, float x, float y, flo
   d[2] += c10 * x * y * weight[10] - 8.0f * c11 * y * z * weight[11] +
           3.0f * c12 * (2.0f * zz - xx - yy) * weight[12] - 8.0f * c11 * x * z * weight[13] +
           c14 * (xx - yy) * weight[14];
+}
+
+// The three channels of a coefficient; where it is the row's last, four would be too many.
+typedef float4 sh4U __attribute__((aligned(4)));
+static inline float4 sh_channels(__global const float *f, int last) {
+  return last ? (float4)(f[0], f[1], f[2], 0.0f) : *(__global const sh4U *)f;
+}
+
+static inline float4 sh_fma(float a, float4 b, float4 c) {
+#ifdef FMA_BY_CONTRACTION
+#pragma OPENCL FP_CONTRACT ON
+  return a * b + c;
+#else
+  return fma((float4)(a), b, c);
+#endif
 }
