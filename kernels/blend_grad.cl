@@ -130,6 +130,16 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
       }
     }
 
+#if LANES >= 8 && ITEMS == 1
+    // The first eight fields of a slot, in the order of layout.SLOT.
+    typedef float8 float8U __attribute__((aligned(4)));
+    *(__global float8U *)slot = sums8(sum_g, sum_gu, sum_gv, sum_guu, sum_guv, sum_gvv, d_red, d_green);
+    slot[SLOT_BLUE] = sumL(d_blue);
+#ifdef ABSOLUTE_GRADIENTS
+    slot[SLOT_ABSX] = sumL(abs_x);
+    slot[SLOT_ABSY] = sumL(abs_y);
+#endif
+#else
     float values[SLOT_STRIDE];
     values[SLOT_G] = sumL(sum_g);
     values[SLOT_GU] = sumL(sum_gu);
@@ -148,6 +158,7 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
     for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = values[field];
 #else
     group_sums(values, scratch, slot);
+#endif
 #endif
   }
 }

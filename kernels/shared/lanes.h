@@ -101,6 +101,26 @@ static inline float sumL(floatL x) {
 #endif
 }
 
+#if LANES >= 8
+#if LANES == 16
+#define EIGHT(x) ((x).lo + (x).hi)
+#else
+#define EIGHT(x) (x)
+#endif
+// The sums of eight vectors, each as sumL adds it up, in fewer steps than one after the other.
+static inline float8 sums8(floatL x0, floatL x1, floatL x2, floatL x3, floatL x4, floatL x5, floatL x6, floatL x7) {
+  const float8 a = EIGHT(x0), b = EIGHT(x1), c = EIGHT(x2), d = EIGHT(x3);
+  const float8 e = EIGHT(x4), f = EIGHT(x5), g = EIGHT(x6), h = EIGHT(x7);
+  const float8 ae = (float8)(a.lo, e.lo) + (float8)(a.hi, e.hi);
+  const float8 bf = (float8)(b.lo, f.lo) + (float8)(b.hi, f.hi);
+  const float8 cg = (float8)(c.lo, g.lo) + (float8)(c.hi, g.hi);
+  const float8 dh = (float8)(d.lo, h.lo) + (float8)(d.hi, h.hi);
+  const float8 abef = (float8)(ae.s01, bf.s01, ae.s45, bf.s45) + (float8)(ae.s23, bf.s23, ae.s67, bf.s67);
+  const float8 cdgh = (float8)(cg.s01, dh.s01, cg.s45, dh.s45) + (float8)(cg.s23, dh.s23, cg.s67, dh.s67);
+  return (float8)(abef.s02, cdgh.s02, abef.s46, cdgh.s46) + (float8)(abef.s13, cdgh.s13, abef.s57, cdgh.s57);
+}
+#endif
+
 // 2^x for x in [-126, 1], relative error under 2.1e-7: round to the nearest integer with the magic number 1.5 * 2^23,
 // degree 5 minimax on [-1/2, 1/2] that is 1 at 0, exponent by integer addition. A lane under -126 is some number. The
 // polynomial is in Estrin's order: blending waits for what its longest chain of operations takes.
