@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import bench_growth
 import bench_sort
+import compare_peer
 import numpy as np
 import pytest
 from measuring import sizes
+from tiny import HEIGHT, WIDTH, write_scene
 
 Capture = pytest.CaptureFixture[str]
 
@@ -132,3 +135,64 @@ def test_line_of_relative_residuals() -> None:
 def test_wrong_calls_of_bench_growth(flags: str, message: str, capsys: Capture) -> None:
     assert bench_growth.main(flags.split()) == 2
     assert message in one_error(capsys, "bench_growth")
+
+
+@pytest.fixture
+def peer_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A scene that the peer is said to have been measured on."""
+    monkeypatch.setattr(compare_peer, "PEERS", {"tiny": compare_peer.Peer(WIDTH, HEIGHT, 40, 0.5)})
+    return write_scene(tmp_path / "tiny")
+
+
+def test_peer_with_a_known_limit(peer_scene: Path, capsys: Capture) -> None:
+    assert compare_peer.main([str(peer_scene), "--limit-gpairs", "2.545", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    (row,) = result["rows"]
+    assert (row["scene"], row["width"], row["height"], row["gaussians"]) == ("tiny", WIDTH, HEIGHT, 40)
+    assert row["limits"] == {"given": 2.545}
+    assert row["peer_seconds_scaled"] == pytest.approx(1.0)
+    assert row["ratio"] == pytest.approx(1000 / row["ms"])
+    assert result["repeat"] == 28
+
+
+def test_peer_with_a_program(peer_scene: Path, tmp_path: Path, capsys: Capture) -> None:
+    program = tmp_path / "limit.py"
+    program.write_text("import sys; print(f'2 threads 8 lanes: {sys.argv[1]} Gpairs/s')")
+    line = [str(peer_scene), "--limit", f"{sys.executable} {program} 1000.5"]
+    assert compare_peer.main([*line, "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    assert row["limit"] == row["limits"]["program"] == 1000.5
+    # a program that is slower than what the device has just shown does not make the peer slower
+    assert compare_peer.main([str(peer_scene), "--limit", f"{sys.executable} {program} 0.0001"]) == 0
+    out = capsys.readouterr().out
+    assert "program 0.00, kernel " in out
+    assert " 0.00  " not in out
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--limit-gpairs", "0"], "--limit-gpairs 0.0: expected more than 0"),
+        (["--limit-gpairs", "1", "--device", "abacus"], "--device abacus: no such device"),
+        (["--limit", "/no/such/program"], "--limit /no/such/program: cannot be run"),
+        (["--limit", f"{sys.executable} -c print(1)"], "printed '1', expected N Gpairs/s in it"),
+        (["--limit", f"{sys.executable} -c 1/0"], "cannot be run"),
+        (["--limit", ""], "cannot be run"),
+    ],
+)
+def test_wrong_calls_of_compare_peer(flags: list[str], message: str, peer_scene: Path, capsys: Capture) -> None:
+    assert compare_peer.main([str(peer_scene), *flags]) == 2
+    assert message in one_error(capsys, "compare_peer")
+
+
+def test_scenes_that_the_peer_did_not_have(peer_scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    for peer, message in [
+        (compare_peer.Peer(WIDTH, HEIGHT, 41, 0.5), "has 40 points, the peer started from 41"),
+        (compare_peer.Peer(WIDTH, HEIGHT + 1, 40, 0.5), "00.png: is 48x40, the peer had 48x41"),
+    ]:
+        monkeypatch.setattr(compare_peer, "PEERS", {"tiny": peer})
+        assert compare_peer.main([str(peer_scene), "--limit-gpairs", "1"]) == 2
+        assert message in one_error(capsys, "compare_peer")
+    monkeypatch.setattr(compare_peer, "PEERS", {"fox": peer})
+    assert compare_peer.main([str(peer_scene), "--limit-gpairs", "1"]) == 2
+    assert "has not been measured on it, expected one of fox" in one_error(capsys, "compare_peer")
