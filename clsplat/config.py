@@ -217,6 +217,11 @@ class TrainConfig:
         for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):
             if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
                 raise InputError(f"--{name} {','.join(map(str, steps))}: expected steps from 1 up, in order")
+        if self.eval_at and self.eval_at[-1] > self.iterations:
+            late = next(step for step in self.eval_at if step > self.iterations)
+            raise InputError(
+                f"--eval-at {late}: training ends before that, expected at most --iterations {self.iterations}"
+            )
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()

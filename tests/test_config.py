@@ -74,3 +74,9 @@ def test_defaults_presets_and_the_ends_of_ranges_make_sense() -> None:
     OptimiserConfig(**still, means_rate_steps=1, beta1=0, beta2=0, cooldown_to=1).check()  # type: ignore[arg-type]
     DensityConfig(every=0, start=0, stop=0, opacity_reset_every=0, dense_fraction=1, max_gaussians=1).check()
     DensityConfig(max_world_fraction=1e9).check()  # prunes none
+
+
+def test_an_evaluation_after_the_last_step(tmp_path: Path, capsys: Capture) -> None:
+    line = refused(["--eval-at", "300,500,1000", "--iterations", "499"], tmp_path, capsys)
+    assert line == "clsplat: error: --eval-at 500: training ends before that, expected at most --iterations 499\n"
+    TrainConfig(iterations=500, eval_at=(300, 500)).check()
