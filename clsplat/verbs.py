@@ -47,9 +47,9 @@ def run(verb: Verb) -> int:
 
 def devices(verb: Devices) -> int:
     """Print the table of devices."""
-    from clsplat.device.context import list_devices
+    from clsplat.device.context import find_device, list_devices
 
-    found = list_devices()
+    found = list_devices() if verb.device is None else [find_device(verb.device)]
     if not found:
         raise DeviceError("no OpenCL device found, expected a driver such as pip install 'pyopencl[pocl]' brings")
     if verb.json:
