@@ -131,6 +131,11 @@ def train(verb: Train) -> int:
         raise InputError(
             f"--iterations {verb.config.iterations}: {verb.output} is at step {done} already, expected more"
         )
+    if len(scene.points) == 1:  # a Gaussian's size follows from its neighbours, and it has none
+        print(
+            f"clsplat: warning: {source}: has a single point, training starts from one Gaussian of next to no size",
+            file=sys.stderr,
+        )
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
     print(
         f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
