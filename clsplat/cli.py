@@ -33,6 +33,9 @@ Device = Annotated[str | None, arg(metavar="DEVICE")]
 class Devices:
     """List the OpenCL devices."""
 
+    device: Device = None
+    """List only the one that this names, as other verbs' --device does: an index, cpu, gpu, or a part of a name.
+    If not given: all of them."""
     json: Flag = False
     """Print a JSON array instead of the table."""
 
