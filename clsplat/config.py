@@ -15,6 +15,7 @@ from clsplat.errors import InputError
 
 Background = Literal["black", "white", "random"]
 Preset = Literal["exact", "default", "fast"]
+Schedule = Literal["paper", "short"]
 
 _Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
 """Names of settings, whether a value makes sense (which NaN must not), and what is expected."""
@@ -225,3 +226,29 @@ class TrainConfig:
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
+
+
+def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
+    """What `clsplat train --schedule` starts from.
+
+    paper: the defaults, made for 30,000 steps, whatever `iterations` is. short: for runs of about 7000 steps, in which
+    the paper's rates leave a model unfinished: colours, opacities and rotations learn faster, SH degrees come twice as
+    fast, the means' rate has fallen at the end, density control ends at five sevenths, and the last seventh cools down
+    (docs/decisions/0013-a-short-schedule.md).
+    """
+    if schedule == "paper":
+        return TrainConfig(iterations=iterations)
+    return TrainConfig(
+        iterations=iterations,
+        sh_degree_every=500,
+        optimiser=OptimiserConfig(
+            means_rate_steps=max(iterations, 1),
+            sh_dc_rate=4e-3,
+            sh_rest_rate=4e-4,
+            opacities_rate=0.05,
+            quaternions_rate=2e-3,
+            cooldown=max(iterations // 7, 0),
+            cooldown_to=0.2,
+        ),
+        density=DensityConfig(stop=max(5 * iterations // 7, 0)),
+    )

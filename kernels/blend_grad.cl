@@ -13,8 +13,6 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#define NOT_YET -100.0f // log2 of an alpha that reaches nothing, for pixels that ended before this Gaussian
-
 #if ITEMS > 1
 // slot[field] = the sum of value over the group, in a fixed tree.
 static inline void group_sums(float *values, __local float *scratch, __global float *slot) {
@@ -99,18 +97,18 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
     FOR_CELLS(cell, reach) {
       const int k = cell / ITEMS;
       const floatL dy = my - AT_Y(cell);
-      const floatL u = l11 * (mx - AT_X(cell)) + l12 * dy, v = l22 * dy;
-      const floatL all = log2_alpha(u, v, log2o);
-      const floatL power = (intL)(i) < stop[k] ? all : (floatL)(NOT_YET);
-      if (REACHES(power)) {
-        const floatL uncapped = power >= LOG2_ALPHA_MIN ? exp2L(power) : zero;
+      const floatL u = fmaL((floatL)(l12), dy, l11 * (mx - AT_X(cell))), v = l22 * dy;
+      const floatL power = log2_alpha(u, v, log2o);
+      const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
+      if (REACHES(taken)) {
+        const floatL uncapped = AS_FLOATL(AS_INTL(exp2L(power)) & taken);
         const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
         const floatL inverse = 1.0f / (1.0f - alpha);
         const floatL before = t[k] * inverse;
         const floatL shade = fmaL(g_red[k], (floatL)(c_red), fmaL(g_green[k], (floatL)(c_green), g_blue[k] * c_blue));
         const floatL weight = alpha * before;
         const floatL d_alpha = fmaL(before, shade, -(behind[k] * inverse));
-        const floatL g = uncapped < ALPHA_MAX ? alpha * d_alpha : zero;
+        const floatL g = AS_FLOATL(AS_INTL(alpha * d_alpha) & MASKL(uncapped < ALPHA_MAX));
         behind[k] = fmaL(weight, shade, behind[k]);
         t[k] = before;
         d_red = fmaL(weight, g_red[k], d_red);

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
+from tiny import write_scene
 
 from clsplat.cli import main
-from clsplat.config import PRESETS, DensityConfig, OptimiserConfig, TrainConfig
+from clsplat.config import PRESETS, DensityConfig, OptimiserConfig, TrainConfig, scheduled
+from clsplat.runs import Run
 
 Capture = pytest.CaptureFixture[str]
 
@@ -80,3 +82,28 @@ def test_an_evaluation_after_the_last_step(tmp_path: Path, capsys: Capture) -> N
     line = refused(["--eval-at", "300,500,1000", "--iterations", "499"], tmp_path, capsys)
     assert line == "clsplat: error: --eval-at 500: training ends before that, expected at most --iterations 499\n"
     TrainConfig(iterations=500, eval_at=(300, 500)).check()
+
+
+def test_the_papers_schedule_is_the_default() -> None:
+    assert scheduled("paper", 30_000) == TrainConfig()
+    assert scheduled("paper", 7000) == TrainConfig(iterations=7000)
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 13, 7000, 30_000])
+def test_the_short_schedule_makes_sense_for_any_number_of_steps(iterations: int) -> None:
+    config = scheduled("short", iterations)
+    config.check()
+    assert config.iterations == config.optimiser.means_rate_steps == iterations
+    assert config.density.stop + config.optimiser.cooldown <= iterations
+
+
+def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> None:
+    scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
+    short = ["--schedule", "short"]
+    flags = ["--iterations", "14", "--preset", "fast", "--optimiser.opacities-rate", "0.04"]
+    assert main(["train", str(scene), "-o", str(run), *short, *flags]) == 0
+    wanted = scheduled("short", 14)
+    wanted = replace(wanted, optimiser=replace(wanted.optimiser, opacities_rate=0.04), rasterizer=PRESETS["fast"])
+    assert Run.open(run).config == wanted, "flags go before the bundles, which go together"
+    assert main(["train", "-o", str(run), "--resume", *short]) == 2
+    assert "--schedule short and --resume" in capsys.readouterr().err

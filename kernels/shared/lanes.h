@@ -1,5 +1,5 @@
-// floatL: LANES neighbouring pixels of a row, one name for float, float8 and float16. Masks are intL, all bits of a
-// lane set or none (LANES > 1) or 0 and 1 (LANES == 1), as the comparison operators give them.
+// floatL: LANES pixels, one name for float, float8 and float16. MASKL(comparison) is an intL, all bits of a lane set or
+// none; the comparison operators alone give 0 and 1 at LANES == 1.
 #ifndef LANES
 #error "LANES must be defined: pixels per vector, 1, 4, 8 or 16"
 #endif
@@ -10,6 +10,7 @@ typedef float floatL;
 typedef int intL;
 #define AS_INTL(x) as_int(x)
 #define AS_FLOATL(x) as_float(x)
+#define MASKL(condition) (-(condition))
 #define TO_INTL(x) ((int)(x))
 #define TO_FLOATL(x) ((float)(x))
 #define LOADL(p) (*(p))
@@ -21,6 +22,7 @@ typedef CAT(float, LANES) floatL;
 typedef CAT(int, LANES) intL;
 #define AS_INTL(x) CAT(as_int, LANES)(x)
 #define AS_FLOATL(x) CAT(as_float, LANES)(x)
+#define MASKL(condition) (condition)
 #define TO_INTL(x) CAT(convert_int, LANES)(x)
 #define TO_FLOATL(x) CAT(convert_float, LANES)(x)
 typedef floatL floatU __attribute__((aligned(4))); // vload and vstore are slow calls in PoCL 3.0
@@ -126,7 +128,7 @@ static inline float8 sums8(floatL x0, floatL x1, floatL x2, floatL x3, floatL x4
 // polynomial is in Estrin's order: blending waits for what its longest chain of operations takes.
 static inline floatL exp2L(floatL x) {
   const floatL t = x + 12582912.0f;
-  const floatL f = x - (t - 12582912.0f);
+  const floatL f = x + (12582912.0f - t);
   const floatL f2 = f * f;
   const floatL low = fmaL(f, (floatL)(6.931469025e-1f), (floatL)(1.0f));
   const floatL middle = fmaL(f, (floatL)(5.550900067e-2f), (floatL)(2.402225277e-1f));
