@@ -185,7 +185,24 @@ class Bench:
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
 
-Verb = Devices | Demo | Sfm | Train | Eval | Render | Bench
+@dataclass(frozen=True)
+class Tune:
+    """Find the quickest shape of the kernels for a device by a short trial, and keep it for later runs.
+
+    A run that is resumed, or repeated for the same bytes, wants the shape that it had. CLSPLAT_SHAPE=LANESxITEMS goes
+    before what is kept.
+    """
+
+    device: Device = None
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
+    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    forget: Flag = False
+    """Go back to the default shape, without a trial."""
+    json: Flag = False
+    """Print the result as JSON."""
+
+
+Verb = Devices | Demo | Sfm | Train | Eval | Render | Bench | Tune
 Commands = (
     Annotated[Devices, subcommand("devices")]
     | Annotated[Demo, subcommand("demo")]
@@ -194,6 +211,7 @@ Commands = (
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Render, subcommand("render")]
     | Annotated[Bench, subcommand("bench")]
+    | Annotated[Tune, subcommand("tune")]
 )
 DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
 

@@ -4,7 +4,8 @@
 The demo and the tests of structure from motion need photos that carry no licence and no known poses, and that
 no splat renderer has touched. Everything in the scene is diffuse but for a mild highlight on the two balls, so its
 light (sun with soft shadows, sky) is baked into one texture per object, and a photo is a nearest hit and a texture
-look-up per ray. The world is z up, in metres: a paved floor inside a low round wall under a pale sky.
+look-up per ray. The world is z up, in metres: a paved floor inside a round wall so high that no photo shows the sky, of
+which there would be no points to start from: what training puts there may hang in front of another camera.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ SUN = np.array([0.45, -0.35, 0.82], np.float32) / np.float32(np.sqrt(0.45**2 + 0
 SUN_LIGHT = np.array([0.80, 0.74, 0.64], np.float32)
 SKY_LIGHT = np.array([0.36, 0.40, 0.47], np.float32)
 SHADOW_RAYS = 24
-WALL_RADIUS, WALL_HEIGHT = 3.4, 1.7
+WALL_RADIUS, WALL_HEIGHT = 3.4, 2.8
 CENTRE = np.array([0.0, 0.0, 0.35], np.float32)
 FIELD_OF_VIEW = np.deg2rad(62.0)
 
@@ -302,7 +303,7 @@ def still_life() -> list[Surface]:
     green = ((0.08, 0.20, 0.14), (0.24, 0.48, 0.28), (0.70, 0.80, 0.46))
     return [
         Floor(768, 768),
-        Wall(192, 2048),
+        Wall(320, 2048),
         Ball(192, 384, 0.25, centre=(0.05, -0.1, 0.48), radius=0.48, palette=marble),
         Ball(96, 192, 0.25, centre=(0.72, 0.62, 0.24), radius=0.24, palette=amber),
         Box(128, 768, centre=(-0.85, 0.35, 0.42), half=(0.30, 0.26, 0.42), turn=0.5, palette=red),

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from clsplat.cli import Bench, Demo, Devices, Eval, Render, Sfm, Train, Verb
+from clsplat.cli import Bench, Demo, Devices, Eval, Render, Sfm, Train, Tune, Verb
 from clsplat.errors import DeviceError, InputError
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ def run(verb: Verb) -> int:
             return render(verb)
         case Bench():
             return bench(verb)
+        case Tune():
+            return tune(verb)
 
 
 def devices(verb: Devices) -> int:
@@ -422,3 +424,32 @@ def _scores(record: dict[str, Any]) -> str:
 def _print_summary(result: dict[str, Any]) -> None:
     if result["views"]:
         print(f"{len(result['views'])} held-out views  {_scores(result['mean'])}  {result['gaussians']:,} Gaussians")
+
+
+def tune(verb: Tune) -> int:
+    """Print what each shape of the kernels takes, and keep the quickest."""
+    from clsplat.device.context import all_devices, find_device
+    from clsplat.device.shapes import default_shape, save_shape, saved_path
+    from clsplat.tune import tune as try_shapes
+
+    info = find_device(verb.device)
+    device = all_devices()[info.index]
+    if verb.forget:
+        save_shape(device, None)
+        print(f"{info.name} ({info.version.split('  ')[0]}): the default, {default_shape(device)}", file=sys.stderr)
+        return 0
+    trials, best = try_shapes(
+        device, info.index, lambda shape: print(f"trying {shape.lanes} lanes x {shape.items} items", file=sys.stderr)
+    )
+    if verb.json:
+        found = [{"lanes": trial.shape.lanes, "items": trial.shape.items, "ms": trial.ms} for trial in trials]
+        print(
+            json.dumps({"device": info.name, "version": info.version, "best": asdict(best), "trials": found}, indent=2)
+        )
+        return 0
+    for trial in trials:
+        text = "failed" if trial.ms is None else f"{trial.ms:8.2f} ms"
+        mark = "  <- kept" if trial.shape == best else ""
+        print(f"{trial.shape.lanes:2d} lanes x {trial.shape.items:3d} items  {text}{mark}")
+    print(f"in {saved_path()}", file=sys.stderr)
+    return 0

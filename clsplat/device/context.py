@@ -19,27 +19,9 @@ import pyopencl as cl
 
 from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build
+from clsplat.device.shapes import Shape, default_shape, kind_of, shape_of
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError
-
-
-@dataclass(frozen=True)
-class Shape:
-    """How kernels are shaped for a device.
-
-    lanes: pixels per vector in the blend kernels (1 on GPUs); items: work-items per work-group in kernels that
-    co-operate (1 on CPUs, where a group is one sequential loop); chunks: pieces that a scan or sort is cut into at
-    `items` == 1.
-    """
-
-    lanes: int
-    items: int
-    chunks: int
-
-    @property
-    def digit_bits(self) -> int:
-        """Radix sort digit: a counter per digit and item has to fit local memory."""
-        return 11 if self.items == 1 else 4
 
 
 @dataclass(frozen=True)
@@ -56,7 +38,8 @@ class DeviceInfo:
     shape: str
 
 
-def _all_devices() -> list[cl.Device]:
+def all_devices() -> list[cl.Device]:
+    """Every OpenCL device that is visible, in the order of its index."""
     try:
         platforms = cl.get_platforms()
     except cl.Error:
@@ -70,43 +53,18 @@ def _all_devices() -> list[cl.Device]:
     return devices
 
 
-def _kind(device: cl.Device) -> str:
-    if device.type & cl.device_type.GPU:
-        return "gpu"
-    return "cpu" if device.type & cl.device_type.CPU else "other"
-
-
-def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
-    words = device.platform.version.split()
-    if "PoCL" not in words:
-        return None
-    digits = words[words.index("PoCL") + 1].split("-")[0].split("+")[0].split(".")
-    return int(digits[0]), int(digits[1])
-
-
-def default_shape(device: cl.Device) -> Shape:
-    """The shape by type and vector width; why there are several is in docs/decisions/0003-one-source-many-shapes.md."""
-    if _kind(device) != "cpu":
-        items = next((n for n in (256, 128, 64, 32, 16) if n <= device.max_work_group_size), 1)
-        return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
-    lanes = 16 if device.native_vector_width_float >= 16 else 8
-    if _pocl_version(device) == (3, 0):
-        lanes = 8  # its compiler aborts on some float16 built-ins
-    return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units)
-
-
 def list_devices() -> list[DeviceInfo]:
     """Every OpenCL device that is visible, GPUs and CPUs, in the order of their index."""
     infos = []
-    for index, device in enumerate(_all_devices()):
-        shape = default_shape(device)
+    for index, device in enumerate(all_devices()):
+        shape = shape_of(device)
         infos.append(
             DeviceInfo(
                 index=index,
                 name=device.name.strip(),
                 platform=device.platform.name.strip(),
                 version=device.platform.version.strip(),
-                kind=_kind(device),
+                kind=kind_of(device),
                 compute_units=device.max_compute_units,
                 memory_bytes=device.global_mem_size,
                 shape=f"{shape.lanes} lanes x {shape.items} items",
@@ -122,7 +80,7 @@ class Device:
         self.cl_device = device
         self.name = device.name.strip()
         self.driver = device.platform.version.strip()
-        self.kind = _kind(device)
+        self.kind = kind_of(device)
         self.shape = shape or default_shape(device)
         self.max_allocation = int(device.max_mem_alloc_size)
         self.context = cl.Context([device])
@@ -189,7 +147,7 @@ def select(selector: str | None) -> cl.Device:
 
     Without one: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
     """
-    devices, infos = _all_devices(), list_devices()
+    devices, infos = all_devices(), list_devices()
     if not devices:
         raise DeviceError("no OpenCL device found: install a driver, or the CPU one with: pip install 'pyopencl[pocl]'")
     selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
@@ -207,15 +165,16 @@ def select(selector: str | None) -> cl.Device:
 def find_device(selector: str | None) -> DeviceInfo:
     """What is listed of the device that `selector` names (see `select`). Raises DeviceError."""
     chosen = select(selector)
-    return list_devices()[_all_devices().index(chosen)]
+    return list_devices()[all_devices().index(chosen)]
 
 
 @lru_cache(maxsize=8)
 def _open(index: int) -> Device:
-    return Device(_all_devices()[index])
+    device = all_devices()[index]
+    return Device(device, shape_of(device))
 
 
 def open_device(selector: str | None = None) -> Device:
     """Open the device that `selector` names (see `select`); the same object for the same device."""
     chosen: Any = select(selector)
-    return _open(_all_devices().index(chosen))
+    return _open(all_devices().index(chosen))

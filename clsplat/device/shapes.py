@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How kernels are shaped for a device: by rule, as `clsplat tune` found it, or as CLSPLAT_SHAPE says."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pyopencl as cl
+
+from clsplat.errors import DeviceError
+
+LANES = (1, 4, 8, 16)
+"""Pixels that a vector can have."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How kernels are shaped for a device.
+
+    lanes: pixels per vector in the blend kernels (1 on GPUs); items: work-items per work-group in kernels that
+    co-operate (1 on CPUs, where a group is one sequential loop); chunks: pieces that a scan or sort is cut into at
+    `items` == 1.
+    """
+
+    lanes: int
+    items: int
+    chunks: int
+
+    @property
+    def digit_bits(self) -> int:
+        """Radix sort digit: a counter per digit and item has to fit local memory."""
+        return 11 if self.items == 1 else 4
+
+
+def kind_of(device: cl.Device) -> str:
+    """cpu, gpu or other."""
+    if device.type & cl.device_type.GPU:
+        return "gpu"
+    return "cpu" if device.type & cl.device_type.CPU else "other"
+
+
+def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
+    words = device.platform.version.split()
+    if "PoCL" not in words:
+        return None
+    digits = words[words.index("PoCL") + 1].split("-")[0].split("+")[0].split(".")
+    return int(digits[0]), int(digits[1])
+
+
+def default_shape(device: cl.Device) -> Shape:
+    """The shape by type and vector width; why there are several is in docs/decisions/0003-one-source-many-shapes.md."""
+    if kind_of(device) != "cpu":
+        items = next((n for n in (256, 128, 64, 32, 16) if n <= device.max_work_group_size), 1)
+        return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
+    lanes = 16 if device.native_vector_width_float >= 16 else 8
+    if _pocl_version(device) == (3, 0):
+        lanes = 8  # its compiler aborts on some float16 built-ins
+    return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units)
+
+
+def candidates(device: cl.Device) -> list[Shape]:
+    """The shapes that are worth a trial, the default first."""
+    default = default_shape(device)
+    if kind_of(device) == "cpu":
+        others = [replace(default, lanes=lanes) for lanes in (16, 8)]
+    else:
+        others = [replace(default, items=items) for items in (256, 128, 64) if items <= device.max_work_group_size]
+    return [default, *(shape for shape in others if shape != default)]
+
+
+def shape_of(device: cl.Device) -> Shape:
+    """What a device that is opened by name gets. Raises DeviceError for a CLSPLAT_SHAPE that makes no sense."""
+    default = default_shape(device)
+    text = os.environ.get("CLSPLAT_SHAPE")
+    if not text:
+        text = saved_shapes().get(_key(device), "")
+        return _parsed(text, default) or default
+    shape = _parsed(text, default)
+    if shape is None:
+        raise DeviceError(f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16")
+    return shape
+
+
+def _parsed(text: str, default: Shape) -> Shape | None:
+    match = re.fullmatch(r"(\d+)x(\d+)", text.strip())
+    if match is None:
+        return None
+    lanes, items = int(match[1]), int(match[2])
+    if lanes not in LANES or items < 1 or items & (items - 1):
+        return None
+    return replace(default, lanes=lanes, items=items)
+
+
+def saved_path() -> Path:
+    """Where `clsplat tune` keeps what it found."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache) / "clsplat" / "shapes.json"
+
+
+def saved_shapes() -> dict[str, str]:
+    """LANESxITEMS by device and driver. A file that is none of ours is passed over with a warning."""
+    path = saved_path()
+    try:
+        saved = json.loads(path.read_text())
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError):
+        saved = None
+    if not isinstance(saved, dict) or not all(isinstance(value, str) for value in saved.values()):
+        warnings.warn(f"{path}: not a list of shapes, passed over; clsplat tune writes it anew", stacklevel=2)
+        return {}
+    return saved
+
+
+def save_shape(device: cl.Device, shape: Shape | None) -> None:
+    """Keep this for the device with the driver that it has; None forgets. Raises OSError."""
+    from clsplat.files import atomic_write
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        saved = saved_shapes()
+    saved.pop(_key(device), None)
+    if shape is not None:
+        saved[_key(device)] = f"{shape.lanes}x{shape.items}"
+    path = saved_path()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, (json.dumps(saved, indent=2, sort_keys=True) + "\n").encode())
+
+
+def _key(device: cl.Device) -> str:
+    return f"{device.name.strip()} | {device.platform.version.strip()} | {device.driver_version.strip()}"

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shape of a device's kernels: by rule, by trial, by hand; and what was kept by a trial is found again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from pipeline import shaped
+
+from clsplat import tune
+from clsplat.cli import main
+from clsplat.device.context import Device, list_devices
+from clsplat.device.shapes import Shape, candidates, default_shape, save_shape, saved_path, saved_shapes, shape_of
+from clsplat.errors import DeviceError
+
+Capture = pytest.CaptureFixture[str]
+A, B, C = Shape(8, 1, 8), Shape(16, 1, 8), Shape(4, 1, 8)
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("CLSPLAT_SHAPE", raising=False)
+
+
+@pytest.mark.parametrize(
+    ("ms", "wanted"),
+    [
+        ((10.0, 12.0, 11.0), A),
+        ((10.0, 9.8, 11.0), A),  # within the noise
+        ((10.0, 9.0, 8.0), C),
+        ((None, 9.0, None), B),
+        ((10.0, None, None), A),
+        ((None, None, None), A),
+    ],
+)
+def test_the_default_stays_unless_another_is_clearly_quicker(ms: tuple[float | None, ...], wanted: Shape) -> None:
+    assert tune.choose([tune.Trial(shape, found) for shape, found in zip((A, B, C), ms, strict=True)]) == wanted
+
+
+def test_candidates_begin_with_the_default(default_device: Device) -> None:
+    found = candidates(default_device.cl_device)
+    assert found[0] == default_shape(default_device.cl_device)
+    assert len(set(found)) == len(found) > 1
+
+
+def test_what_was_kept_is_found_again_and_forgotten(default_device: Device) -> None:
+    device = default_device.cl_device
+    other = replace(default_shape(device), lanes=4, items=2)
+    save_shape(device, other)
+    assert shape_of(device) == other
+    assert any(info.shape == "4 lanes x 2 items" for info in list_devices())
+    save_shape(device, None)
+    assert shape_of(device) == default_shape(device)
+
+
+def test_the_environment_goes_first(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = default_device.cl_device
+    save_shape(device, replace(default_shape(device), lanes=4))
+    monkeypatch.setenv("CLSPLAT_SHAPE", "1x64")
+    assert shape_of(device) == replace(default_shape(device), lanes=1, items=64)
+
+
+@pytest.mark.parametrize("text", ["fast", "8", "3x1", "8x0", "8x3", "8x-1"])
+def test_a_shape_that_makes_no_sense(text: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setenv("CLSPLAT_SHAPE", text)
+    assert main(["devices"]) == 2
+    assert f"CLSPLAT_SHAPE={text}: expected LANESxITEMS" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", ["no JSON", "[]", '{"a": 1}'])
+def test_a_broken_file_is_passed_over(content: str, default_device: Device) -> None:
+    saved_path().parent.mkdir(parents=True)
+    saved_path().write_text(content)
+    with pytest.warns(UserWarning, match=r"shapes\.json: not a list of shapes"):
+        assert shape_of(default_device.cl_device) == default_shape(default_device.cl_device)
+    save_shape(default_device.cl_device, replace(default_shape(default_device.cl_device), lanes=4))
+    assert list(saved_shapes().values()) == ["4x1"], "it is written anew"
+
+
+def test_measure_in_several_shapes(default_device: Device) -> None:
+    for shape in ((8, 1), (1, 64)):
+        assert tune.measure(shaped(default_device, *shape), (300, 70, 50), repeat=1) > 0
+
+
+def test_a_candidate_that_fails(default_device: Device) -> None:
+    index = next(info.index for info in list_devices() if info.version == default_device.driver)
+    assert tune._in_a_process(index, Shape(3, 1, 8)) is None
+
+
+def test_the_verb(default_device: Device, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    device = default_device.cl_device
+    chosen = candidates(device)[1]
+    monkeypatch.setattr(tune, "_in_a_process", lambda _index, shape: 5.0 if shape == chosen else 7.0)
+    name = str(next(info.index for info in list_devices() if info.version == default_device.driver))
+    assert main(["tune", "--device", name, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["best"]["lanes"], result["best"]["items"]) == (chosen.lanes, chosen.items)
+    assert shape_of(device) == chosen
+    assert main(["tune", "--device", name]) == 0
+    assert "5.00 ms  <- kept" in capsys.readouterr().out
+    assert main(["tune", "--device", name, "--forget"]) == 0
+    assert shape_of(device) == default_shape(device)
+
+
+def test_no_such_device(capsys: Capture) -> None:
+    assert main(["tune", "--device", "abacus"]) == 2
+    assert "abacus" in capsys.readouterr().err
+
+
+def test_device_error_is_of_input(monkeypatch: pytest.MonkeyPatch, default_device: Device) -> None:
+    monkeypatch.setenv("CLSPLAT_SHAPE", "x")
+    with pytest.raises(DeviceError):
+        shape_of(default_device.cl_device)
