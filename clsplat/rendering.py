@@ -15,6 +15,7 @@ from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device, open_device
 from clsplat.device.switches import kernel_defines
 from clsplat.gaussians import Gaussians
+from clsplat.memory import parse_bytes
 from clsplat.stages.blend import Blended, blend, blend_grad
 from clsplat.stages.duplicate import Pairs, duplicate
 from clsplat.stages.project import (
@@ -147,6 +148,8 @@ def render(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     *,
     device: str | None = None,
+    max_device_mem: str | int | None = None,
 ) -> RenderResult:
-    """Render one view on the device that `device` names (see `clsplat devices`). Raises DeviceError."""
-    return Renderer(open_device(device)).render(gaussians, camera, background)
+    """Render one view on the device that `device` names (see `clsplat devices`), with at most `max_device_mem` of its
+    memory, such as "256MiB". Raises DeviceError."""
+    return Renderer(open_device(device, parse_bytes(max_device_mem))).render(gaussians, camera, background)

@@ -20,6 +20,7 @@ from clsplat.device.context import Device, open_device
 from clsplat.errors import ClsplatError
 from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
+from clsplat.memory import parse_bytes
 from clsplat.rendering import Renderer
 from clsplat.runs import Run
 from clsplat.stages.loss import Loss
@@ -140,20 +141,22 @@ def train(
     config: TrainConfig | None = None,
     *,
     device: Device | str | None = None,
+    max_device_mem: str | int | None = None,
     run: Run | None = None,
     resume: bool = False,
     on_step: Callable[[StepReport], None] | None = None,
 ) -> Gaussians:
     """Train on a scene; the model.
 
-    device: open, or as `clsplat devices` names it; run: a folder for metrics, checkpoints, held-out renders and
+    device: open, or as `clsplat devices` names it, then with at most `max_device_mem` of its memory, such as "256MiB";
+    run: a folder for metrics, checkpoints, held-out renders and
     the model, or None for none of them; resume: go on from the run's latest checkpoint; on_step: called every
     REPORT_EVERY steps. Raises InputError for a scene without views, ClsplatError for a loss that is not finite, and
     KeyboardInterrupt on Ctrl-C after a checkpoint has been written.
     """
     config = config or TrainConfig()
     config.check()
-    opened = device if isinstance(device, Device) else open_device(device)
+    opened = device if isinstance(device, Device) else open_device(device, parse_bytes(max_device_mem))
     session = _Session(Trainer(scene, config, opened), run)
     trainer = session.trainer
     if resume:

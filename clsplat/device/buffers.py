@@ -67,8 +67,15 @@ class DeviceArray:
         return DeviceArray(self.device, self.buffer, shape, self.dtype)
 
 
+class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
+    """A buffer that can be referred to weakly, as the account of the device's memory wants."""
+
+
 def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:
-    """A new array, its buffer of at least `capacity` elements. Raises CapacityError over the device's limit."""
+    """A new array, its buffer of at least `capacity` elements.
+
+    Raises CapacityError over the device's limit of one buffer, the limit of all (`Device.memory`), or what it has.
+    """
     kind = np.dtype(dtype)
     elements = max(int(np.prod(shape, dtype=np.int64)), capacity, 1)
     nbytes = elements * kind.itemsize
@@ -78,7 +85,16 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
             f"a buffer of {nbytes / 2**20:.0f} MiB is needed and {device.name} allows {limit / 2**20:.0f} MiB: "
             "use a smaller resolution or fewer Gaussians (--density.max-gaussians)"
         )
-    return DeviceArray(device, cl.Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes), shape, kind)
+    device.memory.check(nbytes)
+    try:
+        buffer = _Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes)
+    except cl.MemoryError:
+        raise CapacityError(
+            f"{device.name} has no memory left for a buffer of {nbytes / 2**20:.0f} MiB, beside the "
+            f"{device.memory.used / 2**20:.0f} MiB in use: give --max-device-mem less than that"
+        ) from None
+    device.memory.add(buffer, nbytes)
+    return DeviceArray(device, buffer, shape, kind)
 
 
 def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
@@ -89,7 +105,8 @@ def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 
 class Workspace:
-    """Scratch arrays by name. A name's buffer is kept from call to call and grows by half when it is too small."""
+    """Scratch arrays by name. A name's buffer is kept from call to call and grows by half when it is too small; to just
+    what is needed where the device's memory is limited."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -101,10 +118,16 @@ class Workspace:
         elements = int(np.prod(shape, dtype=np.int64))
         held = self._arrays.get(name)
         if held is None or held.buffer.size < elements * kind.itemsize:
-            spare = 0 if held is None else min(elements * 3 // 2, self._device.max_allocation // kind.itemsize)
-            held = allocate(self._device, (elements,), kind, max(elements, spare))
-            self._arrays[name] = held
+            roomy = held is not None and self._device.memory.limit is None
+            spare = min(elements * 3 // 2, self._device.max_allocation // kind.itemsize) if roomy else 0
+            held = self._arrays.pop(name, None)
+            del held  # before its successor is made: there need not be room for both
+            held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
         return DeviceArray(self._device, held.buffer, shape, kind)
+
+    def clear(self) -> None:
+        """Let go of every buffer."""
+        self._arrays.clear()
 
     @property
     def nbytes(self) -> int:
