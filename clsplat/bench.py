@@ -143,10 +143,20 @@ def bench(
         return rasterizer.forward(gaussians, subject.camera, trainer.background)
 
     frame = draw()
-    contributing, evaluated = count_pairs(
-        rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background, subject.camera
-    )
-    visible, listed = frame.pairs.gaussian_from_rank.shape[0], frame.pairs.tile_keys.shape[0]
+    visible = int(np.count_nonzero(frame.projected.tile_counts.get()))
+    listed = contributing = evaluated = 0
+    for part in rasterizer.parts(frame):
+        listed += part.counted.pairs
+        added, looked_at = count_pairs(
+            rasterizer.device,
+            rasterizer.work,
+            part.lists,
+            frame.projected.splats,
+            frame.background,
+            subject.camera,
+            part.band,
+        )
+        contributing, evaluated = contributing + added, evaluated + looked_at
     in_frame = _measure(device, draw, repeat)
     say("training step", None)
     in_step = _measure(device, trainer.train_step, repeat)

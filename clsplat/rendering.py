@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,14 +13,17 @@ from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device, open_device
+from clsplat.device.layout import SLOT_ABSOLUTE
 from clsplat.device.switches import kernel_defines
 from clsplat.gaussians import Gaussians
 from clsplat.memory import parse_bytes
 from clsplat.stages.blend import Blended, blend, blend_grad
-from clsplat.stages.duplicate import Pairs, duplicate
+from clsplat.stages.duplicate import MAX_PAIRS, Band, Counted, Pairs, count, count_band, duplicate, plan_bands
 from clsplat.stages.project import (
     DeviceGaussians,
     Projected,
+    Slots,
+    add_slots,
     pack_camera,
     project,
     project_grad,
@@ -33,37 +36,85 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
+class Part:
+    """What is listed and blended together: a band of tiles and its pairs."""
+
+    band: Band
+    counted: Counted
+    pairs: Pairs
+    lists: TileLists
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
-    """One forward pass: every stage's arrays, valid until the rasterizer's next forward pass."""
+    """One forward pass: every stage's arrays, valid until the rasterizer's next forward pass.
+
+    bands: one of all tiles, unless memory is short; then `part` is the last one's.
+    """
 
     camera: Camera
     camera_array: DeviceArray
     background: DeviceArray
     projected: Projected
-    pairs: Pairs
-    lists: TileLists
+    bands: tuple[Band, ...]
+    part: Part
     blended: Blended
+
+    @property
+    def pairs(self) -> Pairs:
+        """Of all tiles, if there is one band."""
+        return self.part.pairs
+
+    @property
+    def lists(self) -> TileLists:
+        """Of all tiles, if there is one band."""
+        return self.part.lists
 
 
 class Rasterizer:
-    """The pipeline on one device, with the memory that it works in, which can be another's."""
+    """The pipeline on one device, with the memory that it works in, which can be another's.
+
+    capacity: most (tile, Gaussian) pairs that are worked on together; the plan of who owns the rasterizer.
+    """
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
         self.device = device.with_switches(kernel_defines(self.config))
         self.work = work or Workspace(device)
+        self.capacity = min(device.max_allocation // (4 * SLOT_ABSOLUTE), MAX_PAIRS)
 
     def forward(self, gaussians: DeviceGaussians, camera: Camera, background: DeviceArray) -> Frame:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2)."""
         device, work = self.device, self.work
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
         camera_array.set(pack)
-        tiles_x, tiles_y = tiles_of(camera)
         projected = project(device, work, gaussians, camera, camera_array)
-        pairs = duplicate(device, work, projected, (tiles_x, tiles_y))
-        lists = tile_lists(device, work, pairs, tiles_x * tiles_y)
-        blended = blend(device, work, lists, projected.splats, background, camera.width, camera.height)
-        return Frame(camera, camera_array, background, projected, pairs, lists, blended)
+        counted = count(device, work, projected.tile_counts)
+        bands = self._plan(projected, counted, tiles_of(camera))
+        for part in self._parts(projected, bands, tiles_of(camera), counted):
+            lists, band = part.lists, part.band
+            blended = blend(device, work, lists, projected.splats, background, camera.width, camera.height, band)
+        return Frame(camera, camera_array, background, projected, bands, part, blended)
+
+    def parts(self, frame: Frame) -> Iterator[Part]:
+        """Band after band of the frame; where there are several, each takes the memory of the one before."""
+        if len(frame.bands) == 1:
+            return iter([frame.part])
+        return self._parts(frame.projected, frame.bands, tiles_of(frame.camera))
+
+    def _plan(self, projected: Projected, counted: Counted, tiles: tuple[int, int]) -> tuple[Band, ...]:
+        if counted.pairs <= self.capacity:
+            return (Band(0, tiles[0] * tiles[1]),)
+        return plan_bands(self.device, self.work, projected, tiles, self.capacity)
+
+    def _parts(
+        self, projected: Projected, bands: tuple[Band, ...], tiles: tuple[int, int], whole: Counted | None = None
+    ) -> Iterator[Part]:
+        device, work = self.device, self.work
+        for band in bands:
+            counted = whole if whole and len(bands) == 1 else count_band(device, work, projected, tiles, band)
+            pairs = duplicate(device, work, projected.splats, counted, tiles, band)
+            yield Part(band, counted, pairs, tile_lists(device, work, pairs, band.tiles))
 
     def backward(
         self,
@@ -75,30 +126,35 @@ class Rasterizer:
         absolute: bool = False,
     ) -> DeviceArray:
         """Fill the visible rows of `gradients`; returns the gradient of the means on the image, (n, 2), in pixels."""
-        device, work = self.device, self.work
-        slots = blend_grad(
-            device,
-            work,
-            frame.lists,
-            frame.projected.splats,
-            frame.background,
-            frame.blended,
-            image_gradient,
-            absolute=absolute,
-        )
-        screen = work.array("screen", (gaussians.count, 2))
+        slots = self.pair_gradients(frame, image_gradient, absolute=absolute)
+        screen = self.work.array("screen", (gaussians.count, 2))
         project_grad(
-            device,
-            gaussians,
-            frame.camera_array,
-            frame.projected,
-            frame.pairs.first_slots,
-            slots,
-            gradients,
-            screen,
-            absolute=absolute,
+            self.device, gaussians, frame.camera_array, frame.projected, slots, gradients, screen, absolute=absolute
         )
         return screen
+
+    def pair_gradients(self, frame: Frame, image_gradient: DeviceArray, *, absolute: bool = False) -> Slots:
+        """The gradient of blending: of every pair, or with several bands their sums by Gaussian."""
+        device, work, projected = self.device, self.work, frame.projected
+        sums = None
+        for part in self.parts(frame):
+            values = blend_grad(
+                device,
+                work,
+                part.lists,
+                projected.splats,
+                frame.background,
+                frame.blended,
+                image_gradient,
+                part.band,
+                absolute=absolute,
+            )
+            slots = Slots(values, part.counted.first_slots)
+            if len(frame.bands) == 1:
+                return slots
+            sums = add_slots(device, work, part.counted.tile_counts, slots, sums, absolute=absolute)
+        assert sums is not None
+        return Slots(sums)
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,7 +124,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         run.write_eval({"step": 1, "gaussians": 4, "seconds": 2.5, "mean": {"psnr": 20.0, "ssim": 0.5}, "views": [{}]})
         return gaussians
 
-    def open_device(selector: str | None) -> FakeDevice:
+    def open_device(selector: str | None, memory_limit: int | None = None) -> FakeDevice:
         if selector == "nosuch":
             raise DeviceError("--device nosuch: no such device")
         return FakeDevice()

@@ -141,32 +141,70 @@ def project(
     return Projected(splats, tile_counts)
 
 
+@dataclass(frozen=True, eq=False)
+class Slots:
+    """values (pairs, SLOT), where those of Gaussian i begin at first_slots[i]; without first_slots they are added up
+    already: (n, SLOT)."""
+
+    values: DeviceArray
+    first_slots: DeviceArray | None = None
+
+
+@stage("project_grad")
+def add_slots(
+    device: Device,
+    work: Workspace,
+    tile_counts: DeviceArray,
+    slots: Slots,
+    sums: DeviceArray | None,
+    *,
+    absolute: bool = False,
+) -> DeviceArray:
+    """Add one band's slots to the sums by Gaussian (n, SLOT), which begin as None; bands have to come in order."""
+    (n,) = tile_counts.shape
+    if sums is None:
+        sums = work.array("slot_sums", (n, slots.values.shape[1]))
+        sums.fill(0.0)
+    defines = {"ABSOLUTE_GRADIENTS": True} if absolute else {}
+    launch_items(
+        device,
+        device.kernels("project_grad", **defines).add_slots,
+        n if slots.values.shape[0] else 0,
+        n,
+        tile_counts,
+        slots.first_slots,
+        slots.values,
+        sums,
+    )
+    return sums
+
+
 @stage("project_grad")
 def project_grad(
     device: Device,
     gaussians: DeviceGaussians,
     camera_array: DeviceArray,
     projected: Projected,
-    first_slots: DeviceArray,
-    slots: DeviceArray,
+    slots: Slots,
     gradients: DeviceGaussians,
     screen: DeviceArray,
     *,
     absolute: bool = False,
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` and `screen` (n, 2) from the pairs' slots."""
-    defines = {"ABSOLUTE_GRADIENTS": True} if absolute else {}
+    defines = {"ABSOLUTE_GRADIENTS": absolute, "ADDED_UP": slots.first_slots is None}
+    defines = {name: True for name, wanted in defines.items() if wanted}
     n = gaussians.count
     launch_items(
         device,
         device.kernels("project_grad", **defines).project_grad,
-        -(-n // device.shape.lanes) if slots.shape[0] else 0,
+        -(-n // device.shape.lanes) if slots.values.shape[0] else 0,
         n,
         gaussians.coefficients,
         camera_array,
         projected.tile_counts,
-        first_slots,
-        slots,
+        slots.first_slots or projected.tile_counts,  # not looked at where they are added up
+        slots.values,
         projected.splats,
         *(gaussians[group] for group in GROUPS),
         *(gradients[group] for group in GROUPS),
