@@ -16,14 +16,18 @@ from clsplat.device.context import Device, open_device
 from clsplat.device.layout import SLOT_ABSOLUTE
 from clsplat.device.switches import kernel_defines
 from clsplat.gaussians import Gaussians
-from clsplat.memory import parse_bytes
+from clsplat.memory import Plan, parse_bytes
+from clsplat.needs import plan_frame
 from clsplat.stages.blend import Blended, blend, blend_grad
 from clsplat.stages.duplicate import MAX_PAIRS, Band, Counted, Pairs, count, count_band, duplicate, plan_bands
 from clsplat.stages.project import (
+    AnyGaussians,
     DeviceGaussians,
+    HostGaussians,
     Projected,
     Slots,
     add_slots,
+    host_gaussians,
     pack_camera,
     project,
     project_grad,
@@ -83,7 +87,13 @@ class Rasterizer:
         self.work = work or Workspace(device)
         self.capacity = min(device.max_allocation // (4 * SLOT_ABSOLUTE), MAX_PAIRS)
 
-    def forward(self, gaussians: DeviceGaussians, camera: Camera, background: DeviceArray) -> Frame:
+    def follow(self, plan: Plan) -> None:
+        """Work in as much memory as the plan has for it. Under a limit, what an earlier plan has left is let go of."""
+        if self.device.memory.limit is not None:
+            self.work.clear()
+        self.capacity = plan.pairs
+
+    def forward(self, gaussians: AnyGaussians, camera: Camera, background: DeviceArray) -> Frame:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2)."""
         device, work = self.device, self.work
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
@@ -127,10 +137,21 @@ class Rasterizer:
     ) -> DeviceArray:
         """Fill the visible rows of `gradients`; returns the gradient of the means on the image, (n, 2), in pixels."""
         slots = self.pair_gradients(frame, image_gradient, absolute=absolute)
+        return self.row_gradients(gaussians, frame, frame.projected, slots, gradients, absolute=absolute)
+
+    def row_gradients(
+        self,
+        gaussians: DeviceGaussians,
+        frame: Frame,
+        projected: Projected,
+        slots: Slots,
+        gradients: DeviceGaussians,
+        *,
+        absolute: bool = False,
+    ) -> DeviceArray:
+        """The gradient of projection, for some rows or all: as `backward`, from what blending's gradient is."""
         screen = self.work.array("screen", (gaussians.count, 2))
-        project_grad(
-            self.device, gaussians, frame.camera_array, frame.projected, slots, gradients, screen, absolute=absolute
-        )
+        project_grad(self.device, gaussians, frame.camera_array, projected, slots, gradients, screen, absolute=absolute)
         return screen
 
     def pair_gradients(self, frame: Frame, image_gradient: DeviceArray, *, absolute: bool = False) -> Slots:
@@ -177,25 +198,39 @@ class Renderer:
     ) -> None:
         self.device = device or open_device()
         self._rasterizer = rasterizer or Rasterizer(self.device, config)
+        self._rows = 0
         self._background = allocate(self.device, (3,), np.float32)
-        self._held: tuple[Gaussians, DeviceGaussians] | None = None
+        self._held: tuple[Gaussians, AnyGaussians] | None = None
+        self._planned: tuple[int, int, int, int] | None = None
 
     def render(
-        self, gaussians: Gaussians | DeviceGaussians, camera: Camera, background: Sequence[float] = (0.0, 0.0, 0.0)
+        self, gaussians: Gaussians | AnyGaussians, camera: Camera, background: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> RenderResult:
         """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object."""
-        if isinstance(gaussians, Gaussians):
-            if self._held is None or self._held[0] is not gaussians:
-                self._held = (gaussians, upload_gaussians(self.device, gaussians))
-            on_device = self._held[1]
-        else:
-            on_device = gaussians
+        on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
         self._background.set(np.asarray(background, np.float32))
         blended = self._rasterizer.forward(on_device, camera, self._background).blended
         height, width = camera.height, camera.width
         planes = blended.image.get()[:, :height, :width]
         alpha: Float32 = np.float32(1) - blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(planes.transpose(1, 2, 0)), alpha)
+
+    def _hold(self, gaussians: Gaussians, camera: Camera) -> AnyGaussians:
+        """The model on the device, or on the host if a frame of this size leaves too little room for it."""
+        count, coefficients = len(gaussians), gaussians.sh.shape[1]
+        asked = (count, coefficients, camera.width, camera.height)
+        if self._planned != asked:
+            plan = plan_frame(self.device, count, coefficients, camera)
+            self._rasterizer.follow(plan)
+            if plan.streamed or (self._held is not None and isinstance(self._held[1], HostGaussians)):
+                self._held = None
+            self._planned, self._rows = asked, plan.rows if plan.streamed else 0
+        if self._held is None or self._held[0] is not gaussians:
+            self._held = None
+            rows = self._rows
+            held = host_gaussians(gaussians, rows) if rows else upload_gaussians(self.device, gaussians)
+            self._held = (gaussians, held)
+        return self._held[1]
 
 
 def render(

@@ -38,9 +38,7 @@ class DeviceArray:
     def get(self) -> NDArray[Any]:
         """A copy on the host; waits for the device."""
         host = np.empty(self.shape, self.dtype)
-        if host.size:
-            event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=True)
-            self._note("read", event)
+        self.read_into(host)
         return host
 
     def set(self, values: NDArray[Any]) -> None:
@@ -61,6 +59,20 @@ class DeviceArray:
     def _note(self, name: str, event: cl.Event) -> None:
         if self.device.recorder.on:
             self.device.recorder.add(name, event, self.nbytes)
+
+    def read_into(self, host: NDArray[Any]) -> None:
+        """Copy to a C-contiguous array of the same shape on the host; waits for the device."""
+        if host.size:
+            event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=True)
+            self._note("read", event)
+
+    def rows(self, start: int, stop: int) -> DeviceArray:
+        """The rows [start, stop) in place. `start` has to be a multiple of `Device.row_alignment`."""
+        if (start, stop) == (0, self.shape[0]):
+            return self
+        width = self.nbytes // max(self.shape[0], 1)
+        buffer = self.buffer.get_sub_region(start * width, max((stop - start) * width, 1)) if width else self.buffer
+        return DeviceArray(self.device, buffer, (stop - start, *self.shape[1:]), self.dtype)
 
     def reshaped(self, *shape: int) -> DeviceArray:
         """The same memory in another shape, not larger."""

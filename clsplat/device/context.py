@@ -175,6 +175,12 @@ class Device:
         """Bytes that may be in use: the limit, else all that the device has."""
         return self.memory.limit or int(self.cl_device.global_mem_size)
 
+    @property
+    def row_alignment(self) -> int:
+        """Rows of four bytes or more that can be cut off an array in place: OpenCL has sub-buffers begin at multiples
+        of so many; and whole vectors of lanes."""
+        return max(int(self.cl_device.mem_base_addr_align) // 32, self.shape.lanes, 32)
+
     def finish(self) -> None:
         """Wait until the device has nothing to do."""
         self.queue.finish()
