@@ -88,9 +88,10 @@ class Plan:
 
     rows: Gaussians whose parameters, gradients and moments are on the device at once; streamed: not all of them;
     pairs: most (tile, Gaussian) pairs at once; channels: of the loss, at once; gathers: rows move on the device;
-    needed and allowed: bytes, the first estimated.
+    needed and allowed: bytes, the first estimated; groups: of tiles, estimated too.
     """
 
+    gaussians: int
     rows: int
     streamed: bool
     pairs: int
@@ -99,6 +100,11 @@ class Plan:
     needed: int
     allowed: int
     groups: int
+
+    @property
+    def pieces(self) -> tuple[bool, bool, bool]:
+        """What is done in pieces: parameters, image, loss."""
+        return self.streamed, self.groups > 1, self.channels < 3
 
     def __str__(self) -> str:
         """The line that training prints."""
@@ -129,7 +135,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
         pairs = min((room - rows * need.model) // need.pair, most_pairs)
         gathers = not streamed and need.total + need.gaussians * need.model * 3 // 4 <= budget
         groups = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > most_pairs else 1
-        return Plan(rows, streamed, pairs, channels, gathers, need.total, budget, groups)
+        return Plan(need.gaussians, rows, streamed, pairs, channels, gathers, need.total, budget, groups)
 
     whole = made(need.gaussians, streamed=False)
     enough = min(need.pairs // 8, need.gaussians) + 1

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat.cli import Bench, Demo, Devices, Eval, Render, Sfm, Train, Verb
 from clsplat.errors import DeviceError, InputError
-from clsplat.memory import parse_bytes
+from clsplat.memory import Plan, parse_bytes
 
 if TYPE_CHECKING:
     from clsplat.camera import Camera
@@ -161,8 +161,14 @@ def _train_verb(scene: Scene, run: Run, device: Device) -> Gaussians:
     from clsplat.progress import TrainProgress
     from clsplat.training import train as run_training
 
+    def tell(plan: Plan) -> None:
+        if device.memory.limit is not None or any(plan.pieces):
+            print(f"{plan.gaussians:,} Gaussians: {plan}", file=sys.stderr)
+
     with TrainProgress(run.config.iterations) as progress:
-        return run_training(scene, run.config, device=device, run=run, resume=run.resuming, on_step=progress)
+        return run_training(
+            scene, run.config, device=device, run=run, resume=run.resuming, on_step=progress, on_plan=tell
+        )
 
 
 def evaluate(verb: Eval) -> int:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from compare import assert_same_bits
 from scenes import random_cloud
 from tiny import CONFIG, short, write_scene
 
+from clsplat.cli import main
 from clsplat.config import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
@@ -187,3 +189,21 @@ def test_pieces_are_no_smaller_than_need_be() -> None:
         assert parameters + rest <= mebibytes * 2**20
         assert made.streamed == (made.rows < STEP.gaussians)
         assert made.rows % 32 == 0
+
+
+def test_the_command_line_says_what_it_will_do(
+    tmp_path: Path, unlimited: tuple[bytes, int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    call = ["train", str(write_scene(tmp_path / "scene")), "-o", str(tmp_path / "run"), "--iterations", "3"]
+    assert main([*call, "--max-device-mem", "500KiB"]) == 0
+    said = capfd.readouterr().err
+    assert re.search(r"40 Gaussians: about 0\.\d MiB of device memory needed, 0\.5 MiB allowed: the loss is", said), (
+        said
+    )
+    assert main([*call, "--overwrite"]) == 0
+    assert "device memory" not in capfd.readouterr().err
+    assert main(["eval", str(tmp_path / "run"), "--max-device-mem", "10KiB"]) == 1
+    assert "40 Gaussians at this size of image need at least about" in capfd.readouterr().err
+    sparse = str(tmp_path / "scene" / "sparse" / "0")
+    call = ["render", str(tmp_path / "run"), "--cameras", sparse, "-o", str(tmp_path / "{name}.exr")]
+    assert main([*call, "--max-device-mem", "1M"]) == 0

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from clsplat.config import OptimiserConfig
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
@@ -33,7 +35,7 @@ def adam(
             device,
             kernel,
             -(-n // lanes),
-            n,
+            np.uint64(n),  # of SH more than 32 bits count, from 95 million Gaussians on
             rates[group] / (1.0 - beta1**step),
             root,
             beta1,
