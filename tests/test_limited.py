@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -207,3 +208,13 @@ def test_the_command_line_says_what_it_will_do(
     sparse = str(tmp_path / "scene" / "sparse" / "0")
     call = ["render", str(tmp_path / "run"), "--cameras", sparse, "-o", str(tmp_path / "{name}.exr")]
     assert main([*call, "--max-device-mem", "1M"]) == 0
+
+
+def test_bench_under_a_limit(capsys: pytest.CaptureFixture[str]) -> None:
+    call = ["bench", "--gaussians", "2000", "--size", "96x64", "--repeat", "1", "--json"]
+    found = []
+    for limit in ([], ["--max-device-mem", "1.2MiB"]):
+        assert main([*call, *limit]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0]["pairs"] == found[1]["pairs"]
+    assert found[0]["visible"] == found[1]["visible"]

@@ -84,8 +84,12 @@ def count_pairs(
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     items = _items(device)
-    planes = (3, tiles_y * TILE, tiles_x * TILE)
-    scratch = [work.array(f"count_{name}", planes) for name in ("image", "transmittance", "stops")]
+    rows, stride = tiles_y * TILE, tiles_x * TILE
+    planes = (  # those of `blend`: it writes the same values again
+        work.array("image", (3, rows, stride)),
+        work.array("transmittance", (rows, stride)),
+        work.array("stops", (rows, stride), np.int32),
+    )
     tiles = band.tiles if band else tiles_x * tiles_y
     counts = work.array("counts", (tiles * items, 2), np.uint32)
     launch_groups(
@@ -101,7 +105,7 @@ def count_pairs(
         lists.gaussian_from_sorted,
         splats,
         background,
-        *scratch,
+        *planes,
         counts,
     )
     contributing, evaluated = counts.get().sum(axis=0, dtype=np.uint64)
