@@ -145,7 +145,8 @@ def bench(
     frame = draw()
     visible = int(np.count_nonzero(frame.projected.tile_counts.get()))
     listed = contributing = evaluated = 0
-    for part in rasterizer.parts(frame):
+    for band in frame.bands:
+        part = rasterizer.part(frame, band)
         listed += part.counted.pairs
         added, looked_at = count_pairs(
             rasterizer.device,
@@ -154,7 +155,7 @@ def bench(
             frame.projected.splats,
             frame.background,
             subject.camera,
-            part.band,
+            band,
         )
         contributing, evaluated = contributing + added, evaluated + looked_at
     in_frame = _measure(device, draw, repeat)

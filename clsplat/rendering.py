@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,30 +101,32 @@ class Rasterizer:
         projected = project(device, work, gaussians, camera, camera_array)
         counted = count(device, work, projected.tile_counts)
         bands = self._plan(projected, counted, tiles_of(camera))
-        for part in self._parts(projected, bands, tiles_of(camera), counted):
-            lists, band = part.lists, part.band
-            blended = blend(device, work, lists, projected.splats, background, camera.width, camera.height, band)
+        part = None
+        for band in bands:
+            del part  # its arrays may have to make room for larger ones
+            part = self._part(projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
+            blended = blend(
+                device, work, part.lists, projected.splats, background, camera.width, camera.height, part.band
+            )
+        assert part is not None, "an image has a tile"
         return Frame(camera, camera_array, background, projected, bands, part, blended)
 
-    def parts(self, frame: Frame) -> Iterator[Part]:
-        """Band after band of the frame; where there are several, each takes the memory of the one before."""
+    def part(self, frame: Frame, band: Band) -> Part:
+        """What the band lists; where there are several bands it takes the memory of the one before."""
         if len(frame.bands) == 1:
-            return iter([frame.part])
-        return self._parts(frame.projected, frame.bands, tiles_of(frame.camera))
+            return frame.part
+        return self._part(frame.projected, band, tiles_of(frame.camera))
 
     def _plan(self, projected: Projected, counted: Counted, tiles: tuple[int, int]) -> tuple[Band, ...]:
         if counted.pairs <= self.capacity:
             return (Band(0, tiles[0] * tiles[1]),)
         return plan_bands(self.device, self.work, projected, tiles, self.capacity)
 
-    def _parts(
-        self, projected: Projected, bands: tuple[Band, ...], tiles: tuple[int, int], whole: Counted | None = None
-    ) -> Iterator[Part]:
+    def _part(self, projected: Projected, band: Band, tiles: tuple[int, int], counted: Counted | None = None) -> Part:
         device, work = self.device, self.work
-        for band in bands:
-            counted = whole if whole and len(bands) == 1 else count_band(device, work, projected, tiles, band)
-            pairs = duplicate(device, work, projected.splats, counted, tiles, band)
-            yield Part(band, counted, pairs, tile_lists(device, work, pairs, band.tiles))
+        counted = counted or count_band(device, work, projected, tiles, band)
+        pairs = duplicate(device, work, projected.splats, counted, tiles, band)
+        return Part(band, counted, pairs, tile_lists(device, work, pairs, band.tiles))
 
     def backward(
         self,
@@ -158,7 +160,8 @@ class Rasterizer:
         """The gradient of blending: of every pair, or with several bands their sums by Gaussian."""
         device, work, projected = self.device, self.work, frame.projected
         sums = None
-        for part in self.parts(frame):
+        for band in frame.bands:
+            part = self.part(frame, band)
             values = blend_grad(
                 device,
                 work,
@@ -167,13 +170,14 @@ class Rasterizer:
                 frame.background,
                 frame.blended,
                 image_gradient,
-                part.band,
+                band,
                 absolute=absolute,
             )
             slots = Slots(values, part.counted.first_slots)
             if len(frame.bands) == 1:
                 return slots
             sums = add_slots(device, work, part.counted.tile_counts, slots, sums, absolute=absolute)
+            del part, values, slots  # as in `forward`
         assert sums is not None
         return Slots(sums)
 

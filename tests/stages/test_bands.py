@@ -96,7 +96,7 @@ def test_counted_pairs_are_those_of_one_band(default_device: Device) -> None:
         work, splats = run.rasterizer.work, run.frame.projected.splats
         found = [
             count_pairs(default_device, work, part.lists, splats, run.frame.background, run.camera, part.band)
-            for part in run.rasterizer.parts(run.frame)
+            for part in (run.rasterizer.part(run.frame, band) for band in run.frame.bands)
         ]
         return [sum(column) for column in zip(*found, strict=True)]
 
@@ -113,3 +113,17 @@ def test_without_a_pair(default_device: Device) -> None:
     gradients = allocate_gaussians(default_device, on_device.count, on_device.coefficients, zero=True)
     rasterizer.backward(on_device, frame, frame.blended.image, gradients)
     assert not any(gradients[group].get().any() for group in GROUPS)
+
+
+@pytest.mark.parametrize("name", ["random_cloud", "overlap", "many_per_tile"])
+def test_a_larger_band_needs_no_room_for_the_one_before(default_device: Device, name: str) -> None:
+    """Arrays grow from band to band, each freed before its successor is made: memory in use never falls."""
+    capacity = most_in_a_tile(Pipeline.run(default_device, NAMED[name]()))
+    device = default_device.with_memory_limit(2**40)
+    run = in_bands(device, name, capacity)
+    assert len(run.frame.bands) > 1
+    assert device.memory.peak == device.memory.used
+    gradient = upload(device, np.zeros(run.frame.blended.image.shape, np.float32))
+    slots = run.rasterizer.pair_gradients(run.frame, gradient)
+    assert slots.first_slots is None
+    assert device.memory.peak == device.memory.used
