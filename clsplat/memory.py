@@ -79,7 +79,7 @@ class Need:
 PAIRS_EACH = 8
 """Tiles that a Gaussian reaches, as a guess. Trained scenes have 3 to 8."""
 
-_MAX_PAIRS = 2**31 - 1
+_MAX_PAIRS = 2**31 - 1024
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   Lanes basis[16], weight[16];
   sh_basis(SH_USED(coefficients), vx, vy, vz, &basis[0].all);
   for (uint lane = 0; lane < lanes_used; ++lane) {
-    const uint i = first_row + lane;
+    const size_t i = first_row + lane;
     if (tile_counts[i] == 0) continue;
     __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
     const float4 d_colour = (float4)(splat[SPLAT_RED] > 0.0f ? m[SLOT_RED].lane[lane] : 0.0f,
@@ -170,7 +170,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   }
 
   for (uint lane = 0; lane < lanes_used; ++lane) {
-    const uint i = first_row + lane;
+    const size_t i = first_row + lane;
     if (tile_counts[i] == 0) continue;
     for (int k = 0; k < 3; ++k) d_means[3 * i + k] = d_mean[k].lane[lane];
     for (int k = 0; k < 4; ++k) d_quaternions[4 * i + k] = d_quaternion[k].lane[lane];

@@ -22,8 +22,8 @@ _KEY_BITS = 31
 """Bits of a positive float32."""
 
 
-MAX_PAIRS = 2**31 - 1
-"""In one band: `stops` are signed."""
+MAX_PAIRS = 2**31 - 1024
+"""In one band: what `stops` count is signed, and read a little ahead of."""
 
 
 @dataclass(frozen=True)
