@@ -106,6 +106,11 @@ class Plan:
         """What is done in pieces: parameters, image, loss."""
         return self.streamed, self.groups > 1, self.channels < 3
 
+    @property
+    def tight(self) -> bool:
+        """Whether there is no room to spare."""
+        return any(self.pieces) or not self.gathers
+
     def __str__(self) -> str:
         """The line that training prints."""
         how = []

@@ -88,8 +88,9 @@ class Rasterizer:
         self.capacity = min(device.max_allocation // (4 * SLOT_ABSOLUTE), MAX_PAIRS)
 
     def follow(self, plan: Plan) -> None:
-        """Work in as much memory as the plan has for it. Under a limit, what an earlier plan has left is let go of."""
-        if self.device.memory.limit is not None:
+        """Work in as much memory as the plan has for it. Where that is tight, what an earlier plan left goes."""
+        self.work.tight = self.device.memory.limit is not None or plan.tight
+        if self.work.tight:
             self.work.clear()
         self.capacity = plan.pairs
 

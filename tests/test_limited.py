@@ -12,6 +12,7 @@ from compare import assert_same_bits
 from scenes import random_cloud
 from tiny import CONFIG, short, write_scene
 
+import clsplat
 from clsplat.cli import main
 from clsplat.config import TrainConfig
 from clsplat.device.context import Device
@@ -218,3 +219,24 @@ def test_bench_under_a_limit(capsys: pytest.CaptureFixture[str]) -> None:
         found.append(json.loads(capsys.readouterr().out))
     assert found[0]["pairs"] == found[1]["pairs"]
     assert found[0]["visible"] == found[1]["visible"]
+
+
+def test_from_python(scene: Scene) -> None:
+    gaussians, camera = random_cloud(500, 3, 60, 40)
+    wanted = clsplat.render(gaussians, camera).image
+    assert_same_bits(clsplat.render(gaussians, camera, max_device_mem="400KiB").image, wanted)
+    with pytest.raises(CapacityError, match=r"0\.1 MiB are allowed"):
+        clsplat.render(gaussians, camera, max_device_mem=100_000)
+    config, plans = short(iterations=2), []
+    clsplat.train(scene, config, max_device_mem="64MiB", on_plan=plans.append)
+    assert [plan.allowed for plan in plans] == [64 * 2**20]
+
+
+def test_a_device_with_little_memory_needs_no_flag(
+    scene: Scene, default_device: Device, unlimited: tuple[bytes, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = with_limit(default_device, None)
+    budget = int(0.4 * unlimited[1])
+    monkeypatch.setattr(Device, "budget", budget)
+    assert trained(scene, device, tmp_path / "run") == unlimited[0]
+    assert device.memory.peak <= budget

@@ -117,11 +117,12 @@ def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 
 class Workspace:
-    """Scratch arrays by name. A name's buffer is kept from call to call and grows by half when it is too small; to just
-    what is needed where the device's memory is limited."""
+    """Scratch arrays by name. A name's buffer is kept from call to call, and grows by half when it is too small, or
+    where memory is `tight` to just what is needed."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
+        self.tight = device.memory.limit is not None
         self._arrays: dict[str, DeviceArray] = {}
 
     def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> DeviceArray:
@@ -130,7 +131,7 @@ class Workspace:
         elements = int(np.prod(shape, dtype=np.int64))
         held = self._arrays.get(name)
         if held is None or held.buffer.size < elements * kind.itemsize:
-            roomy = held is not None and self._device.memory.limit is None
+            roomy = held is not None and not self.tight
             spare = min(elements * 3 // 2, self._device.max_allocation // kind.itemsize) if roomy else 0
             held = self._arrays.pop(name, None)
             del held  # before its successor is made: there need not be room for both
