@@ -12,9 +12,11 @@ The public names are loaded when they are first used, so that `import clsplat` a
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # typing's own would be an import, in which Ctrl-C is a traceback still: see __main__.py
 if TYPE_CHECKING:
+    from typing import Any
+
     from clsplat.camera import Camera as Camera
     from clsplat.config import TrainConfig as TrainConfig
     from clsplat.gaussians import Gaussians as Gaussians

@@ -1,9 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m clsplat` is `clsplat`."""
+"""`python -m clsplat`, and the command `clsplat`: the command line, with Ctrl-C caught while that is being imported."""
+
+from __future__ import annotations
 
 import sys
 
-from clsplat.cli import main
+
+def main() -> int:
+    """Run the command line in `sys.argv`; returns the exit status."""
+    try:
+        from clsplat.cli import main as run
+
+        return run()
+    except KeyboardInterrupt:  # before the command line could catch it
+        print("clsplat: interrupted", file=sys.stderr)
+        return 130
+
 
 if __name__ == "__main__":
     sys.exit(main())

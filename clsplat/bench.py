@@ -208,7 +208,7 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Measur
     by_events: list[dict[str, StageRecord]] = []
     by_waiting: list[dict[str, StageRecord]] = []
     for _ in range(repeat):
-        walls.append(_wall_ms(device, work))
+        walls.append(wall_ms(device, work))
         for records, wait in ((by_events, False), (by_waiting, True)):
             with device.recorder.recording(device, wait=wait) as stages:
                 work()
@@ -224,7 +224,8 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Measur
     return _Measured(statistics.median(walls), medians, by_wall)
 
 
-def _wall_ms(device: Device, work: Callable[[], object]) -> float:
+def wall_ms(device: Device, work: Callable[[], object]) -> float:
+    """Milliseconds of `work`, from an idle device to an idle device."""
     device.finish()
     start = time.perf_counter()
     work()
@@ -361,7 +362,7 @@ def compare(
     for done in range(repeat):
         say("times", done / repeat)
         for name, rasterizer in rasterizers.items():
-            times[name].append(_wall_ms(device, partial(draw, rasterizer)))
+            times[name].append(wall_ms(device, partial(draw, rasterizer)))
     whole = (width, height) == (camera.width, camera.height)
     points = []
     for name, (from_reference, from_exact) in found.items():
@@ -446,7 +447,7 @@ def table(result: dict[str, Any]) -> str:
                 "" if rate is None else f"{row['share_of_arithmetic']:.0%}",
             )
         )
-    lines += _columns(rows)
+    lines += columns(rows)
     note = "ms by events" if result["timer"] == "events" else "ms by wall time: the driver's events have none"
     times = f"frame {result['frame_ms']:.2f} ms, training step {result['iteration_ms']:.2f} ms"
     load = f"load average {result['load_average'] or 0:.1f}"
@@ -465,10 +466,10 @@ def settings_table(result: dict[str, Any]) -> str:
         f"error against {result['error_is_against']}; exact against float64 on {width}x{height} pixels: "
         f"{known['psnr']:.1f} dB, {known['max_abs']:.2g}"
     )
-    return "\n".join([*_columns(rows), "", note])
+    return "\n".join([*columns(rows), "", note])
 
 
-def _columns(rows: list[tuple[str, ...]]) -> list[str]:
+def columns(rows: list[tuple[str, ...]]) -> list[str]:
     """Aligned: the first column to the left, the others to the right."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return [

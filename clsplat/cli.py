@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
-from clsplat.config import PRESETS, Preset, RasterizerConfig, TrainConfig
+from clsplat.config import PRESETS, Preset, RasterizerConfig, Schedule, TrainConfig, scheduled
 from clsplat.errors import ClsplatError, InputError
 
 Flag = Annotated[bool, FlagCreatePairsOff]
@@ -34,6 +34,9 @@ Memory = Annotated[str | None, arg(metavar="SIZE")]
 class Devices:
     """List the OpenCL devices."""
 
+    device: Device = None
+    """List only the one that this names, as other verbs' --device does: an index, cpu, gpu, or a part of a name.
+    If not given: all of them."""
     json: Flag = False
     """Print a JSON array instead of the table."""
 
@@ -99,6 +102,9 @@ class Train:
     """Print the final evaluation as JSON on standard output."""
     preset: Preset = "default"
     """Bundle of rasterizer settings; a --rasterizer flag goes before it."""
+    schedule: Schedule = "paper"
+    """Bundle of rates and steps: the paper's, made for 30,000 steps, or faster ones for --iterations of about 7000.
+    Other flags go before it."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
 
 
@@ -255,16 +261,17 @@ def parse(arguments: Sequence[str]) -> Verb:
     if isinstance(verb, Train) and verb.resume:
         from clsplat.runs import Run, check_output
 
-        if verb.preset != "default":
-            raise InputError(f"--preset {verb.preset} and --resume exclude each other: the run has its settings")
+        for flag, value, usual in (("preset", verb.preset, "default"), ("schedule", verb.schedule, "paper")):
+            if value != usual:
+                raise InputError(f"--{flag} {value} and --resume exclude each other: the run has its settings")
         check_output(verb.output, resume=True, overwrite=verb.overwrite)
         # Once more, with the run's settings as the defaults: only flags that are given differ from them.
         earlier = Run.open(verb.output)
         default = replace(verb, config=earlier.config, resume=False, overwrite=False)
         verb = replace(_tyro(Train, arguments[1:], prog="clsplat train", default=default), resume=True)
-    elif isinstance(verb, Train) and verb.preset != "default":
-        # Once more, as above, with the preset's settings as the defaults.
-        config = replace(TrainConfig(), rasterizer=PRESETS[verb.preset])
+    elif isinstance(verb, Train) and (verb.preset, verb.schedule) != ("default", "paper"):
+        # Once more, as above, with the bundles' settings as the defaults.
+        config = replace(scheduled(verb.schedule, verb.config.iterations), rasterizer=PRESETS[verb.preset])
         default = replace(verb, config=config, overwrite=False, json=False)
         verb = _tyro(Train, arguments[1:], prog="clsplat train", default=default)
     elif isinstance(verb, Bench) and verb.preset != "default":

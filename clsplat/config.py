@@ -6,13 +6,28 @@ The training defaults are those of the paper's authors' 2024 code, with the pape
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from math import inf
 from typing import Literal
 
 from clsplat.errors import InputError
 
 Background = Literal["black", "white", "random"]
 Preset = Literal["exact", "default", "fast"]
+Schedule = Literal["paper", "short"]
+
+_Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
+"""Names of settings, whether a value makes sense (which NaN must not), and what is expected."""
+
+
+def _check(config: object, prefix: str, rules: tuple[_Rule, ...]) -> None:
+    """Raise InputError naming the flag of the first setting that breaks its rule."""
+    for names, makes_sense, expected in rules:
+        for name in names:
+            value = getattr(config, name)
+            if not makes_sense(value):
+                raise InputError(f"{prefix}{name.replace('_', '-')} {value}: expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -46,13 +61,12 @@ class RasterizerConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        flag = "--rasterizer."
-        if not 0 <= self.sh_degree_limit <= 3:
-            raise InputError(f"{flag}sh-degree-limit {self.sh_degree_limit}: expected 0 to 3")
-        if not 1e-3 <= self.alpha_min < 0.5:
-            raise InputError(f"{flag}alpha-min {self.alpha_min}: expected 0.001 to 0.5")
-        if not 1e-6 <= self.transmittance_min < 0.5:
-            raise InputError(f"{flag}transmittance-min {self.transmittance_min}: expected 1e-6 to 0.5")
+        rules: tuple[_Rule, ...] = (
+            (("sh_degree_limit",), lambda value: 0 <= value <= 3, "0 to 3"),
+            (("alpha_min",), lambda value: 1e-3 <= value < 0.5, "0.001 to 0.5"),
+            (("transmittance_min",), lambda value: 1e-6 <= value < 0.5, "1e-6 to 0.5"),
+        )
+        _check(self, "--rasterizer.", rules)
 
 
 PRESETS: dict[Preset, RasterizerConfig] = {
@@ -95,6 +109,21 @@ class OptimiserConfig:
     epsilon: float = 1e-15
     """Adam's epsilon."""
 
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        rates = tuple(each.name for each in fields(self) if each.name.endswith(("_rate", "_rate_end")))
+        rules: tuple[_Rule, ...] = (
+            (rates, lambda value: 0 <= value < inf, "a finite number, at least 0"),
+            (("means_rate_steps",), lambda value: value >= 1, "at least 1"),
+            (("cooldown",), lambda value: value >= 0, "at least 0"),
+            (("cooldown_to",), lambda value: 0 < value <= 1, "more than 0, at most 1"),
+            (("beta1", "beta2"), lambda value: 0 <= value < 1, "at least 0, less than 1"),
+            (("epsilon",), lambda value: 0 < value < inf, "a finite number, more than 0"),
+        )
+        _check(self, "--optimiser.", rules)
+        if self.means_rate > 0 and self.means_rate_end == 0:  # in between it would be 0 as well, from the first step on
+            raise InputError("--optimiser.means-rate-end 0.0: expected more than 0, the rate falls log-linearly to it")
+
 
 @dataclass(frozen=True)
 class DensityConfig:
@@ -126,6 +155,23 @@ class DensityConfig:
     """Opacity is lowered to at most this at a reset."""
     max_gaussians: int = 10_000_000
     """Clones and splits stop at this number of Gaussians; where room is short, the largest gradients go first."""
+
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        rules: tuple[_Rule, ...] = (
+            (("every", "start", "stop", "opacity_reset_every"), lambda value: value >= 0, "at least 0"),
+            (
+                ("gradient_threshold", "max_world_fraction"),
+                lambda value: 0 < value < inf,
+                "a finite number, more than 0",
+            ),
+            (("dense_fraction",), lambda value: 0 < value <= 1, "more than 0, at most 1"),
+            (("split_factor",), lambda value: 1 < value < inf, "a finite number, more than 1"),
+            (("min_opacity", "opacity_reset_to"), lambda value: 0 < value < 1, "more than 0, less than 1"),
+            (("max_screen_radius",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
+            (("max_gaussians",), lambda value: value >= 1, "at least 1"),
+        )
+        _check(self, "--density.", rules)
 
 
 @dataclass(frozen=True)
@@ -162,23 +208,47 @@ class TrainConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        if not 0 <= self.sh_degree <= 3:
-            raise InputError(f"--sh-degree {self.sh_degree}: expected 0 to 3")
-        if not 0 <= self.dssim_weight <= 1:
-            raise InputError(f"--dssim-weight {self.dssim_weight}: expected 0 to 1")
-        for name in ("iterations", "sh_degree_every", "random_points"):
-            if getattr(self, name) < 1:
-                raise InputError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected at least 1")
-        for name in ("seed", "resolution", "test_every", "checkpoint_every"):
-            if getattr(self, name) < 0:
-                raise InputError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected at least 0")
+        rules: tuple[_Rule, ...] = (
+            (("sh_degree",), lambda value: 0 <= value <= 3, "0 to 3"),
+            (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
+            (("iterations", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
+            (("seed", "resolution", "test_every", "checkpoint_every"), lambda value: value >= 0, "at least 0"),
+        )
+        _check(self, "--", rules)
         for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):
             if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
                 raise InputError(f"--{name} {','.join(map(str, steps))}: expected steps from 1 up, in order")
+        if self.eval_at and self.eval_at[-1] > self.iterations:
+            late = next(step for step in self.eval_at if step > self.iterations)
+            raise InputError(
+                f"--eval-at {late}: training ends before that, expected at most --iterations {self.iterations}"
+            )
+        self.optimiser.check()
+        self.density.check()
         self.rasterizer.check()
-        if self.optimiser.cooldown < 0:
-            raise InputError(f"--optimiser.cooldown {self.optimiser.cooldown}: expected at least 0")
-        if not 0 < self.optimiser.cooldown_to <= 1:
-            raise InputError(f"--optimiser.cooldown-to {self.optimiser.cooldown_to}: expected more than 0, at most 1")
-        if not self.density.split_factor > 1:
-            raise InputError(f"--density.split-factor {self.density.split_factor}: expected more than 1")
+
+
+def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
+    """What `clsplat train --schedule` starts from.
+
+    paper: the defaults, made for 30,000 steps, whatever `iterations` is. short: for runs of about 7000 steps, in which
+    the paper's rates leave a model unfinished: colours, opacities and rotations learn faster, SH degrees come twice as
+    fast, the means' rate has fallen at the end, density control ends at five sevenths, and the last seventh cools down
+    (docs/decisions/0013-a-short-schedule.md).
+    """
+    if schedule == "paper":
+        return TrainConfig(iterations=iterations)
+    return TrainConfig(
+        iterations=iterations,
+        sh_degree_every=500,
+        optimiser=OptimiserConfig(
+            means_rate_steps=max(iterations, 1),
+            sh_dc_rate=4e-3,
+            sh_rest_rate=4e-4,
+            opacities_rate=0.05,
+            quaternions_rate=2e-3,
+            cooldown=max(iterations // 7, 0),
+            cooldown_to=0.2,
+        ),
+        density=DensityConfig(stop=max(5 * iterations // 7, 0)),
+    )

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,37 @@ def plot_training(path: Path, runs: Mapping[str, Sequence[tuple[float, float]]],
     axes.set_ylabel("PSNR of the held-out views, dB")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+    _save(figure, path)
+
+
+Points = Sequence[tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A pair of logarithmic axes, what they show, and by name what was measured and what was fitted to it."""
+
+    x: str
+    y: str
+    measured: Mapping[str, Points]
+    fitted: Mapping[str, Points] = field(default_factory=dict)
+
+
+def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
+    """How a time grows with a size: panels side by side."""
+    figure = _figure(title, len(panels))
+    for axes, panel in zip(figure.axes, panels, strict=True):
+        for name, points in panel.measured.items():
+            axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=name)
+        for name, points in panel.fitted.items():
+            axes.plot(*zip(*points, strict=True), color="gray", linewidth=0.8, linestyle="--", label=name)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel(panel.x)
+        axes.set_ylabel(panel.y)
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(fontsize=8)
+    figure.subplots_adjust(wspace=0.28)
     _save(figure, path)
 
 

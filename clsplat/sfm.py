@@ -77,9 +77,9 @@ def reconstruct(
     cores if None. The same seed gives the same cameras, bit by bit up to 80 photos. overwrite: replace a result of
     other photos. progress(text, fraction or None) hears of every stage.
 
-    Warns of photos that could not be placed or are of a kind that cannot be read. Raises InputError for a folder
-    without photos, a photo that does not decode, an output that is something else, and photos that no cameras can
-    be recovered from; ClsplatError where pycolmap itself fails. KeyboardInterrupt leaves nothing behind.
+    Warns of photos that could not be placed, are of a kind that cannot be read, or lost their alpha. Raises InputError
+    for a folder without photos, a photo that does not decode, an output that is something else, and photos that no
+    cameras can be recovered from; ClsplatError where pycolmap itself fails. KeyboardInterrupt leaves nothing behind.
     """
     report = progress or _ignore
     if matching not in ("auto", "exhaustive", "sequential"):
@@ -128,10 +128,21 @@ def reconstruct(
         if missing:
             lost = _listed([images / name for name in missing], images)
             warnings.warn(f"{images}: {lost} could not be placed and will not be used", stacklevel=2)
+        if cut := _without_their_alpha(photos, result["registered"], work / "result" / "images"):
+            which = _listed([images / name for name in cut], images)
+            message = f"{which} lost their alpha when their lens was undone: the scene's images are opaque there"
+            warnings.warn(f"{images}: {message}", stacklevel=2)
         _move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return output
+
+
+def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], result: Path) -> list[str]:
+    """Names of the photos with transparent parts that the result has without alpha: pycolmap keeps it only where the
+    lens model has no distortion, and the file is copied."""
+    transparent = {photo.name for photo in photos if photo.transparent}
+    return [name for name in registered if name in transparent and not sfm_photos.has_alpha(result / name)]
 
 
 def _ignore(text: str, fraction: float | None) -> None:

@@ -11,8 +11,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import OpenImageIO as oiio
+from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
 
@@ -25,13 +28,15 @@ OTHER_IMAGES = frozenset({".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".
 class Photo:
     """A photo as staged for pycolmap: its name (path below the folder, with slashes) and what tells its camera.
 
-    width, height: pixels, upright; lens: make, model and focal length from EXIF, empty strings where it has none.
+    width, height: pixels, upright; lens: make, model and focal length from EXIF, empty strings where it has none;
+    transparent: whether any pixel is, in an alpha channel.
     """
 
     name: str
     width: int
     height: int
     lens: tuple[str, ...]
+    transparent: bool = False
 
 
 def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], list[Path]]:
@@ -130,7 +135,25 @@ def _stage(folder: Path, target: Path, path: Path) -> Photo:
             shutil.copyfile(path, copy)
     focal = spec.get_float_attribute("Exif:FocalLength", 0.0)
     lens = (spec.get_string_attribute("Make"), spec.get_string_attribute("Model"), f"{focal:.3f}" if focal else "")
-    return Photo(name, width, height, lens)
+    return Photo(name, width, height, lens, _is_transparent(pixels, spec.alpha_channel))
+
+
+def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
+    """Whether a picture (H, W, C) is not opaque everywhere; alpha_channel: -1 for none."""
+    if alpha_channel < 0:
+        return False
+    opaque = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+    return bool((pixels[:, :, alpha_channel] < opaque).any())
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether an image file has an alpha channel; reads its header alone."""
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        return False
+    found: bool = source.spec().alpha_channel >= 0
+    source.close()
+    return found
 
 
 def _write_upright(path: Path, copy: Path) -> None:

@@ -48,9 +48,9 @@ def run(verb: Verb) -> int:
 
 def devices(verb: Devices) -> int:
     """Print the table of devices."""
-    from clsplat.device.context import list_devices
+    from clsplat.device.context import find_device, list_devices
 
-    found = list_devices()
+    found = list_devices() if verb.device is None else [find_device(verb.device)]
     if not found:
         raise DeviceError("no OpenCL device found, expected a driver such as pip install 'pyopencl[pocl]' brings")
     if verb.json:
@@ -132,6 +132,11 @@ def train(verb: Train) -> int:
     if verb.resume and (done := max((step for step, _ in earlier.checkpoints()), default=0)) > verb.config.iterations:
         raise InputError(
             f"--iterations {verb.config.iterations}: {verb.output} is at step {done} already, expected more"
+        )
+    if len(scene.points) == 1:  # a Gaussian's size follows from its neighbours, and it has none
+        print(
+            f"clsplat: warning: {source}: has a single point, training starts from one Gaussian of next to no size",
+            file=sys.stderr,
         )
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
     print(

@@ -3,8 +3,7 @@
 // that have a pixel left to fill; on a GPU (LANES == 1) each work-item has pixels of its own. The bits are the same.
 //
 // `t` is the transmittance of pixels that go on and 0 in those that are finished, whose own is put aside in `kept`: there
-// no alpha has a weight, and no test is needed. Each mask comes from one comparison: of several joined by & some
-// compilers make 16-bit lanes and back.
+// no alpha has a weight, and no test is needed.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -67,25 +66,27 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     FOR_CELLS(cell, IN_OPEN(reach, open)) {
       const int k = cell / ITEMS;
       const floatL dy = my - AT_Y(cell);
-      const floatL u = l11 * (mx - AT_X(cell)) + l12 * dy;
+      const floatL u = fmaL((floatL)(l12), dy, l11 * (mx - AT_X(cell)));
       const floatL power = log2_alpha(u, l22 * dy, log2o);
       COUNT(evaluated += LANES;)
-      if (REACHES(power)) {
+      const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
+      if (REACHES(reached)) {
         const floatL before = t[k];
         floatL alpha = exp2L(power);
         alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
         alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);
         const floatL after = fmaL(-before, alpha, before);
-        const floatL weight = after > TRANSMITTANCE_MIN ? before * alpha : (floatL)(0.0f);
+        const intL goes_on = MASKL(after > TRANSMITTANCE_MIN);
+        const floatL weight = AS_FLOATL(AS_INTL(before * alpha) & goes_on);
         COUNT(added += weight > 0.0f ? (intL)(1) : (intL)(0);)
         red[k] = fmaL(weight, (floatL)(c_red), red[k]);
         green[k] = fmaL(weight, (floatL)(c_green), green[k]);
         blue[k] = fmaL(weight, (floatL)(c_blue), blue[k]);
-        t[k] = after > TRANSMITTANCE_MIN ? after : (floatL)(0.0f);
-        const floatL ended = after > TRANSMITTANCE_MIN ? (floatL)(0.0f) : before;
-        if (ANYL(ended > 0.0f)) {
-          kept[k] = ended > 0.0f ? before : kept[k];
-          stop[k] = ended > 0.0f ? (intL)(i) : stop[k];
+        t[k] = AS_FLOATL(AS_INTL(after) & goes_on);
+        const intL ended = AS_INTL(before) & ~goes_on; // a positive number's bits, or none
+        if (ANYL(ended)) {
+          kept[k] = ended > 0 ? before : kept[k];
+          stop[k] = ended > 0 ? (intL)(i) : stop[k];
           if (!ANYL(t[k] > 0.0f)) CLOSE_CELL(open, cell);
         }
       }

@@ -13,8 +13,6 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#define NOT_YET -100.0f // log2 of an alpha that reaches nothing, for pixels that ended before this Gaussian
-
 #if ITEMS > 1
 // slot[field] = the sum of value over the group, in a fixed tree.
 static inline void group_sums(float *values, __local float *scratch, __global float *slot) {
@@ -100,18 +98,18 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     FOR_CELLS(cell, reach) {
       const int k = cell / ITEMS;
       const floatL dy = my - AT_Y(cell);
-      const floatL u = l11 * (mx - AT_X(cell)) + l12 * dy, v = l22 * dy;
-      const floatL all = log2_alpha(u, v, log2o);
-      const floatL power = (intL)(i) < stop[k] ? all : (floatL)(NOT_YET);
-      if (REACHES(power)) {
-        const floatL uncapped = power >= LOG2_ALPHA_MIN ? exp2L(power) : zero;
+      const floatL u = fmaL((floatL)(l12), dy, l11 * (mx - AT_X(cell))), v = l22 * dy;
+      const floatL power = log2_alpha(u, v, log2o);
+      const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
+      if (REACHES(taken)) {
+        const floatL uncapped = AS_FLOATL(AS_INTL(exp2L(power)) & taken);
         const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
         const floatL inverse = 1.0f / (1.0f - alpha);
         const floatL before = t[k] * inverse;
         const floatL shade = fmaL(g_red[k], (floatL)(c_red), fmaL(g_green[k], (floatL)(c_green), g_blue[k] * c_blue));
         const floatL weight = alpha * before;
         const floatL d_alpha = fmaL(before, shade, -(behind[k] * inverse));
-        const floatL g = uncapped < ALPHA_MAX ? alpha * d_alpha : zero;
+        const floatL g = AS_FLOATL(AS_INTL(alpha * d_alpha) & MASKL(uncapped < ALPHA_MAX));
         behind[k] = fmaL(weight, shade, behind[k]);
         t[k] = before;
         d_red = fmaL(weight, g_red[k], d_red);
@@ -131,6 +129,16 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
       }
     }
 
+#if LANES >= 8 && ITEMS == 1
+    // The first eight fields of a slot, in the order of layout.SLOT.
+    typedef float8 float8U __attribute__((aligned(4)));
+    *(__global float8U *)slot = sums8(sum_g, sum_gu, sum_gv, sum_guu, sum_guv, sum_gvv, d_red, d_green);
+    slot[SLOT_BLUE] = sumL(d_blue);
+#ifdef ABSOLUTE_GRADIENTS
+    slot[SLOT_ABSX] = sumL(abs_x);
+    slot[SLOT_ABSY] = sumL(abs_y);
+#endif
+#else
     float values[SLOT_STRIDE];
     values[SLOT_G] = sumL(sum_g);
     values[SLOT_GU] = sumL(sum_gu);
@@ -149,6 +157,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = values[field];
 #else
     group_sums(values, scratch, slot);
+#endif
 #endif
   }
 }

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import Capture, command, error_line
 from models import random_gaussians
 
 from clsplat import verbs
@@ -22,8 +23,6 @@ from clsplat.config import RasterizerConfig, TrainConfig
 from clsplat.errors import ClsplatError, DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.runs import Run
-
-Capture = pytest.CaptureFixture[str]
 
 
 def camera(width: int = 32, height: int = 24) -> Camera:
@@ -161,16 +160,6 @@ def model(tmp_path: Path) -> str:
     return str(path)
 
 
-def error_line(capsys: Capture) -> str:
-    """The one line on standard error, and nothing on standard output."""
-    captured = capsys.readouterr()
-    lines = captured.err.splitlines()
-    assert captured.out == "", captured
-    assert len(lines) == 1, captured
-    assert lines[0].startswith("clsplat: error: ")
-    return lines[0]
-
-
 @pytest.mark.parametrize("verb", ["devices", "demo", "sfm", "train", "eval", "render"])
 def test_help(verb: str, capsys: Capture) -> None:
     assert main([verb, "--help"]) == 0
@@ -211,24 +200,6 @@ def test_flags_become_the_config() -> None:
     assert parse(["train", "S", "--output", "R"]) == Train(Path("R"), Path("S"))
     assert parse(["train", "S", "-o", "R", "--warmup", ""]).config.warmup == ()  # type: ignore[union-attr]
     assert parse(["eval", "R"]) == Eval(Path("R"))
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("", "Expected one of"),
-        ("trian", "trian"),
-        ("train S", "--output"),
-        ("train S -o R --iterations many", "many"),
-        ("train S -o R --eval-at 1,x", "'1,x' is not a list of steps, expected such as 500,1000,2000"),
-        ("train S -o R --background green", "green"),
-        ("train S -o R --nosuch 3", "--nosuch"),
-        ("render M -o R", "--cameras"),
-    ],
-)
-def test_wrong_calls_are_one_line(line: str, message: str, capsys: Capture) -> None:
-    assert main(line.split()) == 2
-    assert message in error_line(capsys)
 
 
 @pytest.mark.parametrize(
@@ -493,12 +464,6 @@ def test_render_that_cannot_be(model: str, scene: str, pipeline: Pipeline, tmp_p
     assert not pipeline.written
 
 
-def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "clsplat", *arguments], capture_output=True, text=True, timeout=120, check=False
-    )
-
-
 def test_devices_for_real() -> None:
     listed = command("devices", "--json")
     assert listed.returncode == 0, listed.stderr
@@ -515,14 +480,6 @@ def test_unknown_device_for_real(arguments: list[str], scene: str, model: str, t
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.startswith("clsplat: error: --device no such thing: ")
-    assert done.stderr.count("\n") == 1
-    assert not (tmp_path / "run").exists()
-
-
-def test_no_such_scene_for_real(tmp_path: Path) -> None:
-    done = command("train", str(tmp_path / "none"), "-o", str(tmp_path / "run"))
-    assert done.returncode == 2
-    assert str(tmp_path / "none") in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "run").exists()
 

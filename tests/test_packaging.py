@@ -46,7 +46,7 @@ def test_wheel_metadata(wheel):
     text = archive.read(metadata).decode()
     assert "License-Expression: Apache-2.0" in text
     (entries,) = (name for name in archive.namelist() if name.endswith("/entry_points.txt"))
-    assert "clsplat = clsplat.cli:main" in archive.read(entries).decode()
+    assert "clsplat = clsplat.__main__:main" in archive.read(entries).decode()
     assert any(name.endswith("/licenses/LICENSE") for name in archive.namelist())
 
 

@@ -37,6 +37,21 @@ def write_image(path, pixels, orientation=1):
     assert output.open(str(path), spec) and output.write_image(pixels) and output.close()
 
 
+def write_png(path, pixels):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "uint8")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(pixels) and output.close()
+
+
+def warnings_of(work):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        work()
+    return [str(warning.message) for warning in caught if warning.category is UserWarning]
+
+
 def read_image(path):
     return oiio.ImageInput.open(str(path)).read_image("uint8")
 
@@ -164,6 +179,35 @@ def test_exif_orientation_subfolders_and_a_photo_of_something_else(pictures, tmp
     model = pycolmap.Reconstruction(output / "sparse/0")
     assert len(model.cameras) == 1
     assert sfm.reconstruct(folder, output) == output
+
+
+def test_photos_that_lose_their_alpha_are_named(pictures, tmp_path):
+    for index, picture in enumerate(pictures[0]):
+        alpha = np.full((HEIGHT, WIDTH, 1), 255, np.uint8)
+        alpha[:20] = 255 if index else 128  # one of them has a transparent part, the others only could have
+        write_png(tmp_path / f"photos/{index:02d}.png", np.concatenate([picture, alpha], axis=2))
+    (message,) = warnings_of(lambda: sfm.reconstruct(tmp_path / "photos", tmp_path / "scene"))
+    wanted = "photos: 1 photo(s) (00.png) lost their alpha when their lens was undone: the scene's images are opaque"
+    assert wanted in message
+    assert oiio.ImageInput.open(str(tmp_path / "scene/images/00.png")).spec().nchannels == 3
+    # without distortion there is nothing to undo: pycolmap copies the files
+    copied = warnings_of(
+        lambda: sfm.reconstruct(tmp_path / "photos", tmp_path / "copied", camera_model="SIMPLE_PINHOLE")
+    )
+    assert copied == []
+    assert oiio.ImageInput.open(str(tmp_path / "copied/images/00.png")).spec().nchannels == 4
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_what_counts_as_transparent(dtype):
+    opaque = np.iinfo(dtype).max if dtype.startswith("u") else 1
+    pixels = np.full((3, 4, 4), opaque, dtype)
+    assert not sfm_photos._is_transparent(pixels, 3)
+    pixels[:, :, 0] = 0
+    assert not sfm_photos._is_transparent(pixels, 3)
+    assert not sfm_photos._is_transparent(pixels, -1)
+    pixels[1, 1, 3] = 0
+    assert sfm_photos._is_transparent(pixels, 3)
 
 
 def test_bad_folders(tmp_path, photos):

@@ -225,6 +225,12 @@ def select(selector: str | None) -> cl.Device:
     raise DeviceError(f"--device {selector}: no such device; there are {names}")
 
 
+def find_device(selector: str | None) -> DeviceInfo:
+    """What is listed of the device that `selector` names (see `select`). Raises DeviceError."""
+    chosen = select(selector)
+    return list_devices()[_all_devices().index(chosen)]
+
+
 @lru_cache(maxsize=8)
 def _open(index: int) -> Device:
     return Device(_all_devices()[index])

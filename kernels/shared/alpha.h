@@ -1,11 +1,11 @@
 // The alpha of a Gaussian in a tile's pixels: blend and blend_grad must agree to the last bit, or the transmittance that
 // the gradient recovers by division is another one.
 
-// Whether a vector has a pixel that the Gaussian reaches (RasterizerConfig.vector_skip).
+// Whether a vector has a pixel that takes the Gaussian (RasterizerConfig.vector_skip).
 #ifdef NO_VECTOR_SKIP
-#define REACHES(power) 1
+#define REACHES(mask) 1
 #else
-#define REACHES(power) ANYL((power) >= LOG2_ALPHA_MIN)
+#define REACHES(mask) ANYL(mask)
 #endif
 
 // log2 of alpha before the cap, from the mean's offset in (u, v).

@@ -1,5 +1,5 @@
-// floatL: LANES neighbouring pixels of a row, one name for float, float8 and float16. Masks are intL, all bits of a
-// lane set or none (LANES > 1) or 0 and 1 (LANES == 1), as the comparison operators give them.
+// floatL: LANES pixels, one name for float, float8 and float16. MASKL(comparison) is an intL, all bits of a lane set or
+// none; the comparison operators alone give 0 and 1 at LANES == 1.
 #ifndef LANES
 #error "LANES must be defined: pixels per vector, 1, 4, 8 or 16"
 #endif
@@ -10,6 +10,7 @@ typedef float floatL;
 typedef int intL;
 #define AS_INTL(x) as_int(x)
 #define AS_FLOATL(x) as_float(x)
+#define MASKL(condition) (-(condition))
 #define TO_INTL(x) ((int)(x))
 #define TO_FLOATL(x) ((float)(x))
 #define LOADL(p) (*(p))
@@ -21,6 +22,7 @@ typedef CAT(float, LANES) floatL;
 typedef CAT(int, LANES) intL;
 #define AS_INTL(x) CAT(as_int, LANES)(x)
 #define AS_FLOATL(x) CAT(as_float, LANES)(x)
+#define MASKL(condition) (condition)
 #define TO_INTL(x) CAT(convert_int, LANES)(x)
 #define TO_FLOATL(x) CAT(convert_float, LANES)(x)
 typedef floatL floatU __attribute__((aligned(4))); // vload and vstore are slow calls in PoCL 3.0
@@ -101,12 +103,32 @@ static inline float sumL(floatL x) {
 #endif
 }
 
+#if LANES >= 8
+#if LANES == 16
+#define EIGHT(x) ((x).lo + (x).hi)
+#else
+#define EIGHT(x) (x)
+#endif
+// The sums of eight vectors, each as sumL adds it up, in fewer steps than one after the other.
+static inline float8 sums8(floatL x0, floatL x1, floatL x2, floatL x3, floatL x4, floatL x5, floatL x6, floatL x7) {
+  const float8 a = EIGHT(x0), b = EIGHT(x1), c = EIGHT(x2), d = EIGHT(x3);
+  const float8 e = EIGHT(x4), f = EIGHT(x5), g = EIGHT(x6), h = EIGHT(x7);
+  const float8 ae = (float8)(a.lo, e.lo) + (float8)(a.hi, e.hi);
+  const float8 bf = (float8)(b.lo, f.lo) + (float8)(b.hi, f.hi);
+  const float8 cg = (float8)(c.lo, g.lo) + (float8)(c.hi, g.hi);
+  const float8 dh = (float8)(d.lo, h.lo) + (float8)(d.hi, h.hi);
+  const float8 abef = (float8)(ae.s01, bf.s01, ae.s45, bf.s45) + (float8)(ae.s23, bf.s23, ae.s67, bf.s67);
+  const float8 cdgh = (float8)(cg.s01, dh.s01, cg.s45, dh.s45) + (float8)(cg.s23, dh.s23, cg.s67, dh.s67);
+  return (float8)(abef.s02, cdgh.s02, abef.s46, cdgh.s46) + (float8)(abef.s13, cdgh.s13, abef.s57, cdgh.s57);
+}
+#endif
+
 // 2^x for x in [-126, 1], relative error under 2.1e-7: round to the nearest integer with the magic number 1.5 * 2^23,
 // degree 5 minimax on [-1/2, 1/2] that is 1 at 0, exponent by integer addition. A lane under -126 is some number. The
 // polynomial is in Estrin's order: blending waits for what its longest chain of operations takes.
 static inline floatL exp2L(floatL x) {
   const floatL t = x + 12582912.0f;
-  const floatL f = x - (t - 12582912.0f);
+  const floatL f = x + (12582912.0f - t);
   const floatL f2 = f * f;
   const floatL low = fmaL(f, (floatL)(6.931469025e-1f), (floatL)(1.0f));
   const floatL middle = fmaL(f, (floatL)(5.550900067e-2f), (floatL)(2.402225277e-1f));

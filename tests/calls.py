@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calling the command line in tests, and what it says."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+import pytest
+
+from clsplat.cli import main
+from clsplat.config import TrainConfig
+
+Capture = pytest.CaptureFixture[str]
+
+
+def flags(config: object, prefix: str = "--") -> list[str]:
+    """Every setting as a user would give it."""
+    words: list[str] = []
+    for field in fields(config):  # type: ignore[arg-type]
+        value, name = getattr(config, field.name), prefix + field.name.replace("_", "-")
+        if is_dataclass(value):
+            words += flags(value, f"{name}.")
+        elif isinstance(value, tuple):
+            words += [name, ",".join(map(str, value))]
+        elif not isinstance(value, bool):
+            words += [name, str(value)]
+    return words
+
+
+def train(scene: Path, run: Path, config: TrainConfig, *more: str) -> int:
+    return main(["train", str(scene), "-o", str(run), *flags(config), *more])
+
+
+def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "clsplat", *arguments], capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def error_line(capsys: Capture) -> str:
+    """The one line on standard error, and nothing on standard output."""
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert captured.out == "", captured
+    assert len(lines) == 1, captured
+    assert lines[0].startswith("clsplat: error: ")
+    return lines[0]
+
+
+def one_error(capfd: Capture) -> str:
+    """The last words: nothing on standard output, one line of error, no traceback, nothing from any library."""
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("clsplat: error: "), captured.err
+    assert captured.err.count("\n") == 1, captured.err
+    return captured.err

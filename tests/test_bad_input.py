@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bad input: one line, the file's name, exit 2, and nothing is written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calls import Capture, command, error_line, one_error, train
+from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, write_scene
+
+from clsplat.cli import main
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("cli") / "scene")
+
+
+@pytest.fixture(scope="module")
+def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of CONFIG; not to be changed."""
+    run = tmp_path_factory.mktemp("trained") / "run"
+    assert train(scene, run, CONFIG) == 0
+    return run
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("", "Expected one of"),
+        ("trian", "trian"),
+        ("train S", "--output"),
+        ("train S -o R --iterations many", "many"),
+        ("train S -o R --eval-at 1,x", "'1,x' is not a list of steps, expected such as 500,1000,2000"),
+        ("train S -o R --background green", "green"),
+        ("train S -o R --nosuch 3", "--nosuch"),
+        ("render M -o R", "--cameras"),
+    ],
+)
+def test_wrong_calls_are_one_line(line: str, message: str, capsys: Capture) -> None:
+    assert main(line.split()) == 2
+    assert message in error_line(capsys)
+
+
+def test_no_such_scene_for_real(tmp_path: Path) -> None:
+    done = command("train", str(tmp_path / "none"), "-o", str(tmp_path / "run"))
+    assert done.returncode == 2
+    assert str(tmp_path / "none") in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def colmap_binary(scene: Path) -> Path:
+    """The scene's model as binary files instead of text; the folder."""
+    import pycolmap
+
+    folder = scene / "sparse" / "0"
+    pycolmap.Reconstruction(folder).write_binary(folder)
+    for path in folder.glob("*.txt"):
+        path.unlink()
+    return folder
+
+
+def cut(path: Path, keep: float = 0.6) -> str:
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * keep)])
+    return str(path)
+
+
+def no_such_folder(scene: Path) -> str:
+    scene.rename(scene.with_name("elsewhere"))
+    return f"{scene}: no such folder"
+
+
+def nothing_in_it(scene: Path) -> str:
+    scene.rename(scene.with_name("elsewhere"))
+    scene.mkdir()
+    return f"{scene}: no images found"
+
+
+def no_pictures(scene: Path) -> str:
+    for path in (scene / "images").iterdir():
+        path.unlink()
+    return f"{scene / 'images'}: no images found"
+
+
+def a_picture_is_missing(scene: Path) -> str:
+    (scene / "images" / "03.png").unlink()
+    return str(scene / "images" / "03.png")
+
+
+def truncated_images(scene: Path) -> str:
+    return cut(colmap_binary(scene) / "images.bin")
+
+
+def corrupt_images(scene: Path) -> str:
+    path = colmap_binary(scene) / "images.bin"
+    data = bytearray(path.read_bytes())
+    data[:8] = b"\xff" * 8  # so many images
+    path.write_bytes(data)
+    return str(path)
+
+
+def unknown_camera_model(scene: Path) -> str:
+    path = scene / "sparse" / "0" / "cameras.txt"
+    path.write_text(path.read_text().replace("PINHOLE", "KALEIDOSCOPE"))
+    return str(path)
+
+
+def unknown_camera_number(scene: Path) -> str:
+    path = colmap_binary(scene) / "cameras.bin"
+    data = bytearray(path.read_bytes())
+    data[12:16] = (99).to_bytes(4, "little")
+    path.write_bytes(data)
+    return str(path)
+
+
+def a_picture_is_cut(scene: Path) -> str:
+    return cut(scene / "images" / "04.png")
+
+
+def a_picture_is_text(scene: Path) -> str:
+    path = scene / "images" / "04.png"
+    path.write_text("not a picture")
+    return str(path)
+
+
+def without_frames(scene: Path) -> str:
+    return transforms(scene, lambda keys: keys.pop("frames"))
+
+
+def without_intrinsics(scene: Path) -> str:
+    return transforms(scene, lambda keys: keys.pop("fl_x"))
+
+
+def without_a_pose(scene: Path) -> str:
+    return transforms(scene, lambda keys: keys["frames"][1].pop("transform_matrix"))
+
+
+def transforms(scene: Path, spoil: Callable[[dict[str, Any]], object]) -> str:
+    shutil.rmtree(scene / "sparse")
+    frames = [{"file_path": f"images/{i:02d}.png", "transform_matrix": np.eye(4).tolist()} for i in range(VIEWS)]
+    keys = {"fl_x": 50, "w": WIDTH, "h": HEIGHT, "frames": frames}
+    path = scene / "transforms.json"
+    spoil(keys)
+    path.write_text(json.dumps(keys))
+    return str(path)
+
+
+BAD_SCENES = (
+    no_such_folder,
+    nothing_in_it,
+    no_pictures,
+    a_picture_is_missing,
+    truncated_images,
+    corrupt_images,
+    unknown_camera_model,
+    unknown_camera_number,
+    a_picture_is_cut,
+    a_picture_is_text,
+    without_frames,
+    without_intrinsics,
+    without_a_pose,
+)
+
+
+@pytest.mark.parametrize("spoil", BAD_SCENES, ids=lambda spoil: spoil.__name__)
+@pytest.mark.parametrize("verb", ["train", "eval"])
+def test_bad_scenes(verb: str, spoil: Callable[[Path], str], trained: Path, tmp_path: Path, capfd: Capture) -> None:
+    scene = write_scene(tmp_path / "scene")
+    named = spoil(scene)
+    before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")} if scene.exists() else {}
+    capfd.readouterr()
+    if verb == "train":
+        assert main(["train", str(scene), "-o", str(tmp_path / "run"), "--iterations", "2"]) == 2
+        assert not (tmp_path / "run").exists()
+    else:
+        assert main(["eval", str(trained / "model.ply"), "--scene", str(scene)]) == 2
+    assert named in one_error(capfd)
+    assert ({path: path.stat().st_mtime_ns for path in scene.rglob("*")} if scene.exists() else {}) == before
+
+
+def no_opacity(head: bytes, data: bytes) -> tuple[bytes, str]:
+    return head.replace(b"float opacity", b"float opaque") + data, "property opacity"
+
+
+def nan_position(head: bytes, data: bytes) -> tuple[bytes, str]:
+    return head + np.float32(np.nan).tobytes() + data[4:], "have a position"
+
+
+def no_gaussians(head: bytes, data: bytes) -> tuple[bytes, str]:
+    words = head.split(b"element vertex ")
+    return words[0] + b"element vertex 0" + words[1][words[1].index(b"\n") :], "0 Gaussians"
+
+
+def cut_short(head: bytes, data: bytes) -> tuple[bytes, str]:
+    return head + data[:-100], "truncated"
+
+
+@pytest.mark.parametrize("spoil", [no_opacity, nan_position, no_gaussians, cut_short], ids=lambda spoil: spoil.__name__)
+@pytest.mark.parametrize("verb", ["render", "eval"])
+def test_bad_models(
+    verb: str,
+    spoil: Callable[[bytes, bytes], tuple[bytes, str]],
+    scene: Path,
+    trained: Path,
+    tmp_path: Path,
+    capfd: Capture,
+) -> None:
+    head, mark, data = (trained / "model.ply").read_bytes().partition(b"end_header\n")
+    content, trouble = spoil(head + mark, data)
+    model = tmp_path / "bad.ply"
+    model.write_bytes(content)
+    out = tmp_path / "out" / "{name}.png"
+    rest = ["--scene", str(scene)] if verb == "eval" else ["--cameras", str(scene / "sparse" / "0"), "-o", str(out)]
+    assert main([verb, str(model), *rest]) == 2
+    line = one_error(capfd)
+    assert str(model) in line
+    assert trouble in line
+    assert not out.parent.exists()
+
+
+def test_bad_cameras_for_render(trained: Path, tmp_path: Path, capfd: Capture) -> None:
+    scene = write_scene(tmp_path / "scene")
+    named = truncated_images(scene)
+    out = tmp_path / "out" / "{name}.png"
+    assert main(["render", str(trained), "--cameras", str(scene / "sparse" / "0"), "-o", str(out)]) == 2
+    assert named in one_error(capfd)
+    assert not out.parent.exists()
+
+
+@pytest.mark.parametrize("verb", ["train", "eval", "render"])
+def test_an_unknown_device(verb: str, scene: Path, trained: Path, tmp_path: Path, capfd: Capture) -> None:
+    arguments = {
+        "train": [str(scene), "-o", str(tmp_path / "run")],
+        "eval": [str(trained / "model.ply"), "--scene", str(scene)],
+        "render": [str(trained), "--cameras", str(scene / "sparse" / "0"), "-o", str(tmp_path / "{name}.png")],
+    }[verb]
+    assert main([verb, *arguments, "--device", "abacus"]) == 2
+    line = one_error(capfd)
+    assert "--device abacus: no such device; there are 0: " in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_overwriting_with_what_cannot_be_trained_keeps_the_run(scene: Path, tmp_path: Path, capfd: Capture) -> None:
+    run = tmp_path / "run"
+    assert train(scene, run, CONFIG) == 0
+    model = (run / "model.ply").read_bytes()
+    for wrong in (["--test-every", "1"], ["--resolution", "8"]):
+        capfd.readouterr()
+        assert main(["train", str(scene), "-o", str(run), "--overwrite", "--iterations", "3", *wrong]) == 2
+        assert len(capfd.readouterr().err.splitlines()) == 1
+        assert (run / "model.ply").read_bytes() == model
+    assert main(["train", "-o", str(run), "--resume", "--iterations", "3"]) == 2
+    assert "is at step 40 already" in capfd.readouterr().err

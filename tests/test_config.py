@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings that make no sense are told by the name of their flag, before anything is touched."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+from tiny import write_scene
+
+from clsplat.cli import main
+from clsplat.config import PRESETS, DensityConfig, OptimiserConfig, TrainConfig, scheduled
+from clsplat.runs import Run
+
+Capture = pytest.CaptureFixture[str]
+
+OUT_OF_RANGE = {
+    "--optimiser.means-rate": ("-1e-4", "nan", "inf"),
+    "--optimiser.means-rate-end": ("-1e-9", "nan", "inf", "0"),
+    "--optimiser.means-rate-steps": ("0", "-1"),
+    "--optimiser.sh-dc-rate": ("-1", "nan", "inf"),
+    "--optimiser.sh-rest-rate": ("-1", "nan", "inf"),
+    "--optimiser.opacities-rate": ("-1", "nan", "inf"),
+    "--optimiser.scales-rate": ("-1", "nan", "inf"),
+    "--optimiser.quaternions-rate": ("-1", "nan", "-inf"),
+    "--optimiser.cooldown": ("-1",),
+    "--optimiser.cooldown-to": ("0", "1.1", "nan"),
+    "--optimiser.beta1": ("-0.1", "1", "nan"),
+    "--optimiser.beta2": ("-0.1", "1", "nan"),
+    "--optimiser.epsilon": ("0", "-1e-8", "nan", "inf"),
+    "--density.every": ("-1",),
+    "--density.start": ("-1",),
+    "--density.stop": ("-1",),
+    "--density.gradient-threshold": ("0", "-1", "nan", "inf"),
+    "--density.dense-fraction": ("0", "1.1", "nan"),
+    "--density.split-factor": ("1", "nan", "inf"),
+    "--density.min-opacity": ("0", "1", "nan"),
+    "--density.max-world-fraction": ("0", "-1", "nan", "inf"),
+    "--density.max-screen-radius": ("-1", "nan", "inf"),
+    "--density.opacity-reset-every": ("-1",),
+    "--density.opacity-reset-to": ("0", "1", "nan"),
+    "--density.max-gaussians": ("0", "-1"),
+}
+
+
+def refused(flags: list[str], tmp_path: Path, capsys: Capture) -> str:
+    """The one line of an error that names the flag; nothing is written."""
+    assert main(["train", str(tmp_path), "-o", str(tmp_path / "run"), *flags]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.err.startswith(f"clsplat: error: {flags[0]} "), captured.err
+    assert "expected" in captured.err
+    assert not list(tmp_path.iterdir())
+    return captured.err
+
+
+@pytest.mark.parametrize(("flag", "value"), [(flag, value) for flag, each in OUT_OF_RANGE.items() for value in each])
+def test_a_value_out_of_range(flag: str, value: str, tmp_path: Path, capsys: Capture) -> None:
+    refused([flag, value], tmp_path, capsys)
+
+
+def test_no_number_of_the_optimiser_or_density_control_is_left_out() -> None:
+    for config, prefix in ((OptimiserConfig(), "--optimiser."), (DensityConfig(), "--density.")):
+        numbers = [each.name for each in fields(config) if not isinstance(getattr(config, each.name), bool)]
+        flags = {prefix + name.replace("_", "-") for name in numbers}
+        assert flags == {flag for flag in OUT_OF_RANGE if flag.startswith(prefix)}
+
+
+def test_defaults_presets_and_the_ends_of_ranges_make_sense() -> None:
+    TrainConfig().check()
+    for preset in PRESETS.values():
+        TrainConfig(rasterizer=preset).check()
+    still = {each.name: 0.0 for each in fields(OptimiserConfig) if each.name.endswith(("_rate", "_rate_end"))}
+    OptimiserConfig(**still, means_rate_steps=1, beta1=0, beta2=0, cooldown_to=1).check()  # type: ignore[arg-type]
+    DensityConfig(every=0, start=0, stop=0, opacity_reset_every=0, dense_fraction=1, max_gaussians=1).check()
+    DensityConfig(max_world_fraction=1e9).check()  # prunes none
+
+
+def test_an_evaluation_after_the_last_step(tmp_path: Path, capsys: Capture) -> None:
+    line = refused(["--eval-at", "300,500,1000", "--iterations", "499"], tmp_path, capsys)
+    assert line == "clsplat: error: --eval-at 500: training ends before that, expected at most --iterations 499\n"
+    TrainConfig(iterations=500, eval_at=(300, 500)).check()
+
+
+def test_the_papers_schedule_is_the_default() -> None:
+    assert scheduled("paper", 30_000) == TrainConfig()
+    assert scheduled("paper", 7000) == TrainConfig(iterations=7000)
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 13, 7000, 30_000])
+def test_the_short_schedule_makes_sense_for_any_number_of_steps(iterations: int) -> None:
+    config = scheduled("short", iterations)
+    config.check()
+    assert config.iterations == config.optimiser.means_rate_steps == iterations
+    assert config.density.stop + config.optimiser.cooldown <= iterations
+
+
+def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> None:
+    scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
+    short = ["--schedule", "short"]
+    flags = ["--iterations", "14", "--preset", "fast", "--optimiser.opacities-rate", "0.04"]
+    assert main(["train", str(scene), "-o", str(run), *short, *flags]) == 0
+    wanted = scheduled("short", 14)
+    wanted = replace(wanted, optimiser=replace(wanted.optimiser, opacities_rate=0.04), rasterizer=PRESETS["fast"])
+    assert Run.open(run).config == wanted, "flags go before the bundles, which go together"
+    assert main(["train", "-o", str(run), "--resume", *short]) == 2
+    assert "--schedule short and --resume" in capsys.readouterr().err

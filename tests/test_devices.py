@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""clsplat devices: all of them, or the one that a selector means."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from clsplat.cli import main
+from clsplat.device.context import list_devices, open_device
+
+Capture = pytest.CaptureFixture[str]
+
+
+def listed(capsys: Capture, *flags: str) -> list[dict[str, object]]:
+    assert main(["devices", "--json", *flags]) == 0
+    devices: list[dict[str, object]] = json.loads(capsys.readouterr().out)
+    return devices
+
+
+def test_each_by_its_index_and_by_its_version(capsys: Capture) -> None:
+    everything = listed(capsys)
+    assert len(everything) == len(list_devices())
+    for device in everything:
+        assert listed(capsys, "--device", str(device["index"])) == [device]
+        (found,) = listed(capsys, "--device", str(device["version"]))
+        assert found["version"] == device["version"]
+
+
+def test_it_is_the_one_that_the_other_verbs_take(capsys: Capture) -> None:
+    kind = list_devices()[-1].kind
+    (found,) = listed(capsys, "--device", kind)
+    device = open_device(kind)
+    assert (found["name"], found["version"]) == (device.name, device.driver)
+
+
+def test_the_table_has_one_line(capsys: Capture) -> None:
+    assert main(["devices", "--device", "0"]) == 0
+    header, line = capsys.readouterr().out.splitlines()
+    assert header.split()[:2] == ["name", "kind"]
+    assert line.startswith("0 ")
+
+
+def test_the_environment_does_not_shorten_the_list(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setenv("CLSPLAT_DEVICE", "0")
+    assert len(listed(capsys)) == len(list_devices())
+
+
+def test_an_unknown_one(capsys: Capture) -> None:
+    assert main(["devices", "--device", "abacus"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("clsplat: error: --device abacus: no such device; there are 0: ")
+    assert captured.err.count("\n") == 1

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the tools that measure have in common: sizes, what a result says of the machine, how trouble is told."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from clsplat.device.context import Device
+from clsplat.errors import ClsplatError, InputError
+
+Result = dict[str, Any]
+
+
+def number(text: str) -> int:
+    """An integer that may be written as 3e7; for argparse, which tells of a ValueError."""
+    try:
+        return int(float(text))
+    except OverflowError:
+        raise ValueError(text) from None
+
+
+def sizes(first: int, most: int) -> list[int]:
+    """first, 3 first, 10 first, 30 first and so on, up to `most`."""
+    found = [factor * first * 10**power for power in range(12) for factor in (1, 3)]
+    return [size for size in found if size <= most]
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise InputError unless the condition holds."""
+    if not condition:
+        raise InputError(message)
+
+
+def machine(device: Device, repeat: int) -> Result:
+    """What a figure has to have beside it."""
+    return {
+        "device": device.name,
+        "driver": device.driver,
+        "shape": {"lanes": device.shape.lanes, "items": device.shape.items},
+        "repeat": repeat,
+        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+    }
+
+
+def heading(result: Result) -> str:
+    """`machine` in a line."""
+    load = f"load average {result['load_average'] or 0:.1f}"
+    shape = f"{result['shape']['lanes']} lanes x {result['shape']['items']} items"
+    driver = result["driver"].split("  ")[0]
+    return f"{result['device']}, {driver}, {shape}; medians of {result['repeat']}; {load}"
+
+
+def show(result: Result, lines: Sequence[str], *, as_json: bool) -> None:
+    """The result on standard output, for programs or for people."""
+    print(json.dumps(result, indent=2) if as_json else "\n".join([heading(result), "", *lines]))
+
+
+def reporting(name: str, work: Callable[[], int]) -> int:
+    """The exit status of `work`, with trouble told in one line as the command line does."""
+    try:
+        return work()
+    except (ClsplatError, OSError, MemoryError) as error:
+        print(f"{name}: error: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
+        return error.exit_status if isinstance(error, ClsplatError) else 1
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted", file=sys.stderr)
+        return 130
