@@ -26,7 +26,7 @@ from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
 from clsplat.gaussians import Gaussians
 from clsplat.initialise import from_points, random_points
-from clsplat.rendering import Frame, Rasterizer
+from clsplat.rendering import Frame, Rasterizer, Renderer
 from clsplat.runs import Run, is_run
 from clsplat.scene import Scene, View, load_scene
 from clsplat.stages.blend import count_pairs
@@ -143,10 +143,21 @@ def bench(
         return rasterizer.forward(gaussians, subject.camera, trainer.background)
 
     frame = draw()
-    contributing, evaluated = count_pairs(
-        rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background, subject.camera
-    )
-    visible, listed = frame.pairs.gaussian_from_rank.shape[0], frame.pairs.tile_keys.shape[0]
+    visible = int(np.count_nonzero(frame.projected.tile_counts.get()))
+    listed = contributing = evaluated = 0
+    for band in frame.bands:
+        part = rasterizer.part(frame, band)
+        listed += part.counted.pairs
+        added, looked_at = count_pairs(
+            rasterizer.device,
+            rasterizer.work,
+            part.lists,
+            frame.projected.splats,
+            frame.background,
+            subject.camera,
+            band,
+        )
+        contributing, evaluated = contributing + added, evaluated + looked_at
     in_frame = _measure(device, draw, repeat)
     say("training step", None)
     in_step = _measure(device, trainer.train_step, repeat)
@@ -250,10 +261,7 @@ def _trainer(subject: Subject, device: Device, config: RasterizerConfig) -> Trai
     camera = subject.camera
     photograph = subject.photograph
     if photograph is None:  # the frame mirrored: a picture like it, with a gradient everywhere
-        rasterizer = Rasterizer(device, config)
-        black = upload(device, np.zeros(3, np.float32))
-        frame = rasterizer.forward(upload_gaussians(device, subject.gaussians), camera, black)
-        mirrored = _picture(frame)[:, ::-1]
+        mirrored = Renderer(device, config=config).render(subject.gaussians, camera).image[:, ::-1]
         photograph = np.rint(255 * np.clip(mirrored, 0, 1)).astype(np.uint8)
     lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
     pixels = (photograph / np.float32(255)).astype(np.float32)

@@ -27,6 +27,7 @@ from clsplat.errors import ClsplatError, InputError
 Flag = Annotated[bool, FlagCreatePairsOff]
 Output = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
 Device = Annotated[str | None, arg(metavar="DEVICE")]
+Memory = Annotated[str | None, arg(metavar="SIZE")]
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,9 @@ class Train:
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    max_device_mem: Memory = None
+    """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
+    If not given: all that the device has."""
     json: Flag = False
     """Print the final evaluation as JSON on standard output."""
     preset: Preset = "default"
@@ -124,6 +128,9 @@ class Eval:
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    max_device_mem: Memory = None
+    """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
+    If not given: all that the device has."""
     json: Flag = False
     """Print the result as JSON, as in eval.json."""
 
@@ -154,6 +161,9 @@ class Render:
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    max_device_mem: Memory = None
+    """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
+    If not given: all that the device has."""
     json: Flag = False
     """Print the images written as JSON: name, path, width, height, seconds."""
 
@@ -180,6 +190,9 @@ class Bench:
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    max_device_mem: Memory = None
+    """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
+    If not given: all that the device has."""
     json: Flag = False
     """Print the result as JSON."""
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)

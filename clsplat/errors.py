@@ -35,4 +35,4 @@ class KernelBuildError(ClsplatError):
 
 
 class CapacityError(ClsplatError):
-    """A buffer would be larger than the device allows."""
+    """A buffer would be larger than the device allows, or all of them together than --max-device-mem does."""

@@ -13,13 +13,21 @@ from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device, open_device
+from clsplat.device.layout import SLOT_ABSOLUTE
 from clsplat.device.switches import kernel_defines
 from clsplat.gaussians import Gaussians
+from clsplat.memory import Plan, parse_bytes
+from clsplat.needs import plan_frame
 from clsplat.stages.blend import Blended, blend, blend_grad
-from clsplat.stages.duplicate import Pairs, duplicate
+from clsplat.stages.duplicate import MAX_PAIRS, Band, Counted, Pairs, count, count_band, duplicate, plan_bands
 from clsplat.stages.project import (
+    AnyGaussians,
     DeviceGaussians,
+    HostGaussians,
     Projected,
+    Slots,
+    add_slots,
+    host_gaussians,
     pack_camera,
     project,
     project_grad,
@@ -32,37 +40,94 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
+class Part:
+    """What is listed and blended together: a band of tiles and its pairs."""
+
+    band: Band
+    counted: Counted
+    pairs: Pairs
+    lists: TileLists
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
-    """One forward pass: every stage's arrays, valid until the rasterizer's next forward pass."""
+    """One forward pass: every stage's arrays, valid until the rasterizer's next forward pass.
+
+    bands: one of all tiles, unless memory is short; then `part` is the last one's.
+    """
 
     camera: Camera
     camera_array: DeviceArray
     background: DeviceArray
     projected: Projected
-    pairs: Pairs
-    lists: TileLists
+    bands: tuple[Band, ...]
+    part: Part
     blended: Blended
+
+    @property
+    def pairs(self) -> Pairs:
+        """Of all tiles, if there is one band."""
+        return self.part.pairs
+
+    @property
+    def lists(self) -> TileLists:
+        """Of all tiles, if there is one band."""
+        return self.part.lists
 
 
 class Rasterizer:
-    """The pipeline on one device, with the memory that it works in, which can be another's."""
+    """The pipeline on one device, with the memory that it works in, which can be another's.
+
+    capacity: most (tile, Gaussian) pairs that are worked on together; the plan of who owns the rasterizer.
+    """
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
         self.device = device.with_switches(kernel_defines(self.config))
         self.work = work or Workspace(device)
+        self.capacity = min(device.max_allocation // (4 * SLOT_ABSOLUTE), MAX_PAIRS)
 
-    def forward(self, gaussians: DeviceGaussians, camera: Camera, background: DeviceArray) -> Frame:
+    def follow(self, plan: Plan) -> None:
+        """Work in as much memory as the plan has for it. Where that is tight, what an earlier plan left goes."""
+        self.work.tight = self.device.memory.limit is not None or plan.tight
+        if self.work.tight:
+            self.work.clear()
+        self.capacity = plan.pairs
+
+    def forward(self, gaussians: AnyGaussians, camera: Camera, background: DeviceArray) -> Frame:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2)."""
         device, work = self.device, self.work
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
         camera_array.set(pack)
-        tiles_x, tiles_y = tiles_of(camera)
         projected = project(device, work, gaussians, camera, camera_array)
-        pairs = duplicate(device, work, projected, (tiles_x, tiles_y))
-        lists = tile_lists(device, work, pairs, tiles_x * tiles_y)
-        blended = blend(device, work, lists, projected.splats, background, camera.width, camera.height)
-        return Frame(camera, camera_array, background, projected, pairs, lists, blended)
+        counted = count(device, work, projected.tile_counts)
+        bands = self._plan(projected, counted, tiles_of(camera))
+        part = None
+        for band in bands:
+            del part  # its arrays may have to make room for larger ones
+            part = self._part(projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
+            blended = blend(
+                device, work, part.lists, projected.splats, background, camera.width, camera.height, part.band
+            )
+        assert part is not None, "an image has a tile"
+        return Frame(camera, camera_array, background, projected, bands, part, blended)
+
+    def part(self, frame: Frame, band: Band) -> Part:
+        """What the band lists; where there are several bands it takes the memory of the one before."""
+        if len(frame.bands) == 1:
+            return frame.part
+        return self._part(frame.projected, band, tiles_of(frame.camera))
+
+    def _plan(self, projected: Projected, counted: Counted, tiles: tuple[int, int]) -> tuple[Band, ...]:
+        if counted.pairs <= self.capacity:
+            return (Band(0, tiles[0] * tiles[1]),)
+        return plan_bands(self.device, self.work, projected, tiles, self.capacity)
+
+    def _part(self, projected: Projected, band: Band, tiles: tuple[int, int], counted: Counted | None = None) -> Part:
+        device, work = self.device, self.work
+        counted = counted or count_band(device, work, projected, tiles, band)
+        pairs = duplicate(device, work, projected.splats, counted, tiles, band)
+        return Part(band, counted, pairs, tile_lists(device, work, pairs, band.tiles))
 
     def backward(
         self,
@@ -74,30 +139,48 @@ class Rasterizer:
         absolute: bool = False,
     ) -> DeviceArray:
         """Fill the visible rows of `gradients`; returns the gradient of the means on the image, (n, 2), in pixels."""
-        device, work = self.device, self.work
-        slots = blend_grad(
-            device,
-            work,
-            frame.lists,
-            frame.projected.splats,
-            frame.background,
-            frame.blended,
-            image_gradient,
-            absolute=absolute,
-        )
-        screen = work.array("screen", (gaussians.count, 2))
-        project_grad(
-            device,
-            gaussians,
-            frame.camera_array,
-            frame.projected,
-            frame.pairs.first_slots,
-            slots,
-            gradients,
-            screen,
-            absolute=absolute,
-        )
+        slots = self.pair_gradients(frame, image_gradient, absolute=absolute)
+        return self.row_gradients(gaussians, frame, frame.projected, slots, gradients, absolute=absolute)
+
+    def row_gradients(
+        self,
+        gaussians: DeviceGaussians,
+        frame: Frame,
+        projected: Projected,
+        slots: Slots,
+        gradients: DeviceGaussians,
+        *,
+        absolute: bool = False,
+    ) -> DeviceArray:
+        """The gradient of projection, for some rows or all: as `backward`, from what blending's gradient is."""
+        screen = self.work.array("screen", (gaussians.count, 2))
+        project_grad(self.device, gaussians, frame.camera_array, projected, slots, gradients, screen, absolute=absolute)
         return screen
+
+    def pair_gradients(self, frame: Frame, image_gradient: DeviceArray, *, absolute: bool = False) -> Slots:
+        """The gradient of blending: of every pair, or with several bands their sums by Gaussian."""
+        device, work, projected = self.device, self.work, frame.projected
+        sums = None
+        for band in frame.bands:
+            part = self.part(frame, band)
+            values = blend_grad(
+                device,
+                work,
+                part.lists,
+                projected.splats,
+                frame.background,
+                frame.blended,
+                image_gradient,
+                band,
+                absolute=absolute,
+            )
+            slots = Slots(values, part.counted.first_slots)
+            if len(frame.bands) == 1:
+                return slots
+            sums = add_slots(device, work, part.counted.tile_counts, slots, sums, absolute=absolute)
+            del part, values, slots  # as in `forward`
+        assert sums is not None
+        return Slots(sums)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,25 +203,39 @@ class Renderer:
     ) -> None:
         self.device = device or open_device()
         self._rasterizer = rasterizer or Rasterizer(self.device, config)
+        self._rows = 0
         self._background = allocate(self.device, (3,), np.float32)
-        self._held: tuple[Gaussians, DeviceGaussians] | None = None
+        self._held: tuple[Gaussians, AnyGaussians] | None = None
+        self._planned: tuple[int, int, int, int] | None = None
 
     def render(
-        self, gaussians: Gaussians | DeviceGaussians, camera: Camera, background: Sequence[float] = (0.0, 0.0, 0.0)
+        self, gaussians: Gaussians | AnyGaussians, camera: Camera, background: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> RenderResult:
         """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object."""
-        if isinstance(gaussians, Gaussians):
-            if self._held is None or self._held[0] is not gaussians:
-                self._held = (gaussians, upload_gaussians(self.device, gaussians))
-            on_device = self._held[1]
-        else:
-            on_device = gaussians
+        on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
         self._background.set(np.asarray(background, np.float32))
         blended = self._rasterizer.forward(on_device, camera, self._background).blended
         height, width = camera.height, camera.width
         planes = blended.image.get()[:, :height, :width]
         alpha: Float32 = np.float32(1) - blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(planes.transpose(1, 2, 0)), alpha)
+
+    def _hold(self, gaussians: Gaussians, camera: Camera) -> AnyGaussians:
+        """The model on the device, or on the host if a frame of this size leaves too little room for it."""
+        count, coefficients = len(gaussians), gaussians.sh.shape[1]
+        asked = (count, coefficients, camera.width, camera.height)
+        if self._planned != asked:
+            plan = plan_frame(self.device, count, coefficients, camera)
+            self._rasterizer.follow(plan)
+            if plan.streamed or (self._held is not None and isinstance(self._held[1], HostGaussians)):
+                self._held = None
+            self._planned, self._rows = asked, plan.rows if plan.streamed else 0
+        if self._held is None or self._held[0] is not gaussians:
+            self._held = None
+            rows = self._rows
+            held = host_gaussians(gaussians, rows) if rows else upload_gaussians(self.device, gaussians)
+            self._held = (gaussians, held)
+        return self._held[1]
 
 
 def render(
@@ -147,6 +244,8 @@ def render(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     *,
     device: str | None = None,
+    max_device_mem: str | int | None = None,
 ) -> RenderResult:
-    """Render one view on the device that `device` names (see `clsplat devices`). Raises DeviceError."""
-    return Renderer(open_device(device)).render(gaussians, camera, background)
+    """Render one view on the device that `device` names (see `clsplat devices`), with at most `max_device_mem` of its
+    memory, such as "256MiB". Raises DeviceError."""
+    return Renderer(open_device(device, parse_bytes(max_device_mem))).render(gaussians, camera, background)

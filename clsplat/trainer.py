@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluate import background_colour
 from clsplat.gaussians import Gaussians
 from clsplat.initialise import from_points, random_points
+from clsplat.needs import plan_step
 from clsplat.rendering import Rasterizer
 from clsplat.runs import Checkpoint
 from clsplat.stages.adam import adam
@@ -23,10 +26,18 @@ from clsplat.stages.density import NO_ROW, DensityStatistics, add_statistics, ga
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.project import (
     GROUPS,
+    AnyGaussians,
     DeviceGaussians,
+    HostArray,
+    HostGaussians,
     allocate_gaussians,
     download_gaussians,
     group_shapes,
+    host_gaussians,
+    host_zeros,
+    parts,
+    to_device,
+    to_host,
     upload_gaussians,
 )
 from clsplat.stages.target import target
@@ -74,29 +85,60 @@ class Trainer:
         self.step = 0
         self.queue: list[int] = []
         self.background = allocate(device, (3,), np.float32)
-        self._set_parameters(upload_gaussians(device, initial) if initial is not None else self._initial())
+        initial = initial if initial is not None else self._initial()
+        self._make_plan(len(initial))
+        if self.plan.streamed:
+            self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
+        else:
+            self._set_parameters(upload_gaussians(device, initial))
 
-    def _initial(self) -> DeviceGaussians:
+    def _initial(self) -> Gaussians:
         scene = self.scene
         if len(scene.points) > 0:
-            initial = from_points(scene.points, scene.point_colors, sh_degree=0)
-        else:
-            low, high = scene.bounds
-            initial = from_points(*random_points(self.config.random_points, low, high, self.rng), sh_degree=0)
-        return upload_gaussians(self.device, initial)
+            return from_points(scene.points, scene.point_colors, sh_degree=0)
+        low, high = scene.bounds
+        return from_points(*random_points(self.config.random_points, low, high, self.rng), sh_degree=0)
+
+    def _make_plan(self, count: int) -> None:
+        """How so many Gaussians go through the device's memory, with all of their SH coefficients in the end."""
+        coefficients, absolute = (self.config.sh_degree + 1) ** 2, self.config.density.absolute_gradients
+        cameras = [view.camera for view in self.scene.views]
+        self.plan = plan_step(self.device, count, coefficients, cameras, absolute=absolute)
+        self.rasterizer.follow(self.plan)
 
     def _set_parameters(
-        self,
-        parameters: DeviceGaussians,
-        first: DeviceGaussians | None = None,
-        second: DeviceGaussians | None = None,
+        self, parameters: AnyGaussians, first: AnyGaussians | None = None, second: AnyGaussians | None = None
     ) -> None:
+        """The model, on the device or streamed from the host; without moments they start from zero."""
         count, coefficients = parameters.count, parameters.coefficients
         self.parameters = parameters
-        self.first = first or allocate_gaussians(self.device, count, coefficients, zero=True)
-        self.second = second or allocate_gaussians(self.device, count, coefficients, zero=True)
-        self.gradients = allocate_gaussians(self.device, count, coefficients, zero=True)
+        self.first = first or self._zeros(count, coefficients)
+        self.second = second or self._zeros(count, coefficients)
+        self.gradients = self._new_gradients()
         self.statistics = new_statistics(self.device, count)
+
+    def _zeros(self, count: int, coefficients: int) -> AnyGaussians:
+        if isinstance(self.parameters, HostGaussians):
+            return host_zeros(count, coefficients, self.parameters.rows)
+        return allocate_gaussians(self.device, count, coefficients, zero=True)
+
+    def _new_gradients(self) -> DeviceGaussians:
+        """Zeros for the rows that are on the device at once; Adam leaves them so."""
+        model = self.parameters
+        rows = min(model.rows, model.count) if isinstance(model, HostGaussians) else model.count
+        return allocate_gaussians(self.device, rows, model.coefficients, zero=True)
+
+    def _take_down(self) -> list[HostGaussians]:
+        """Parameters, first and second moments on the host, and none of them on the device."""
+        models = [to_host(model) for model in (self.parameters, self.first, self.second)]
+        del self.parameters, self.first, self.second, self.gradients
+        return models
+
+    def _placed(self, model: AnyGaussians) -> AnyGaussians:
+        """The model where the plan wants it, if it is not there."""
+        if isinstance(model, HostGaussians):
+            return replace(model, rows=self.plan.rows) if self.plan.streamed else to_device(self.device, model)
+        return model
 
     def train_step(self) -> Loss:
         """Density control as the last step left it to do, then one view: forward, loss, backward, Adam.
@@ -115,29 +157,20 @@ class Trainer:
 
         planes = target(device, work, image, self.background)
         frame = self.rasterizer.forward(self.parameters, camera, self.background)
-        result = loss(device, work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight)
-        screen = self.rasterizer.backward(
-            self.parameters,
-            frame,
-            result.gradient,
-            self.gradients,
-            absolute=config.density.absolute_gradients,
+        channels, absolute = self.plan.channels, config.density.absolute_gradients
+        result = loss(
+            device, work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight, channels
         )
-        if self.step < config.density.stop:
-            add_statistics(device, self.statistics, camera, frame.projected, screen)
-        optimiser = config.optimiser
-        adam(
-            device,
-            self.step,
-            self.rates(),
-            optimiser.beta1,
-            optimiser.beta2,
-            optimiser.epsilon,
-            self.parameters,
-            self.gradients,
-            self.first,
-            self.second,
-        )
+        slots = self.rasterizer.pair_gradients(frame, result.gradient, absolute=absolute)
+        model = (self.parameters, self.first, self.second)
+        for start, stop, (parameters, first, second) in parts(work, *model, keep=True):  # one, if the model fits
+            projected = frame.projected.rows(start, stop)
+            screen = self.rasterizer.row_gradients(
+                parameters, frame, projected, slots.rows(start, stop), self.gradients, absolute=absolute
+            )
+            if self.step < config.density.stop:
+                add_statistics(device, self.statistics.rows(start, stop), camera, projected, screen)
+            adam(device, self.step, self.rates(), config.optimiser, parameters, self.gradients, first, second)
         return result
 
     def rates(self) -> dict[str, float]:
@@ -176,10 +209,11 @@ class Trainer:
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
         coefficients = (degree + 1) ** 2
         if coefficients > self.parameters.coefficients:
-            self.parameters = widen(self.device, self.parameters, coefficients)
-            self.first = widen(self.device, self.first, coefficients)
-            self.second = widen(self.device, self.second, coefficients)
-            self.gradients = widen(self.device, self.gradients, coefficients)
+            models = [self.parameters, self.first, self.second] if self.plan.gathers else self._take_down()
+            self.parameters, self.first, self.second = (
+                self._placed(widen(self.device, model, coefficients)) for model in models
+            )
+            self.gradients = self._new_gradients()
 
     def _control_density(self) -> None:
         config = self.config.density
@@ -207,8 +241,14 @@ class Trainer:
         )
         if len(plan.rows) == 0:
             raise ClsplatError(f"step {self.step}: every Gaussian was pruned; lower --density.min-opacity")
+        gathers = self.plan.gathers
+        self._make_plan(len(plan.rows))
+        models = [self.parameters, self.first, self.second] if gathers and self.plan.gathers else self._take_down()
+        del self.statistics
         moment_rows = np.where(plan.fresh, NO_ROW, plan.rows)
-        parameters = gather(device, plan.rows, self.parameters)
+        rows_of = (plan.rows, moment_rows, moment_rows)
+        parameters, first, second = (gather(device, r, model) for r, model in zip(rows_of, models, strict=True))
+        del models
         if plan.split.any():
             host = {name: parameters[name].get() for name in ("means", "quaternions", "log_scales")}
             halves = {name: values[plan.split] for name, values in host.items()}
@@ -216,9 +256,7 @@ class Trainer:
             host["means"][plan.split], host["log_scales"][plan.split] = means, log_scales
             parameters["means"].set(host["means"])
             parameters["log_scales"].set(host["log_scales"])
-        self._set_parameters(
-            parameters, gather(device, moment_rows, self.first), gather(device, moment_rows, self.second)
-        )
+        self._set_parameters(*(self._placed(model) for model in (parameters, first, second)))
 
     def gaussians(self) -> Gaussians:
         """The model so far, on the host, with room for the SH degree it is trained to."""
@@ -241,19 +279,21 @@ class Trainer:
         self.rng.bit_generator.state = checkpoint.state["rng"]
         self.queue = list(checkpoint.state["queue"])
         loaded = [self._loaded(checkpoint, kind) for kind in ("parameters", "first", "second")]
-        self._set_parameters(*loaded)
+        del self.parameters, self.first, self.second, self.gradients, self.statistics
+        self._make_plan(loaded[0].count)
+        self._set_parameters(*(self._placed(model) for model in loaded))
         self.statistics = DensityStatistics(
             *(upload(self.device, checkpoint.arrays[f"statistics/{name}"]) for name in _STATISTICS)
         )
 
-    def _loaded(self, checkpoint: Checkpoint, kind: str) -> DeviceGaussians:
+    def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
         host = {group: checkpoint.arrays[f"{kind}/{group}"] for group in GROUPS}
         count, coefficients = len(host["means"]), host["sh_rest"].shape[1] + 1
         for group, shape in group_shapes(count, coefficients).items():
             if host[group].shape != shape:
                 raise InputError(f"checkpoint of step {checkpoint.step}: {kind}/{group} has shape {host[group].shape}")
-        arrays = {group: upload(self.device, values) for group, values in host.items()}
-        return DeviceGaussians(count, coefficients, arrays)
+        arrays = {group: HostArray(values) for group, values in host.items()}
+        return HostGaussians(count, coefficients, arrays, count)
 
 
 _STATISTICS = ("gradient_sums", "seen", "radii")

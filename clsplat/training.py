@@ -20,6 +20,7 @@ from clsplat.device.context import Device, open_device
 from clsplat.errors import ClsplatError
 from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
+from clsplat.memory import Plan, parse_bytes
 from clsplat.rendering import Renderer
 from clsplat.runs import Run
 from clsplat.stages.loss import Loss
@@ -65,8 +66,9 @@ def _interruption() -> Iterator[Callable[[], bool]]:
 class _Session:
     """One call of `train`: a trainer, the run that it writes to, and the seconds that it has trained."""
 
-    def __init__(self, trainer: Trainer, run: Run | None) -> None:
-        self.trainer, self.run = trainer, run
+    def __init__(self, trainer: Trainer, run: Run | None, on_plan: Callable[[Plan], None] | None = None) -> None:
+        self.trainer, self.run, self.on_plan = trainer, run, on_plan
+        self.told: Plan | None = None
         self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
         self.saved = 0
@@ -84,6 +86,13 @@ class _Session:
             arrays, state = self.trainer.checkpoint()
             self.run.save_checkpoint(self.trainer.step, arrays, {**state, "seconds": self.seconds})
             self.saved = self.trainer.step
+
+    def tell_plan(self) -> None:
+        """Tell how the device's memory is used, at first and when more is done in pieces, or less."""
+        plan, told = self.trainer.plan, self.told
+        if self.on_plan is not None and (told is None or plan.pieces != told.pieces):
+            self.on_plan(plan)
+        self.told = plan
 
     def report(self, result: Loss) -> StepReport:
         """Read the loss of the step just made. Raises ClsplatError where it is not finite."""
@@ -120,6 +129,7 @@ class _Session:
         start = time.perf_counter()
         result = trainer.train_step()
         self.seconds += time.perf_counter() - start
+        self.tell_plan()
         step = trainer.step
         evaluating = step in config.eval_at and bool(trainer.scene.test_views)
         if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
@@ -140,24 +150,29 @@ def train(
     config: TrainConfig | None = None,
     *,
     device: Device | str | None = None,
+    max_device_mem: str | int | None = None,
     run: Run | None = None,
     resume: bool = False,
     on_step: Callable[[StepReport], None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
 ) -> Gaussians:
     """Train on a scene; the model.
 
-    device: open, or as `clsplat devices` names it; run: a folder for metrics, checkpoints, held-out renders and
+    device: open, or as `clsplat devices` names it, then with at most `max_device_mem` of its memory, such as "256MiB";
+    run: a folder for metrics, checkpoints, held-out renders and
     the model, or None for none of them; resume: go on from the run's latest checkpoint; on_step: called every
-    REPORT_EVERY steps. Raises InputError for a scene without views, ClsplatError for a loss that is not finite, and
+    REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes.
+    Raises InputError for a scene without views, ClsplatError for a loss that is not finite, and
     KeyboardInterrupt on Ctrl-C after a checkpoint has been written.
     """
     config = config or TrainConfig()
     config.check()
-    opened = device if isinstance(device, Device) else open_device(device)
-    session = _Session(Trainer(scene, config, opened), run)
+    opened = device if isinstance(device, Device) else open_device(device, parse_bytes(max_device_mem))
+    session = _Session(Trainer(scene, config, opened), run, on_plan)
     trainer = session.trainer
     if resume:
         session.resume()
+    session.tell_plan()
     with _interruption() as interrupted:
         while trainer.step < config.iterations and not interrupted():
             session.step(on_step)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat.cli import Bench, Demo, Devices, Eval, Render, Sfm, Train, Tune, Verb
 from clsplat.errors import DeviceError, InputError
+from clsplat.memory import Plan, parse_bytes
 
 if TYPE_CHECKING:
     from clsplat.camera import Camera
@@ -118,6 +119,7 @@ def train(verb: Train) -> int:
     from clsplat.runs import Run, check_output, check_resumed
 
     check_output(verb.output, resume=verb.resume, overwrite=verb.overwrite)
+    limit = parse_bytes(verb.max_device_mem)
     verb.config.check()
     source = verb.scene
     if verb.resume:
@@ -126,7 +128,7 @@ def train(verb: Train) -> int:
         source = source or earlier.scene
     if source is None:
         raise InputError("SCENE is missing, expected the folder of the scene to train on")
-    device = open_device(verb.device)
+    device = open_device(verb.device, limit)
     scene = _load_scene(source, verb.config.resolution, verb.config.test_every)
     _check_scene(scene)
     if verb.resume and (done := max((step for step, _ in earlier.checkpoints()), default=0)) > verb.config.iterations:
@@ -166,8 +168,14 @@ def _train_verb(scene: Scene, run: Run, device: Device) -> Gaussians:
     from clsplat.progress import TrainProgress
     from clsplat.training import train as run_training
 
+    def tell(plan: Plan) -> None:
+        if device.memory.limit is not None or any(plan.pieces):
+            print(f"{plan.gaussians:,} Gaussians: {plan}", file=sys.stderr)
+
     with TrainProgress(run.config.iterations) as progress:
-        return run_training(scene, run.config, device=device, run=run, resume=run.resuming, on_step=progress)
+        return run_training(
+            scene, run.config, device=device, run=run, resume=run.resuming, on_step=progress, on_plan=tell
+        )
 
 
 def evaluate(verb: Eval) -> int:
@@ -180,6 +188,7 @@ def evaluate(verb: Eval) -> int:
     from clsplat.rendering import Renderer
     from clsplat.runs import Run, is_run
 
+    limit = parse_bytes(verb.max_device_mem)
     given_run = Run.open(verb.model) if verb.model.is_dir() else None
     trained = given_run or (Run.open(verb.model.parent) if is_run(verb.model.parent) else None)
     gaussians = _load_model(verb.model)
@@ -189,7 +198,7 @@ def evaluate(verb: Eval) -> int:
         raise InputError(f"{verb.model}: the scene it was trained on is not known, expected --scene SCENE")
     resolution = config.resolution if verb.resolution is None else verb.resolution
     test_every = config.test_every if verb.test_every is None else verb.test_every
-    renderer = Renderer(open_device(verb.device), config=config.rasterizer)
+    renderer = Renderer(open_device(verb.device, limit), config=config.rasterizer)
     scene = _load_scene(source, resolution, test_every)
     views = [view for view in scene.views if view.split == "test"]
     if not views:
@@ -232,6 +241,7 @@ def render(verb: Render) -> int:
     if verb.alpha and verb.background is not None:
         raise InputError("--alpha and --background exclude each other: with alpha there is no background")
     background = parse_colour(verb.background or "black")
+    limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
     if not verb.cameras.is_dir():
         raise InputError(f"{verb.cameras}: no such folder, expected a COLMAP model (cameras and images, bin or txt)")
@@ -240,7 +250,7 @@ def render(verb: Render) -> int:
         raise InputError(f"{verb.cameras}: has no images, expected at least one")
     paths = output_paths(verb.output, list(cameras))
     gaussians = _load_model(verb.model)
-    renderer = Renderer(open_device(verb.device), config=_rasterizer(verb))
+    renderer = Renderer(open_device(verb.device, limit), config=_rasterizer(verb))
 
     written = []
     for name, camera in cameras.items():
@@ -276,7 +286,7 @@ def bench(verb: Bench) -> int:
     from clsplat.plots import check_plot, plot_settings
     from clsplat.progress import StageProgress
 
-    size = parse_size(verb.size)
+    size, limit = parse_size(verb.size), parse_bytes(verb.max_device_mem)
     if verb.gaussians < 1:
         raise InputError(f"--gaussians {verb.gaussians}: expected at least 1")
     if verb.repeat < 1:
@@ -288,6 +298,7 @@ def bench(verb: Bench) -> int:
         raise InputError(f"{verb.source}: no such file or folder, expected a scene, a run or a model file")
     progress = StageProgress()
     device = Device(select(verb.device), profile=True)
+    device.memory.limit = limit
     if verb.source is None:
         subject = measure.synthetic(verb.gaussians, *(size or (1024, 768)))
     else:

@@ -5,10 +5,10 @@
 #include "shared/lanes.h"
 
 // parameters, gradients, first, second (n). rate: learning rate / (1 - beta1^t); root: 1 / sqrt(1 - beta2^t).
-__kernel void adam(const uint n, const float rate, const float root, const float beta1, const float beta2,
+__kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
                    const float epsilon, __global float *parameters, __global float *gradients,
                    __global float *first, __global float *second) {
-  const uint i = get_global_id(0) * LANES;
+  const ulong i = get_global_id(0) * (ulong)LANES;
   if (i + LANES <= n) {
     const floatL g = LOADL(gradients + i);
     const floatL m = fmaL((floatL)(beta1), LOADL(first + i), (1.0f - beta1) * g);
@@ -19,7 +19,7 @@ __kernel void adam(const uint n, const float rate, const float root, const float
     STOREL((floatL)(0.0f), gradients + i);
     return;
   }
-  for (uint k = i; k < n; ++k) {
+  for (ulong k = i; k < n; ++k) {
     const float g = gradients[k];
     const float m = fma1(beta1, first[k], (1.0f - beta1) * g);
     const float v = fma1(beta2, second[k], (1.0f - beta2) * (g * g));

@@ -23,10 +23,11 @@
 #define COUNT(statements)
 #endif
 
+// first_tile: the image's tile that is the first of the lists' (a band of tiles, or all), in row-major order.
 // ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), background (3) -> image (3, height, width),
 // transmittance (height, width): what is left at the end; stops (height, width): the sorted index from which on the
-// pixel takes no more. Sizes are padded to whole tiles; padding is black.
-GROUP __kernel void blend(const int tiles_x, const int width, const int height, __global const uint *ranges,
+// pixel takes no more, -1 in padding. Sizes are padded to whole tiles; padding is black.
+GROUP __kernel void blend(const int first_tile, const int tiles_x, const int width, const int height, __global const uint *ranges,
                           __global const uint *gaussian_from_sorted, __global const float *splats,
                           __global const float *background, __global float *image, __global float *transmittance,
                           __global int *stops
@@ -34,9 +35,9 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
                           , __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
 #endif
 ) {
-  const int tile = get_group_id(0);
+  const int tile = first_tile + get_group_id(0);
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
-  const int begin = ranges[2 * tile], end = ranges[2 * tile + 1];
+  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];
   PIXEL_TABLES
   floatL t[OWNED], kept[OWNED], red[OWNED], green[OWNED], blue[OWNED];
   intL stop[OWNED];
@@ -50,7 +51,7 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
     t[k] = y < (floatL)(height) ? t[k] : (floatL)(0.0f);
     kept[k] = (floatL)(1.0f);
     red[k] = green[k] = blue[k] = (floatL)(0.0f);
-    stop[k] = t[k] > 0.0f ? (intL)(end) : (intL)(0);
+    stop[k] = t[k] > 0.0f ? (intL)(end) : (intL)(-1);
     if (ANYL(t[k] > 0.0f)) OPEN_CELL(open, cell);
   }
 
@@ -109,9 +110,8 @@ GROUP __kernel void blend(const int tiles_x, const int width, const int height, 
   for (int k = 0; k < OWNED; ++k) {
     const int cell = get_local_id(0) + k * ITEMS;
     const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
-    const intL shown = (stop[k] > 0) | (t[k] > 0.0f);
     const floatL at_end = t[k] > 0.0f ? t[k] : kept[k];
-    const floatL left = shown ? at_end : (floatL)(0.0f);
+    const floatL left = stop[k] >= 0 ? at_end : (floatL)(0.0f);
     STORE_CELL(float, fmaL(left, (floatL)(background[0]), red[k]), image + pixel, stride);
     STORE_CELL(float, fmaL(left, (floatL)(background[1]), green[k]), image + plane + pixel, stride);
     STORE_CELL(float, fmaL(left, (floatL)(background[2]), blue[k]), image + 2 * plane + pixel, stride);

@@ -32,7 +32,8 @@ static inline void group_sums(float *values, __local float *scratch, __global fl
 
 // As blend, its transmittance and stops, image_gradient (3, height, width), slot_from_sorted (pairs)
 // -> slots (pairs, SLOT_STRIDE), every one of them.
-GROUP __kernel void blend_grad(const int tiles_x, const int height, __global const uint *ranges,
+GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const int height,
+                               __global const uint *ranges,
                                __global const uint *gaussian_from_sorted, __global const uint *slot_from_sorted,
                                __global const float *splats, __global const float *background,
                                __global const float *image_gradient, __global const float *transmittance,
@@ -41,9 +42,9 @@ GROUP __kernel void blend_grad(const int tiles_x, const int height, __global con
   __local float scratch[SLOT_STRIDE * ITEMS];
   __local int group_last;
 #endif
-  const int tile = get_group_id(0);
+  const int tile = first_tile + get_group_id(0);
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
-  const int begin = ranges[2 * tile], end = ranges[2 * tile + 1];
+  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];
   const size_t stride = (size_t)tiles_x * TILE;
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
 

@@ -9,7 +9,7 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
                                  __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums,
                                  __global float *seen, __global float *radii) {
-  const uint i = get_global_id(0);
+  const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
   const float gx = x_scale * screen[2 * i], gy = y_scale * screen[2 * i + 1];
   gradient_sums[i] += sqrt(fma1(gx, gx, gy * gy));

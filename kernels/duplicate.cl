@@ -4,6 +4,13 @@
 #include "shared/tile.h"
 #include "shared/prefetch.h"
 
+// What tile_span gives, of the tiles [first_tile, end_tile) in row-major order.
+static inline void band_span(const Ellipse *e, int ty, int tiles_x, int first_tile, int end_tile, int *x0, int *x1) {
+  tile_span(e, ty, tiles_x, x0, x1);
+  *x0 = max(*x0, first_tile - ty * tiles_x);
+  *x1 = max(*x0, min(*x1, end_tile - ty * tiles_x));
+}
+
 // tile_counts (n), rank (n): scan of the visible -> gaussian_from_visible, depth_keys (visible). A positive float's
 // bits sort as it does.
 __kernel void compact_visible(const uint n, __global const uint *tile_counts, __global const uint *ranks,
@@ -26,10 +33,45 @@ __kernel void order_counts(const uint visible, __global const uint *order, __glo
   counts[rank] = tile_counts[i];
 }
 
+// tile_counts (n): on the whole image -> counts (tiles), zeroed before: how many Gaussians each tile's list will have.
+// Sums of integers are the same in any order.
+__kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, __global const uint *tile_counts,
+                            __global const float *splats, __global uint *counts) {
+  const uint i = get_global_id(0);
+  if (i >= n || tile_counts[i] == 0) return;
+  const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i, tiles_x, tiles_y);
+  for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
+    int x0, x1;
+    tile_span(&e, ty, tiles_x, &x0, &x1);
+    for (int tx = x0; tx < x1; ++tx) atomic_inc(counts + ty * tiles_x + tx);
+  }
+}
+
+// tile_counts (n): on the whole image -> band_counts (n): among the tiles [first_tile, end_tile)
+__kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, const int first_tile, const int end_tile,
+                          __global const uint *tile_counts, __global const float *splats,
+                          __global uint *band_counts) {
+  const uint i = get_global_id(0);
+  if (i >= n) return;
+  uint count = 0;
+  if (tile_counts[i] > 0) {
+    const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i, tiles_x, tiles_y);
+    const int y0 = max(e.tile_y0, first_tile / tiles_x), y1 = min(e.tile_y1, (end_tile - 1) / tiles_x + 1);
+    for (int ty = y0; ty < y1; ++ty) {
+      int x0, x1;
+      band_span(&e, ty, tiles_x, first_tile, end_tile, &x0, &x1);
+      count += x1 - x0;
+    }
+  }
+  band_counts[i] = count;
+}
+
 // offsets (visible): scan of the counts by rank; slots (n): scan of the counts by Gaussian -> tile_keys,
 // slot_from_pair (pairs): pairs in order of depth; gaussian_from_slot (pairs): a Gaussian's slots follow each other,
 // and Gaussians' slots the Gaussians, so that what is summed over slots streams through memory.
-__kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y,
+// Only tiles from first_tile to before end_tile, from which keys count.
+__kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y, const int first_tile,
+                        const int end_tile,
                         __global const uint *gaussian_from_rank, __global const uint *offsets,
                         __global const uint *slots, __global const float *splats, __global uint *tile_keys,
                         __global uint *slot_from_pair, __global uint *gaussian_from_slot) {
@@ -41,11 +83,12 @@ __kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y
   const uint i = gaussian_from_rank[rank];
   const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i, tiles_x, tiles_y);
   uint pair = offsets[rank], slot = slots[i];
-  for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
+  const int y0 = max(e.tile_y0, first_tile / tiles_x), y1 = min(e.tile_y1, (end_tile - 1) / tiles_x + 1);
+  for (int ty = y0; ty < y1; ++ty) {
     int x0, x1;
-    tile_span(&e, ty, tiles_x, &x0, &x1);
+    band_span(&e, ty, tiles_x, first_tile, end_tile, &x0, &x1);
     for (int tx = x0; tx < x1; ++tx, ++pair, ++slot) {
-      tile_keys[pair] = ty * tiles_x + tx;
+      tile_keys[pair] = ty * tiles_x + tx - first_tile;
       slot_from_pair[pair] = slot;
       gaussian_from_slot[slot] = i;
     }

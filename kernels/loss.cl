@@ -3,6 +3,9 @@
 // needs no margin, into planes with PAD zero columns on either side, then horizontal without bounds checks. A second
 // pair of passes convolves the three partial derivatives, the adjoint of the first.
 //
+// `first` is the channel of the image that is the first of a launch's: all three go at once, or one after the other where
+// memory is short, `channels` of them.
+//
 // A work-item owns every get_global_size(0)-th vector of one row of one channel: a whole row on a CPU.
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -27,19 +30,20 @@ static inline floatL horizontal(__global const float *row, int x) {
 }
 
 #define OWN_ROWS                                                                                                      \
-  const int y = get_global_id(1), channel = get_global_id(2);                                                         \
+  const int y = get_global_id(1), channel = get_global_id(2), channels = get_global_size(2);                          \
   const int step = get_global_size(0) * LANES, x_first = get_global_id(0) * LANES;                                    \
   const int padded = stride + 2 * PAD;                                                                                \
-  const size_t row = (size_t)plane * channel + (size_t)stride * y;                                                    \
+  const size_t row = (size_t)plane * (first + channel) + (size_t)stride * y;                                          \
   const size_t padded_plane = (size_t)padded * height;                                                                \
   const size_t padded_row = padded_plane * channel + (size_t)padded * y + PAD;
 
-// image, target (3, rows, stride) -> moments (5, 3, height, stride + 2 PAD): vertical windows of x, y, xx, yy, xy.
-__kernel void loss_vertical(const int height, const int stride, const int plane, __global const float *image,
-                            __global const float *target, __global float *moments) {
+// image, target (3, rows, stride) -> moments (5, channels, height, stride + 2 PAD): vertical windows of x, y, xx, yy,
+// xy.
+__kernel void loss_vertical(const int first, const int height, const int stride, const int plane,
+                            __global const float *image, __global const float *target, __global float *moments) {
   OWN_ROWS
   if (get_global_id(0) == 0)
-    for (int m = 0; m < 5; ++m) clear_margins(moments + 3 * padded_plane * m + padded_row, stride);
+    for (int m = 0; m < 5; ++m) clear_margins(moments + channels * padded_plane * m + padded_row, stride);
   const int tap0 = max(0, REACH - y), tap1 = min(TAPS, height + REACH - y);
   for (int x = x_first; x < stride; x += step) {
     floatL a = (floatL)(0.0f), b = a, aa = a, bb = a, ab = a;
@@ -55,16 +59,16 @@ __kernel void loss_vertical(const int height, const int stride, const int plane,
     }
     __global float *out = moments + padded_row + x;
     STOREL(a, out);
-    STOREL(b, out + 3 * padded_plane);
-    STOREL(aa, out + 6 * padded_plane);
-    STOREL(bb, out + 9 * padded_plane);
-    STOREL(ab, out + 12 * padded_plane);
+    STOREL(b, out + channels * padded_plane);
+    STOREL(aa, out + 2 * channels * padded_plane);
+    STOREL(bb, out + 3 * channels * padded_plane);
+    STOREL(ab, out + 4 * channels * padded_plane);
   }
 }
 
-// moments -> partials (3, 3, height, stride): dSSIM by the windowed x, xx and xy, 0 right of the image;
+// moments -> partials (3, channels, height, stride): dSSIM by the windowed x, xx and xy, 0 right of the image;
 // sums (3, 3, height, strips)[0]: SSIM.
-__kernel void loss_ssim(const int width, const int height, const int stride, const int plane,
+__kernel void loss_ssim(const int first, const int width, const int height, const int stride, const int plane,
                         __global const float *moments, __global float *partials, __global float *sums) {
   OWN_ROWS
   const size_t out_plane = (size_t)stride * height;
@@ -72,10 +76,10 @@ __kernel void loss_ssim(const int width, const int height, const int stride, con
   for (int x = x_first; x < stride; x += step) {
     __global const float *in = moments + padded_row;
     const floatL mu1 = horizontal(in, x);
-    const floatL mu2 = horizontal(in + 3 * padded_plane, x);
-    const floatL var1 = horizontal(in + 6 * padded_plane, x) - mu1 * mu1;
-    const floatL var2 = horizontal(in + 9 * padded_plane, x) - mu2 * mu2;
-    const floatL covariance = horizontal(in + 12 * padded_plane, x) - mu1 * mu2;
+    const floatL mu2 = horizontal(in + channels * padded_plane, x);
+    const floatL var1 = horizontal(in + 2 * channels * padded_plane, x) - mu1 * mu1;
+    const floatL var2 = horizontal(in + 3 * channels * padded_plane, x) - mu2 * mu2;
+    const floatL covariance = horizontal(in + 4 * channels * padded_plane, x) - mu1 * mu2;
     const floatL a = 2.0f * (mu1 * mu2) + C1, b = 2.0f * covariance + C2;
     const floatL c = mu1 * mu1 + mu2 * mu2 + C1, d = var1 + var2 + C2;
     const floatL inverse = 1.0f / (c * d);
@@ -90,21 +94,21 @@ __kernel void loss_ssim(const int width, const int height, const int stride, con
     total += inside ? ssim : zero;
     __global float *out = partials + out_plane * channel + (size_t)stride * y + x;
     STOREL(inside ? by_mean : zero, out);
-    STOREL(inside ? by_variance : zero, out + 3 * out_plane);
-    STOREL(inside ? by_covariance : zero, out + 6 * out_plane);
+    STOREL(inside ? by_variance : zero, out + channels * out_plane);
+    STOREL(inside ? by_covariance : zero, out + 2 * channels * out_plane);
   }
-  sums[((size_t)channel * height + y) * get_global_size(0) + get_global_id(0)] = sumL(total);
+  sums[((size_t)(first + channel) * height + y) * get_global_size(0) + get_global_id(0)] = sumL(total);
 }
 
-// partials -> moments (3, 3, height, stride + 2 PAD): their vertical windows.
-__kernel void loss_vertical_grad(const int height, const int stride, const int plane,
+// partials -> moments (3, channels, height, stride + 2 PAD): their vertical windows.
+__kernel void loss_vertical_grad(const int first, const int height, const int stride, const int plane,
                                  __global const float *partials, __global float *moments) {
   OWN_ROWS
   const size_t in_plane = (size_t)stride * height;
   const int tap0 = max(0, REACH - y), tap1 = min(TAPS, height + REACH - y);
   for (int m = 0; m < 3; ++m) {
-    __global const float *in = partials + in_plane * (3 * m + channel);
-    __global float *out = moments + 3 * padded_plane * m + padded_row;
+    __global const float *in = partials + in_plane * (channels * m + channel);
+    __global float *out = moments + channels * padded_plane * m + padded_row;
     if (get_global_id(0) == 0) clear_margins(out, stride);
     for (int x = x_first; x < stride; x += step) {
       floatL sum = (floatL)(0.0f);
@@ -117,8 +121,8 @@ __kernel void loss_vertical_grad(const int height, const int stride, const int p
 
 // moments, image, target -> gradient (3, rows, stride), sums[1]: |image - target|, sums[2]: its square.
 // l1_scale and ssim_scale are the weights over the number of pixels and channels.
-__kernel void loss_grad(const int width, const int height, const int stride, const int plane, const float l1_scale,
-                        const float ssim_scale, __global const float *moments, __global const float *image,
+__kernel void loss_grad(const int first, const int width, const int height, const int stride, const int plane,
+                        const float l1_scale, const float ssim_scale, __global const float *moments, __global const float *image,
                         __global const float *target, __global float *gradient, __global float *sums) {
   OWN_ROWS
   floatL absolute = (floatL)(0.0f), squares = absolute;
@@ -126,8 +130,8 @@ __kernel void loss_grad(const int width, const int height, const int stride, con
     __global const float *in = moments + padded_row;
     const floatL p = LOADL(image + row + x), q = LOADL(target + row + x);
     const floatL by_mean = horizontal(in, x);
-    const floatL by_variance = horizontal(in + 3 * padded_plane, x);
-    const floatL by_covariance = horizontal(in + 6 * padded_plane, x);
+    const floatL by_variance = horizontal(in + channels * padded_plane, x);
+    const floatL by_covariance = horizontal(in + 2 * channels * padded_plane, x);
     const floatL difference = p - q;
     const floatL sign = difference > 0.0f ? (floatL)(l1_scale)
                                           : (difference < 0.0f ? (floatL)(-l1_scale) : (floatL)(0.0f));
@@ -139,7 +143,7 @@ __kernel void loss_grad(const int width, const int height, const int stride, con
     squares = fmaL(difference, difference, squares);
   }
   const size_t count = (size_t)3 * height * get_global_size(0);
-  const size_t at = ((size_t)channel * height + y) * get_global_size(0) + get_global_id(0);
+  const size_t at = ((size_t)(first + channel) * height + y) * get_global_size(0) + get_global_id(0);
   sums[count + at] = sumL(absolute);
   sums[2 * count + at] = sumL(squares);
 }

@@ -50,7 +50,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 
   for (uint lane = 0; lane < lanes_used; ++lane) {
     if (!valid.lane[lane]) continue;
-    const uint i = first_row + lane;
+    const size_t i = first_row + lane;
     __global float *splat = splats + (size_t)SPLAT_SIZE * i;
     const int fields[] = {SPLAT_PIXEL_X, SPLAT_PIXEL_Y, SPLAT_SUB_X, SPLAT_SUB_Y,  SPLAT_L11,    SPLAT_L12,
                           SPLAT_L22,     SPLAT_LOG2O,   SPLAT_DEPTH, SPLAT_HALF_W, SPLAT_HALF_H, SPLAT_INVERSE_L11};

@@ -8,6 +8,23 @@
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 
+// Sums that band after band of tiles goes on with: tile_counts, first_slots (n), slots (pairs) of one band
+// -> sums (n, SLOT_STRIDE). From the first band to the last these are the additions that project_grad makes by itself.
+__kernel void add_slots(const uint n, __global const uint *tile_counts, __global const uint *first_slots,
+                        __global const float *slots, __global float *sums) {
+  const uint i = get_global_id(0);
+  if (i >= n) return;
+  const uint count = tile_counts[i];
+  if (count == 0) return;
+  __global const float *slot = slots + (size_t)SLOT_STRIDE * first_slots[i];
+  float own[SLOT_STRIDE];
+  for (int field = 0; field < SLOT_STRIDE; ++field) own[field] = sums[(size_t)SLOT_STRIDE * i + field];
+  for (uint k = 0; k < count; ++k, slot += SLOT_STRIDE)
+    for (int field = 0; field < SLOT_STRIDE; ++field) own[field] += slot[field];
+  for (int field = 0; field < SLOT_STRIDE; ++field) sums[(size_t)SLOT_STRIDE * i + field] = own[field];
+}
+
+// slots (pairs, SLOT_STRIDE), or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE).
 // tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project
 // -> gradients of the parameters (same shapes; rows of Gaussians that are not visible are left as they are) and of
 // the mean on the image: screen (n, 2) in pixels, plain or absolute.
@@ -29,10 +46,16 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
     const uint count = tile_counts[first_row + lane];
     if (count == 0) continue;
     any = 1;
+#ifdef ADDED_UP
+    __global const float *slot = slots + (size_t)SLOT_STRIDE * (first_row + lane);
+    const uint addends = 1;
+#else
     __global const float *slot = slots + (size_t)SLOT_STRIDE * first_slots[first_row + lane];
+    const uint addends = count;
+#endif
     float sums[SLOT_STRIDE];
     for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
-    for (uint k = 0; k < count; ++k, slot += SLOT_STRIDE)
+    for (uint k = 0; k < addends; ++k, slot += SLOT_STRIDE)
       for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] += slot[field];
     for (int field = 0; field < SLOT_STRIDE; ++field) m[field].lane[lane] = sums[field];
   }
@@ -118,7 +141,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   Lanes basis[16], weight[16];
   sh_basis(SH_USED(coefficients), vx, vy, vz, &basis[0].all);
   for (uint lane = 0; lane < lanes_used; ++lane) {
-    const uint i = first_row + lane;
+    const size_t i = first_row + lane;
     if (tile_counts[i] == 0) continue;
     __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
     const float4 d_colour = (float4)(splat[SPLAT_RED] > 0.0f ? m[SLOT_RED].lane[lane] : 0.0f,
@@ -147,7 +170,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   }
 
   for (uint lane = 0; lane < lanes_used; ++lane) {
-    const uint i = first_row + lane;
+    const size_t i = first_row + lane;
     if (tile_counts[i] == 0) continue;
     for (int k = 0; k < 3; ++k) d_means[3 * i + k] = d_mean[k].lane[lane];
     for (int k = 0; k < 4; ++k) d_quaternions[4 * i + k] = d_quaternion[k].lane[lane];

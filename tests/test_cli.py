@@ -112,7 +112,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         return Scene(views if test_every else views[1:], ["one photo is dark"])
 
     def train(
-        scene: Scene, config: TrainConfig, *, device: FakeDevice, run: Run, resume: bool, on_step: Any
+        scene: Scene, config: TrainConfig, *, device: FakeDevice, run: Run, resume: bool, on_step: Any, on_plan: Any
     ) -> Gaussians:
         pipe.calls.append(("train", config.iterations, config.seed, resume))
         on_step(Report(1))
@@ -123,7 +123,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         run.write_eval({"step": 1, "gaussians": 4, "seconds": 2.5, "mean": {"psnr": 20.0, "ssim": 0.5}, "views": [{}]})
         return gaussians
 
-    def open_device(selector: str | None) -> FakeDevice:
+    def open_device(selector: str | None, memory_limit: int | None = None) -> FakeDevice:
         if selector == "nosuch":
             raise DeviceError("--device nosuch: no such device")
         return FakeDevice()

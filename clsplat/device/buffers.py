@@ -38,9 +38,7 @@ class DeviceArray:
     def get(self) -> NDArray[Any]:
         """A copy on the host; waits for the device."""
         host = np.empty(self.shape, self.dtype)
-        if host.size:
-            event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=True)
-            self._note("read", event)
+        self.read_into(host)
         return host
 
     def set(self, values: NDArray[Any]) -> None:
@@ -62,13 +60,34 @@ class DeviceArray:
         if self.device.recorder.on:
             self.device.recorder.add(name, event, self.nbytes)
 
+    def read_into(self, host: NDArray[Any]) -> None:
+        """Copy to a C-contiguous array of the same shape on the host; waits for the device."""
+        if host.size:
+            event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=True)
+            self._note("read", event)
+
+    def rows(self, start: int, stop: int) -> DeviceArray:
+        """The rows [start, stop) in place. `start` has to be a multiple of `Device.row_alignment`."""
+        if (start, stop) == (0, self.shape[0]):
+            return self
+        width = self.nbytes // max(self.shape[0], 1)
+        buffer = self.buffer.get_sub_region(start * width, max((stop - start) * width, 1)) if width else self.buffer
+        return DeviceArray(self.device, buffer, (stop - start, *self.shape[1:]), self.dtype)
+
     def reshaped(self, *shape: int) -> DeviceArray:
         """The same memory in another shape, not larger."""
         return DeviceArray(self.device, self.buffer, shape, self.dtype)
 
 
+class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
+    """A buffer that can be referred to weakly, as the account of the device's memory wants."""
+
+
 def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:
-    """A new array, its buffer of at least `capacity` elements. Raises CapacityError over the device's limit."""
+    """A new array, its buffer of at least `capacity` elements.
+
+    Raises CapacityError over the device's limit of one buffer, the limit of all (`Device.memory`), or what it has.
+    """
     kind = np.dtype(dtype)
     elements = max(int(np.prod(shape, dtype=np.int64)), capacity, 1)
     nbytes = elements * kind.itemsize
@@ -78,7 +97,16 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
             f"a buffer of {nbytes / 2**20:.0f} MiB is needed and {device.name} allows {limit / 2**20:.0f} MiB: "
             "use a smaller resolution or fewer Gaussians (--density.max-gaussians)"
         )
-    return DeviceArray(device, cl.Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes), shape, kind)
+    device.memory.check(nbytes)
+    try:
+        buffer = _Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes)
+    except cl.MemoryError:
+        raise CapacityError(
+            f"{device.name} has no memory left for a buffer of {nbytes / 2**20:.0f} MiB, beside the "
+            f"{device.memory.used / 2**20:.0f} MiB in use: give --max-device-mem less than that"
+        ) from None
+    device.memory.add(buffer, nbytes)
+    return DeviceArray(device, buffer, shape, kind)
 
 
 def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
@@ -89,10 +117,12 @@ def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 
 class Workspace:
-    """Scratch arrays by name. A name's buffer is kept from call to call and grows by half when it is too small."""
+    """Scratch arrays by name. A name's buffer is kept from call to call, and grows by half when it is too small, or
+    where memory is `tight` to just what is needed."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
+        self.tight = device.memory.limit is not None
         self._arrays: dict[str, DeviceArray] = {}
 
     def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> DeviceArray:
@@ -101,10 +131,16 @@ class Workspace:
         elements = int(np.prod(shape, dtype=np.int64))
         held = self._arrays.get(name)
         if held is None or held.buffer.size < elements * kind.itemsize:
-            spare = 0 if held is None else min(elements * 3 // 2, self._device.max_allocation // kind.itemsize)
-            held = allocate(self._device, (elements,), kind, max(elements, spare))
-            self._arrays[name] = held
+            roomy = held is not None and not self.tight
+            spare = min(elements * 3 // 2, self._device.max_allocation // kind.itemsize) if roomy else 0
+            held = self._arrays.pop(name, None)
+            del held  # before its successor is made: there need not be room for both
+            held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
         return DeviceArray(self._device, held.buffer, shape, kind)
+
+    def clear(self) -> None:
+        """Let go of every buffer."""
+        self._arrays.clear()
 
     @property
     def nbytes(self) -> int:

@@ -17,6 +17,7 @@ os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 import numpy as np
 import pyopencl as cl
 
+from clsplat.device.memory import Memory
 from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build
 from clsplat.device.shapes import Shape, default_shape, kind_of, shape_of
@@ -83,6 +84,7 @@ class Device:
         self.kind = kind_of(device)
         self.shape = shape or default_shape(device)
         self.max_allocation = int(device.max_mem_alloc_size)
+        self.memory = Memory()
         self.context = cl.Context([device])
         self.profile = profile
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
@@ -110,13 +112,32 @@ class Device:
 
     def with_shape(self, **changes: int) -> Device:
         """A device like this with another shape."""
-        return Device(self.cl_device, replace(self.shape, **changes), profile=self.profile)
+        device = Device(self.cl_device, replace(self.shape, **changes), profile=self.profile)
+        device.memory.limit = self.memory.limit
+        return device
 
     def with_switches(self, switches: Mapping[str, object]) -> Device:
         """The same device, queue and cache of kernels, with these defines for the kernels whose text names them."""
         device = copy(self)
         device._switches = switches  # noqa: SLF001  # a copy of our own class
         return device
+
+    def with_memory_limit(self, limit: int | None) -> Device:
+        """The same device, queue and kernels, with an account of its own of at most `limit` bytes of buffers."""
+        device = copy(self)
+        device.memory = Memory(limit)
+        return device
+
+    @property
+    def budget(self) -> int:
+        """Bytes that may be in use: the limit, else all that the device has."""
+        return self.memory.limit or int(self.cl_device.global_mem_size)
+
+    @property
+    def row_alignment(self) -> int:
+        """Rows of four bytes or more that can be cut off an array in place: OpenCL has sub-buffers begin at multiples
+        of so many; and whole vectors of lanes."""
+        return max(int(self.cl_device.mem_base_addr_align) // 32, self.shape.lanes, 32)
 
     def finish(self) -> None:
         """Wait until the device has nothing to do."""
@@ -174,7 +195,11 @@ def _open(index: int) -> Device:
     return Device(device, shape_of(device))
 
 
-def open_device(selector: str | None = None) -> Device:
-    """Open the device that `selector` names (see `select`); the same object for the same device."""
+def open_device(selector: str | None = None, memory_limit: int | None = None) -> Device:
+    """Open the device that `selector` names (see `select`); the same object for the same device without a limit.
+
+    memory_limit: bytes that the buffers of this object's users may take together.
+    """
     chosen: Any = select(selector)
-    return _open(all_devices().index(chosen))
+    device = _open(all_devices().index(chosen))
+    return device if memory_limit is None else device.with_memory_limit(memory_limit)

@@ -5,6 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
+from clsplat.config import OptimiserConfig
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
@@ -16,16 +19,15 @@ def adam(
     device: Device,
     step: int,
     rates: Mapping[str, float],
-    beta1: float,
-    beta2: float,
-    epsilon: float,
+    config: OptimiserConfig,
     parameters: DeviceGaussians,
     gradients: DeviceGaussians,
     first: DeviceGaussians,
     second: DeviceGaussians,
 ) -> None:
-    """Step number `step` (from 1) with a rate per group; leaves the gradients zero."""
+    """Step number `step` (from 1) with the constants of `config` and a rate per group; leaves the gradients zero."""
     kernel, lanes = device.kernels("adam").adam, device.shape.lanes
+    beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     root = (1.0 - beta2**step) ** -0.5
     for group in GROUPS:
         n = parameters[group].size
@@ -33,7 +35,7 @@ def adam(
             device,
             kernel,
             -(-n // lanes),
-            n,
+            np.uint64(n),  # of SH more than 32 bits count, from 95 million Gaussians on
             rates[group] / (1.0 - beta1**step),
             root,
             beta1,

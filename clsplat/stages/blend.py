@@ -13,6 +13,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 from clsplat.device.layout import SLOT_ABSOLUTE, SLOT_PLAIN, TILE
 from clsplat.device.profile import stage
+from clsplat.stages.duplicate import Band
 from clsplat.stages.ranges import TileLists
 
 
@@ -38,8 +39,10 @@ def blend(
     background: DeviceArray,
     width: int,
     height: int,
+    band: Band | None = None,
 ) -> Blended:
-    """Blend each tile's Gaussians front to back over the background (3,)."""
+    """Blend the Gaussians of each of the band's tiles, all tiles if none is given, front to back over the background
+    (3,). Pixels of other tiles are left as they are."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     rows, stride = tiles_y * TILE, tiles_x * TILE
     image = work.array("image", (3, rows, stride))
@@ -49,8 +52,9 @@ def blend(
     launch_groups(
         device,
         device.kernels("blend", ITEMS=items).blend,
-        tiles_x * tiles_y,
+        band.tiles if band else tiles_x * tiles_y,
         items,
+        band.first if band else 0,
         tiles_x,
         width,
         height,
@@ -66,7 +70,13 @@ def blend(
 
 
 def count_pairs(
-    device: Device, work: Workspace, lists: TileLists, splats: DeviceArray, background: DeviceArray, camera: Camera
+    device: Device,
+    work: Workspace,
+    lists: TileLists,
+    splats: DeviceArray,
+    background: DeviceArray,
+    camera: Camera,
+    band: Band | None = None,
 ) -> tuple[int, int]:
     """(contributing, evaluated) pairs of a Gaussian and a pixel, by a build of blend.cl that counts them.
 
@@ -74,14 +84,20 @@ def count_pairs(
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     items = _items(device)
-    planes = (3, tiles_y * TILE, tiles_x * TILE)
-    scratch = [work.array(f"count_{name}", planes) for name in ("image", "transmittance", "stops")]
-    counts = work.array("counts", (tiles_x * tiles_y * items, 2), np.uint32)
+    rows, stride = tiles_y * TILE, tiles_x * TILE
+    planes = (  # those of `blend`: it writes the same values again
+        work.array("image", (3, rows, stride)),
+        work.array("transmittance", (rows, stride)),
+        work.array("stops", (rows, stride), np.int32),
+    )
+    tiles = band.tiles if band else tiles_x * tiles_y
+    counts = work.array("counts", (tiles * items, 2), np.uint32)
     launch_groups(
         device,
         device.kernels("blend", ITEMS=items, COUNT_PAIRS=True).blend,
-        tiles_x * tiles_y,
+        tiles,
         items,
+        band.first if band else 0,
         tiles_x,
         camera.width,
         camera.height,
@@ -89,7 +105,7 @@ def count_pairs(
         lists.gaussian_from_sorted,
         splats,
         background,
-        *scratch,
+        *planes,
         counts,
     )
     contributing, evaluated = counts.get().sum(axis=0, dtype=np.uint64)
@@ -105,10 +121,11 @@ def blend_grad(
     background: DeviceArray,
     blended: Blended,
     image_gradient: DeviceArray,
+    band: Band | None = None,
     *,
     absolute: bool = False,
 ) -> DeviceArray:
-    """Partial gradients of every pair at its slot, (pairs, SLOT), from image_gradient (3, rows, stride)."""
+    """Partial gradients of every pair of the band at its slot, (pairs, SLOT), from image_gradient (3, rows, stride)."""
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]
     slots = work.array("slots", (pairs, SLOT_ABSOLUTE if absolute else SLOT_PLAIN))
@@ -117,8 +134,9 @@ def blend_grad(
     launch_groups(
         device,
         device.kernels("blend_grad", ITEMS=items, **defines).blend_grad,
-        (rows // TILE) * (stride // TILE) if pairs else 0,
+        (band.tiles if band else (rows // TILE) * (stride // TILE)) if pairs else 0,
         items,
+        band.first if band else 0,
         stride // TILE,
         rows,
         lists.ranges,

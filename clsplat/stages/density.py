@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from clsplat.device.buffers import DeviceArray, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.stages.project import DeviceGaussians, Projected, group_shapes
+from clsplat.stages.project import AnyGaussians, DeviceGaussians, HostArray, HostGaussians, Projected, group_shapes
 
 NO_ROW = np.uint32(0xFFFFFFFF)
 """In a list of rows: a row of zeros."""
@@ -26,6 +26,10 @@ class DensityStatistics:
     gradient_sums: DeviceArray
     seen: DeviceArray
     radii: DeviceArray
+
+    def rows(self, start: int, stop: int) -> DensityStatistics:
+        """Of the Gaussians from start to before stop."""
+        return DensityStatistics(*(a.rows(start, stop) for a in (self.gradient_sums, self.seen, self.radii)))
 
 
 def new_statistics(device: Device, count: int) -> DensityStatistics:
@@ -62,8 +66,20 @@ def add_statistics(
     )
 
 
-def gather(device: Device, rows: NDArray[np.uint32], source: DeviceGaussians) -> DeviceGaussians:
-    """New arrays of which row j is row rows[j] of the source, or zeros at NO_ROW. Parameters and moments alike."""
+def _gather_on_host(rows: NDArray[np.uint32], source: HostGaussians) -> HostGaussians:
+    arrays = {}
+    for name, array in source.arrays.items():
+        values = array.values[np.where(rows == NO_ROW, 0, rows)]
+        values[rows == NO_ROW] = 0.0
+        arrays[name] = HostArray(values)
+    return replace(source, count=len(rows), arrays=arrays)
+
+
+def gather(device: Device, rows: NDArray[np.uint32], source: AnyGaussians) -> AnyGaussians:
+    """New arrays, where the source is, of which row j is row rows[j] of the source, or zeros at NO_ROW. Parameters and
+    moments alike."""
+    if isinstance(source, HostGaussians):
+        return _gather_on_host(rows, source)
     count = len(rows)
     rows_array = upload(device, rows)
     kernel = device.kernels("density").gather_rows
@@ -76,10 +92,10 @@ def gather(device: Device, rows: NDArray[np.uint32], source: DeviceGaussians) ->
     return DeviceGaussians(count, source.coefficients, arrays)
 
 
-def widen(device: Device, source: DeviceGaussians, coefficients: int) -> DeviceGaussians:
-    """The same with room for more SH coefficients, the new ones 0."""
-    arrays = dict(source.arrays)
+def widen(device: Device, source: AnyGaussians, coefficients: int) -> AnyGaussians:
+    """The same, where it was, with room for more SH coefficients, the new ones 0."""
     rest = np.zeros((source.count, coefficients - 1, 3), np.float32)
     rest[:, : source.coefficients - 1] = source["sh_rest"].get()
-    arrays["sh_rest"] = upload(device, rest)
-    return DeviceGaussians(source.count, coefficients, arrays)
+    if isinstance(source, HostGaussians):
+        return replace(source, coefficients=coefficients, arrays={**source.arrays, "sh_rest": HostArray(rest)})
+    return replace(source, coefficients=coefficients, arrays={**source.arrays, "sh_rest": upload(device, rest)})

@@ -77,7 +77,7 @@ def _pairs_per_second(device: Device, items: int, seconds: float, repeat: int) -
 
 def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
     lanes = device.shape.lanes
-    n = min(nbytes, device.max_allocation // 4) // 4 // lanes * lanes
+    n = min(nbytes, device.max_allocation // 4, device.budget // 4) // 4 // lanes * lanes
     source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
     source.fill(1.0)
     copy.fill(0.0)  # so that its pages are there

@@ -14,7 +14,12 @@ from clsplat.device.layout import PAD
 from clsplat.device.profile import stage
 
 _STRIPS = 64
-"""Work-items a row on devices that are not CPUs."""
+"""Of a row, on devices that are not CPUs."""
+
+
+def strips(device: Device) -> int:
+    """Work-items a row."""
+    return 1 if device.shape.items == 1 else _STRIPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,36 +39,48 @@ class Loss:
 
 @stage("loss")
 def loss(
-    device: Device, work: Workspace, image: DeviceArray, target: DeviceArray, width: int, height: int, weight: float
+    device: Device,
+    work: Workspace,
+    image: DeviceArray,
+    target: DeviceArray,
+    width: int,
+    height: int,
+    weight: float,
+    channels: int = 3,
 ) -> Loss:
-    """(1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero right of and below the image."""
+    """(1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero right of and below the image.
+
+    channels: 3, or 1 to work on one after the other in a third of the scratch memory.
+    """
     _, rows, stride = image.shape
     plane, padded = rows * stride, stride + 2 * PAD
-    strips = 1 if device.shape.items == 1 else _STRIPS
-    grid = (strips, height, 3)
+    across = strips(device)
+    grid = (across, height, channels)
     samples = 3 * width * height
-    moments = work.array("loss_moments", (5, 3, height, padded))
-    partials = work.array("loss_partials", (3, 3, height, stride))
+    moments = work.array("loss_moments", (5, channels, height, padded))
+    partials = work.array("loss_partials", (3, channels, height, stride))
     gradient = work.array("image_gradient", (3, rows, stride))
-    sums = work.array("loss_sums", (3, 3 * height * strips))
+    sums = work.array("loss_sums", (3, 3 * height * across))
     kernels = device.kernels("loss")
-    launch_grid(device, kernels.loss_vertical, grid, height, stride, plane, image, target, moments)
-    launch_grid(device, kernels.loss_ssim, grid, width, height, stride, plane, moments, partials, sums)
-    launch_grid(device, kernels.loss_vertical_grad, grid, height, stride, plane, partials, moments)
-    launch_grid(
-        device,
-        kernels.loss_grad,
-        grid,
-        width,
-        height,
-        stride,
-        plane,
-        (1 - weight) / samples,
-        weight / samples,
-        moments,
-        image,
-        target,
-        gradient,
-        sums,
-    )
+    for first in range(0, 3, channels):
+        launch_grid(device, kernels.loss_vertical, grid, first, height, stride, plane, image, target, moments)
+        launch_grid(device, kernels.loss_ssim, grid, first, width, height, stride, plane, moments, partials, sums)
+        launch_grid(device, kernels.loss_vertical_grad, grid, first, height, stride, plane, partials, moments)
+        launch_grid(
+            device,
+            kernels.loss_grad,
+            grid,
+            first,
+            width,
+            height,
+            stride,
+            plane,
+            (1 - weight) / samples,
+            weight / samples,
+            moments,
+            image,
+            target,
+            gradient,
+            sums,
+        )
     return Loss(gradient, sums, samples, weight)

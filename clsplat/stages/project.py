@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,74 @@ class DeviceGaussians:
         return self.arrays[group]
 
 
+@dataclass(frozen=True, eq=False)
+class HostArray:
+    """An array on the host that is used as a DeviceArray is."""
+
+    values: NDArray[np.float32]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.values.shape
+
+    def get(self) -> NDArray[np.float32]:
+        """A copy."""
+        return self.values.copy()
+
+    def set(self, values: NDArray[np.float32]) -> None:
+        """Copy from another array."""
+        self.values[...] = values
+
+    def fill(self, value: float) -> None:
+        """Set every element."""
+        self.values.fill(value)
+
+
+@dataclass(frozen=True, eq=False)
+class HostGaussians:
+    """As DeviceGaussians, but on the host: for use they go to the device `rows` at a time (`parts`)."""
+
+    count: int
+    coefficients: int
+    arrays: dict[str, HostArray]
+    rows: int
+
+    def __getitem__(self, group: str) -> HostArray:
+        return self.arrays[group]
+
+
+AnyGaussians = DeviceGaussians | HostGaussians
+
+
+def parts(
+    work: Workspace, *models: AnyGaussians, keep: bool = False
+) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...]]]:
+    """(start, stop, the models' rows from start to before stop on the device), all at once if they are there.
+
+    Of host models the part is valid until the next one is asked for; keep: what was done to it then goes back.
+    """
+    on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
+    if len(on_device) == len(models):
+        yield 0, models[0].count, on_device
+        return
+    streamed = [model for model in models if isinstance(model, HostGaussians)]
+    count, rows = streamed[0].count, streamed[0].rows
+    for start in range(0, count, rows):
+        stop = min(start + rows, count)
+        uploaded = []
+        for index, model in enumerate(streamed):
+            arrays = {}
+            for name, shape in group_shapes(stop - start, model.coefficients).items():
+                arrays[name] = work.array(f"part{index}_{name}", shape)
+                arrays[name].set(model[name].values[start:stop])
+            uploaded.append(DeviceGaussians(stop - start, model.coefficients, arrays))
+        yield start, stop, tuple(uploaded)
+        if keep:
+            for model, part in zip(streamed, uploaded, strict=True):
+                for name, array in part.arrays.items():
+                    array.read_into(model[name].values[start:stop])
+
+
 def group_shapes(count: int, coefficients: int) -> dict[str, tuple[int, ...]]:
     """The arrays of `count` Gaussians with `coefficients` SH coefficients a channel."""
     return {
@@ -53,8 +122,7 @@ def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: b
     return DeviceGaussians(count, coefficients, arrays)
 
 
-def upload_gaussians(device: Device, gaussians: Gaussians) -> DeviceGaussians:
-    """A copy on the device."""
+def _grouped(gaussians: Gaussians) -> dict[str, NDArray[np.float32]]:
     host = {
         "means": gaussians.means,
         "quaternions": gaussians.quaternions,
@@ -63,13 +131,45 @@ def upload_gaussians(device: Device, gaussians: Gaussians) -> DeviceGaussians:
         "sh_dc": gaussians.sh[:, 0],
         "sh_rest": gaussians.sh[:, 1:],
     }
-    arrays = {name: upload(device, np.ascontiguousarray(values, np.float32)) for name, values in host.items()}
+    return {name: np.ascontiguousarray(values, np.float32) for name, values in host.items()}
+
+
+def upload_gaussians(device: Device, gaussians: Gaussians) -> DeviceGaussians:
+    """A copy on the device."""
+    arrays = {name: upload(device, values) for name, values in _grouped(gaussians).items()}
     return DeviceGaussians(len(gaussians), gaussians.sh.shape[1], arrays)
 
 
-def download_gaussians(gaussians: DeviceGaussians) -> Gaussians:
+def host_gaussians(gaussians: Gaussians, rows: int) -> HostGaussians:
+    """On the host, to go through the device `rows` at a time. Not a copy: to read, unless the caller may write."""
+    arrays = {name: HostArray(values) for name, values in _grouped(gaussians).items()}
+    return HostGaussians(len(gaussians), gaussians.sh.shape[1], arrays, rows)
+
+
+def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
+    """Zeros, as moments begin."""
+    shapes = group_shapes(count, coefficients)
+    arrays = {name: HostArray(np.zeros(shape, np.float32)) for name, shape in shapes.items()}
+    return HostGaussians(count, coefficients, arrays, rows)
+
+
+def to_host(gaussians: AnyGaussians) -> HostGaussians:
+    """A copy of what is on the device, or what is on the host already."""
+    if isinstance(gaussians, HostGaussians):
+        return gaussians
+    arrays = {name: HostArray(array.get()) for name, array in gaussians.arrays.items()}
+    return HostGaussians(gaussians.count, gaussians.coefficients, arrays, gaussians.count)
+
+
+def to_device(device: Device, gaussians: HostGaussians) -> DeviceGaussians:
+    """A copy of what is on the host."""
+    arrays = {name: upload(device, array.values) for name, array in gaussians.arrays.items()}
+    return DeviceGaussians(gaussians.count, gaussians.coefficients, arrays)
+
+
+def download_gaussians(gaussians: AnyGaussians) -> Gaussians:
     """A copy on the host."""
-    host = {name: array.get() for name, array in gaussians.arrays.items()}
+    host = {name: gaussians[name].get() for name in GROUPS}
     return Gaussians(
         means=host["means"],
         quaternions=host["quaternions"],
@@ -115,30 +215,81 @@ class Projected:
     splats: DeviceArray
     tile_counts: DeviceArray
 
+    def rows(self, start: int, stop: int) -> Projected:
+        """Of the Gaussians from start to before stop."""
+        return Projected(self.splats.rows(start, stop), self.tile_counts.rows(start, stop))
+
 
 @stage("project")
 def project(
-    device: Device, work: Workspace, gaussians: DeviceGaussians, camera: Camera, camera_array: DeviceArray
+    device: Device, work: Workspace, gaussians: AnyGaussians, camera: Camera, camera_array: DeviceArray
 ) -> Projected:
     """Project all Gaussians (Kerbl et al. 2023, section 4) and count the tiles that each reaches."""
     n = gaussians.count
     splats = work.array("splats", (n, len(SPLAT)))
     tile_counts = work.array("tile_counts", (n,), np.uint32)
     tiles_x, tiles_y = tiles_of(camera)
+    projected = Projected(splats, tile_counts)
+    for start, stop, (part,) in parts(work, gaussians):
+        out = projected.rows(start, stop)
+        launch_items(
+            device,
+            device.kernels("project").project,
+            -(-part.count // device.shape.lanes),
+            part.count,
+            part.coefficients,
+            tiles_x,
+            tiles_y,
+            camera_array,
+            *(part[group] for group in GROUPS),
+            out.splats,
+            out.tile_counts,
+        )
+    return projected
+
+
+@dataclass(frozen=True, eq=False)
+class Slots:
+    """values (pairs, SLOT), where those of Gaussian i begin at first_slots[i]; without first_slots they are added up
+    already: (n, SLOT)."""
+
+    values: DeviceArray
+    first_slots: DeviceArray | None = None
+
+    def rows(self, start: int, stop: int) -> Slots:
+        """For the Gaussians from start to before stop."""
+        if self.first_slots is None:
+            return Slots(self.values.rows(start, stop))
+        return Slots(self.values, self.first_slots.rows(start, stop))
+
+
+@stage("project_grad")
+def add_slots(
+    device: Device,
+    work: Workspace,
+    tile_counts: DeviceArray,
+    slots: Slots,
+    sums: DeviceArray | None,
+    *,
+    absolute: bool = False,
+) -> DeviceArray:
+    """Add one band's slots to the sums by Gaussian (n, SLOT), which begin as None; bands have to come in order."""
+    (n,) = tile_counts.shape
+    if sums is None:
+        sums = work.array("slot_sums", (n, slots.values.shape[1]))
+        sums.fill(0.0)
+    defines = {"ABSOLUTE_GRADIENTS": True} if absolute else {}
     launch_items(
         device,
-        device.kernels("project").project,
-        -(-n // device.shape.lanes),
+        device.kernels("project_grad", **defines).add_slots,
+        n if slots.values.shape[0] else 0,
         n,
-        gaussians.coefficients,
-        tiles_x,
-        tiles_y,
-        camera_array,
-        *(gaussians[group] for group in GROUPS),
-        splats,
         tile_counts,
+        slots.first_slots,
+        slots.values,
+        sums,
     )
-    return Projected(splats, tile_counts)
+    return sums
 
 
 @stage("project_grad")
@@ -147,26 +298,26 @@ def project_grad(
     gaussians: DeviceGaussians,
     camera_array: DeviceArray,
     projected: Projected,
-    first_slots: DeviceArray,
-    slots: DeviceArray,
+    slots: Slots,
     gradients: DeviceGaussians,
     screen: DeviceArray,
     *,
     absolute: bool = False,
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` and `screen` (n, 2) from the pairs' slots."""
-    defines = {"ABSOLUTE_GRADIENTS": True} if absolute else {}
+    defines = {"ABSOLUTE_GRADIENTS": absolute, "ADDED_UP": slots.first_slots is None}
+    defines = {name: True for name, wanted in defines.items() if wanted}
     n = gaussians.count
     launch_items(
         device,
         device.kernels("project_grad", **defines).project_grad,
-        -(-n // device.shape.lanes) if slots.shape[0] else 0,
+        -(-n // device.shape.lanes) if slots.values.shape[0] else 0,
         n,
         gaussians.coefficients,
         camera_array,
         projected.tile_counts,
-        first_slots,
-        slots,
+        slots.first_slots or projected.tile_counts,  # not looked at where they are added up
+        slots.values,
         projected.splats,
         *(gaussians[group] for group in GROUPS),
         *(gradients[group] for group in GROUPS),

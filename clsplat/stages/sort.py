@@ -18,6 +18,13 @@ BITONIC_WINS = {"cpu": 512, "gpu": BITONIC_MAX, "other": BITONIC_MAX}
 """Up to this many keys one launch of bitonic sort beats the radix sort's dozen."""
 
 
+def scratch_bytes(device: Device, n: int) -> int:
+    """At most so many bytes do sorts and scans of up to `n` elements need, beside the arrays under their names."""
+    shape = device.shape
+    groups = min(shape.chunks, -(-n // 1024)) if shape.items == 1 else -(-n // (16 * shape.items))
+    return 4 * (1 << shape.digit_bits) * max(groups, 1) + 8 * max(groups, shape.chunks)  # histograms, sums of scans
+
+
 def radix_sort(
     device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int
 ) -> tuple[DeviceArray, DeviceArray]:

@@ -20,7 +20,7 @@ def target(device: Device, work: Workspace, image: NDArray[Any], background: Dev
     """image (H, W, 3 or 4), uint8 or float32, straight alpha -> planes (3, rows, stride) over the background."""
     height, width, channels = image.shape
     rows, stride = -(-height // TILE) * TILE, -(-width // TILE) * TILE
-    source = work.array(f"target_{image.dtype}", image.shape, image.dtype)
+    source = work.array("target_source", image.shape, image.dtype)
     source.set(image)
     planes = work.array("target", (3, rows, stride))
     kernels = device.kernels("target", **({"BYTES": True} if image.dtype == np.uint8 else {}))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from compare import assert_close
 
+from clsplat.config import OptimiserConfig
 from clsplat.device.context import Device
 from clsplat.reference.adam import adam as reference
 from clsplat.stages.adam import adam
@@ -31,7 +32,7 @@ def test_steps(shaped_device: Device, count: int) -> None:
             wanted[group] = reference(
                 wanted[group][0], gradient.astype(np.float64), *wanted[group][1:], step, rates[group], 0.9, 0.999, 1e-15
             )
-        adam(shaped_device, step, rates, 0.9, 0.999, 1e-15, p, g, m, v)
+        adam(shaped_device, step, rates, OptimiserConfig(), p, g, m, v)
     for group in GROUPS:
         # beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3: 1e-5 of a step, of which there were four.
         assert_close(p[group].get(), wanted[group][0], relative=1e-6, absolute=1e-4 * rates[group])
@@ -41,5 +42,5 @@ def test_steps(shaped_device: Device, count: int) -> None:
 def test_no_gradient_no_step(device: Device) -> None:
     p, g, m, v = (allocate_gaussians(device, 20, 1, zero=True) for _ in range(4))
     p["means"].fill(0.5)
-    adam(device, 1, dict.fromkeys(GROUPS, 0.1), 0.9, 0.999, 1e-15, p, g, m, v)
+    adam(device, 1, dict.fromkeys(GROUPS, 0.1), OptimiserConfig(), p, g, m, v)
     assert np.all(p["means"].get() == 0.5)

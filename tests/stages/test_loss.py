@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from compare import assert_close, assert_close_gradient
+from compare import assert_close, assert_close_gradient, assert_same_bits
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
@@ -76,3 +76,16 @@ def test_target_composites_alpha(device: Device, channels: int, dtype: type) -> 
     if channels == 4:
         wanted = wanted * values[:, :, 3:] + background * (1 - values[:, :, 3:])
     assert_close(planes, padded(wanted), absolute=2e-7)
+
+
+def test_channel_by_channel_it_has_the_same_bits(shaped_device: Device) -> None:
+    x, y = np.random.default_rng(0).random((2, 37, 50, 3)).astype(np.float32)
+    planes = [upload(shaped_device, padded(image)) for image in (x, y)]
+    held = []
+    for channels in (3, 1):
+        work = Workspace(shaped_device)
+        result = loss(shaped_device, work, *planes, 50, 37, 0.2, channels)
+        held.append((result.gradient.get()[:, :37], result.sums.get(), work.nbytes))
+    assert_same_bits(held[1][0], held[0][0])
+    assert_same_bits(held[1][1], held[0][1])
+    assert held[1][2] < 0.6 * held[0][2]

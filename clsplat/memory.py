@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much device memory may be used, and what is worked on in pieces because of it. Policy only: no OpenCL."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from clsplat.errors import CapacityError, InputError
+
+_UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+_SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([kmgt]?)(i?b)?\s*", re.IGNORECASE)
+
+
+def parse_bytes(text: str | int | None, flag: str = "--max-device-mem") -> int | None:
+    """Bytes of "256MiB", "2GiB", "1.5G" (the same as GiB), "500MB" (decimal) or a number. Raises InputError."""
+    if text is None:
+        return None
+    match = _SIZE.fullmatch(str(text))
+    size = 0
+    if match is not None:
+        number, prefix, ending = match.groups()
+        decimal = prefix and (ending or "").lower() == "b"
+        unit = 1000 ** "kmgt".index(prefix.lower()) * 1000 if decimal else _UNITS[prefix.lower()]
+        size = int(float(number) * unit)
+    if size < 1:
+        raise InputError(f"{flag} {text}: expected a size such as 256MiB, 1.5G or a number of bytes")
+    return size
+
+
+@dataclass(frozen=True)
+class Need:
+    """What a frame, or a training step, asks of the device's memory, in bytes unless said otherwise.
+
+    gaussians: how many; floats: parameters of one; models: arrays of so many parameters, 1 for a frame and 4 for a
+    step; slot: floats of a pair's slot, 0 for a frame; planes: all that is as large as the image; loss: of which the
+    loss's scratch memory; scratch: whatever is left over.
+    """
+
+    gaussians: int
+    floats: int
+    models: int
+    slot: int
+    planes: int
+    loss: int
+    scratch: int
+
+    @property
+    def row(self) -> int:
+        """Of each Gaussian, beside its parameters: splat, counts, scans, sort by depth; screen and statistics."""
+        return 64 + 12 + 36 + (20 if self.slot else 0)
+
+    @property
+    def banded_row(self) -> int:
+        """`row`, with what several bands of tiles want: counts of the band, sums of slots."""
+        return self.row + 4 + 4 * self.slot
+
+    @property
+    def model(self) -> int:
+        """Of each Gaussian's parameters, gradients and moments."""
+        return 4 * self.floats * self.models
+
+    @property
+    def pair(self) -> int:
+        """Of each pair: keys, sort, lists; slot."""
+        return 36 + 4 * self.slot
+
+    @property
+    def pairs(self) -> int:
+        """A guess, before the first frame: how many there will be."""
+        return PAIRS_EACH * self.gaussians
+
+    @property
+    def total(self) -> int:
+        """With everything on the device at once."""
+        return self.planes + self.scratch + self.gaussians * (self.row + self.model) + self.pairs * self.pair
+
+
+PAIRS_EACH = 8
+"""Tiles that a Gaussian reaches, as a guess. Trained scenes have 3 to 8."""
+
+_MAX_PAIRS = 2**31 - 1024
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How the work goes through the memory.
+
+    rows: Gaussians whose parameters, gradients and moments are on the device at once; streamed: not all of them;
+    pairs: most (tile, Gaussian) pairs at once; channels: of the loss, at once; gathers: rows move on the device;
+    needed and allowed: bytes, the first estimated; groups: of tiles, estimated too.
+    """
+
+    gaussians: int
+    rows: int
+    streamed: bool
+    pairs: int
+    channels: int
+    gathers: bool
+    needed: int
+    allowed: int
+    groups: int
+
+    @property
+    def pieces(self) -> tuple[bool, bool, bool]:
+        """What is done in pieces: parameters, image, loss."""
+        return self.streamed, self.groups > 1, self.channels < 3
+
+    @property
+    def tight(self) -> bool:
+        """Whether there is no room to spare."""
+        return any(self.pieces) or not self.gathers
+
+    def __str__(self) -> str:
+        """The line that training prints."""
+        how = []
+        if self.streamed:
+            how.append(f"parameters are streamed, {self.rows:,} Gaussians at a time")
+        if self.groups > 1:
+            how.append(f"the image is done in about {self.groups} groups of tiles")
+        if self.channels < 3:
+            how.append("the loss is done by channel")
+        needed, allowed = (f"{size / 2**20:,.1f} MiB" for size in (self.needed, self.allowed))
+        return f"about {needed} of device memory needed, {allowed} allowed: " + (", ".join(how) or "all at once")
+
+
+def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
+    """All at once if the guess of the pairs says so; else the loss by channel, then the tiles in bands, and when those
+    would be many, the parameters in parts: bands repeat little, parts go over the bus in every step.
+
+    alignment: what the number of rows is a multiple of. Raises CapacityError where not even the smallest pieces fit.
+    """
+    widest = 4 * max(need.floats - 14, 4)
+    most_pairs = min(max_allocation // (4 * max(need.slot, 1)), _MAX_PAIRS)
+    channels = 3 if need.total <= budget and need.loss * 4 // 5 <= max_allocation else 1
+    planes = need.planes - (need.loss * 2 // 3 if channels == 1 else 0)
+    room = budget - planes - need.scratch - need.gaussians * need.banded_row
+
+    def made(rows: int, *, streamed: bool) -> Plan:
+        pairs = min((room - rows * need.model) // need.pair, most_pairs)
+        gathers = not streamed and need.total + need.gaussians * need.model * 3 // 4 <= budget
+        groups = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > most_pairs else 1
+        return Plan(need.gaussians, rows, streamed, pairs, channels, gathers, need.total, budget, groups)
+
+    whole = made(need.gaussians, streamed=False)
+    enough = min(need.pairs // 8, need.gaussians) + 1
+    if need.gaussians * widest <= max_allocation and whole.pairs >= enough:
+        return whole
+    for_rows = min(room // 4, room - need.gaussians * need.pair)  # a tile may have all Gaussians
+    rows = max(min(for_rows // need.model, max_allocation // widest, need.gaussians), alignment)
+    rows -= rows % alignment
+    streamed = made(rows, streamed=True)
+    if streamed.pairs < 1:
+        least = budget - room + alignment * need.model + max(need.gaussians // 8, 1) * need.pair
+        raise CapacityError(
+            f"{need.gaussians:,} Gaussians at this size of image need at least about {least / 2**20:,.1f} MiB of device"
+            f" memory, {need.total / 2**20:,.1f} MiB to be done at once, and {budget / 2**20:,.1f} MiB are allowed"
+        )
+    return streamed

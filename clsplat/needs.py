@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What frames and training steps need of a device's memory: the sizes of the stages' arrays, for the plan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from clsplat.camera import Camera
+from clsplat.device.context import Device
+from clsplat.device.layout import PAD, SLOT_ABSOLUTE, SLOT_PLAIN, TILE
+from clsplat.memory import Need, Plan, plan
+from clsplat.stages.loss import strips
+from clsplat.stages.project import tiles_of
+from clsplat.stages.sort import scratch_bytes
+
+_SOURCE = 16
+"""Bytes of a photograph's pixel at most: RGBA in floats."""
+_SMALL = 4096
+"""Camera, background, totals and the like."""
+
+
+def plan_frame(device: Device, gaussians: int, coefficients: int, camera: Camera) -> Plan:
+    """Of rendering alone. Raises CapacityError."""
+    return _plan(device, gaussians, coefficients, [camera], training=False, slot=0)
+
+
+def plan_step(device: Device, gaussians: int, coefficients: int, cameras: Iterable[Camera], *, absolute: bool) -> Plan:
+    """Of a training step, from any of the cameras. Raises CapacityError."""
+    slot = SLOT_ABSOLUTE if absolute else SLOT_PLAIN
+    return _plan(device, gaussians, coefficients, cameras, training=True, slot=slot)
+
+
+def _plan(
+    device: Device, gaussians: int, coefficients: int, cameras: Iterable[Camera], *, training: bool, slot: int
+) -> Plan:
+    planes = loss = 0
+    for camera in cameras:
+        tiles_x, tiles_y = tiles_of(camera)
+        pixels, stride = tiles_x * tiles_y * TILE * TILE, tiles_x * TILE
+        scratch = 5 * 3 * 4 * camera.height * (stride + 2 * PAD) + 9 * 4 * camera.height * stride
+        sums = 9 * 4 * camera.height * strips(device)
+        # image, transmittance, stops; ranges, counts_by_tile; in training target, its source, image_gradient
+        own = 20 * pixels + 12 * tiles_x * tiles_y + ((24 + _SOURCE) * pixels + sums if training else 0)
+        loss = max(loss, scratch if training else 0)
+        planes = max(planes, own)
+    floats = 11 + 3 * coefficients
+    longest = max(gaussians, device.budget // 36)
+    need = Need(
+        gaussians=gaussians,
+        floats=floats,
+        models=4 if training else 1,
+        slot=slot,
+        planes=planes + loss,
+        loss=loss,
+        scratch=scratch_bytes(device, longest) + _SMALL,
+    )
+    return plan(need, device.budget, device.max_allocation, device.row_alignment)
