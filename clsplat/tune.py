@@ -10,7 +10,6 @@ from __future__ import annotations
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from clsplat.bench import synthetic
+from clsplat.bench import synthetic, wall_ms
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, all_devices
 from clsplat.device.shapes import Shape, candidates, default_shape, save_shape
@@ -79,14 +78,12 @@ def measure(device: Device, workload: tuple[int, int, int] = WORKLOAD, repeat: i
     gaussians = upload_gaussians(device, subject.gaussians)
     gradients = allocate_gaussians(device, gaussians.count, gaussians.coefficients, zero=True)
     background = upload(device, np.zeros(3, np.float32))
-    times = []
-    for _ in range(repeat + 2):
-        device.finish()
-        start = time.perf_counter()
+
+    def draw() -> None:
         frame = rasterizer.forward(gaussians, subject.camera, background)
         rasterizer.backward(gaussians, frame, frame.blended.image, gradients)
-        device.finish()
-        times.append(1e3 * (time.perf_counter() - start))
+
+    times = [wall_ms(device, draw) for _ in range(repeat + 2)]
     return statistics.median(times[2:])
 
 

@@ -27,8 +27,9 @@
 // ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), background (3) -> image (3, height, width),
 // transmittance (height, width): what is left at the end; stops (height, width): the sorted index from which on the
 // pixel takes no more, -1 in padding. Sizes are padded to whole tiles; padding is black.
-GROUP __kernel void blend(const int first_tile, const int tiles_x, const int width, const int height, __global const uint *ranges,
-                          __global const uint *gaussian_from_sorted, __global const float *splats,
+GROUP __kernel void blend(const int first_tile, const int tiles_x, const int width, const int height,
+                          __global const uint *ranges, __global const uint *gaussian_from_sorted,
+                          __global const float *splats,
                           __global const float *background, __global float *image, __global float *transmittance,
                           __global int *stops
 #ifdef COUNT_PAIRS
@@ -66,7 +67,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     FOR_CELLS(cell, IN_OPEN(reach, open)) {
       const int k = cell / ITEMS;
       const floatL dy = my - AT_Y(cell);
-      const floatL u = fmaL((floatL)(l12), dy, l11 * (mx - AT_X(cell)));
+      const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy);
       const floatL power = log2_alpha(u, l22 * dy, log2o);
       COUNT(evaluated += LANES;)
       const intL reached = MASKL(power >= LOG2_ALPHA_MIN);

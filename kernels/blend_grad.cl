@@ -98,7 +98,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     FOR_CELLS(cell, reach) {
       const int k = cell / ITEMS;
       const floatL dy = my - AT_Y(cell);
-      const floatL u = fmaL((floatL)(l12), dy, l11 * (mx - AT_X(cell))), v = l22 * dy;
+      const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;
       const floatL power = log2_alpha(u, v, log2o);
       const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
       if (REACHES(taken)) {

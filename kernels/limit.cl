@@ -20,8 +20,8 @@ GROUP __kernel void limit_blend(const int rounds, __global const float *splats, 
     for (int i = 0; i < rounds; ++i) {
       __global const float *splat = splats + SPLAT_SIZE * (i % LIMIT_SPLATS);
       const floatL dy = splat[SPLAT_PIXEL_Y] - y;
-      const floatL power = log2_alpha(fmaL((floatL)(splat[SPLAT_L12]), dy, splat[SPLAT_L11] * (splat[SPLAT_PIXEL_X] - x)),
-                                      splat[SPLAT_L22] * dy, splat[SPLAT_LOG2O]);
+      const floatL u = whitened_u(splat[SPLAT_L11], splat[SPLAT_L12], splat[SPLAT_PIXEL_X] - x, dy);
+      const floatL power = log2_alpha(u, splat[SPLAT_L22] * dy, splat[SPLAT_LOG2O]);
       floatL alpha = exp2L(power);
       alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
       alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);

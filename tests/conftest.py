@@ -14,7 +14,9 @@ from opencl_drivers import use_every_driver
 
 use_every_driver()
 
+from calls import train
 from pipeline import shaped
+from tiny import CONFIG, write_scene
 
 from clsplat.device.context import Device, list_devices, open_device
 
@@ -48,3 +50,17 @@ def shaped_device(device: Device, request: pytest.FixtureRequest) -> Device:
     """Each driver in each kernel shape."""
     lanes, items = request.param
     return shaped(device, lanes, items)
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny scene on disk; not to be changed."""
+    return write_scene(tmp_path_factory.mktemp("cli") / "scene")
+
+
+@pytest.fixture(scope="session")
+def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of CONFIG by the command line; not to be changed."""
+    run = tmp_path_factory.mktemp("trained") / "run"
+    assert train(scene, run, CONFIG) == 0
+    return run

@@ -17,19 +17,6 @@ from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, write_scene
 from clsplat.cli import main
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("cli") / "scene")
-
-
-@pytest.fixture(scope="module")
-def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of CONFIG; not to be changed."""
-    run = tmp_path_factory.mktemp("trained") / "run"
-    assert train(scene, run, CONFIG) == 0
-    return run
-
-
 @pytest.mark.parametrize(
     ("line", "message"),
     [

@@ -24,20 +24,6 @@ import clsplat
 from clsplat.cli import main
 from clsplat.runs import Run
 
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("cli") / "scene")
-
-
-@pytest.fixture(scope="module")
-def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of CONFIG; not to be changed."""
-    run = tmp_path_factory.mktemp("trained") / "run"
-    assert train(scene, run, CONFIG) == 0
-    return run
-
-
 # From photographs to pictures
 
 

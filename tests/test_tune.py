@@ -52,6 +52,7 @@ def test_what_was_kept_is_found_again_and_forgotten(default_device: Device) -> N
     other = replace(default_shape(device), lanes=4, items=2)
     save_shape(device, other)
     assert shape_of(device) == other
+    assert Device(device).shape == other, "also where no name was given, as in bench"
     assert any(info.shape == "4 lanes x 2 items" for info in list_devices())
     save_shape(device, None)
     assert shape_of(device) == default_shape(device)

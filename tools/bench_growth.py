@@ -15,14 +15,12 @@ sizes count as much as large ones. The largest residual is stated, as a share of
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
-from measuring import Result, machine, number, reporting, require, show, sizes
+from measuring import Result, machine, number, options_parser, reporting, require, show, sizes
 
 from clsplat.bench import columns, synthetic, wall_ms
 from clsplat.device.buffers import upload
@@ -103,15 +101,9 @@ def panel(part: Result) -> Panel:
 
 def run(arguments: list[str]) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = options_parser(__doc__)
     parser.add_argument("--max-gaussians", metavar="N", type=number, default=3_000_000)
     parser.add_argument("--max-megapixels", metavar="X", type=float, default=8.0)
-    parser.add_argument("--repeat", metavar="N", type=int, default=5)
-    parser.add_argument("--device")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--plot", metavar="FILE", type=Path)
     options = parser.parse_args(arguments)
     counts = sizes(FEWEST, options.max_gaussians)
     images = [size_of(size) for size in MEGAPIXELS if size <= options.max_megapixels]

@@ -15,7 +15,6 @@ largest time a key over the smallest, from 1e5 keys up.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 import time
@@ -24,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import Result, machine, number, reporting, require, show, sizes
+from measuring import Result, machine, number, options_parser, reporting, require, show, sizes
 from numpy.typing import NDArray
 
 from clsplat.bench import columns, wall_ms
@@ -151,14 +150,8 @@ def plot(path: Path, result: Result) -> None:
 
 def run(arguments: list[str]) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = options_parser(__doc__)
     parser.add_argument("--max", metavar="N", type=number, default=30_000_000)
-    parser.add_argument("--repeat", metavar="N", type=int, default=5)
-    parser.add_argument("--device")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--plot", metavar="FILE", type=Path)
     options = parser.parse_args(arguments)
     require(options.max >= SMALLEST, f"--max {options.max}: expected at least {SMALLEST}")
     require(options.repeat >= 1, f"--repeat {options.repeat}: expected at least 1")

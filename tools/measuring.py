@@ -3,16 +3,30 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from clsplat.device.context import Device
 from clsplat.errors import ClsplatError, InputError
 
 Result = dict[str, Any]
+
+
+def options_parser(description: str | None) -> argparse.ArgumentParser:
+    """With the options that every one of the tools with a plot has; the description stands as it is written."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("--repeat", metavar="N", type=int, default=5)
+    parser.add_argument("--device")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--plot", metavar="FILE", type=Path)
+    return parser
 
 
 def number(text: str) -> int:

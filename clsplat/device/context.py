@@ -20,7 +20,7 @@ import pyopencl as cl
 from clsplat.device.memory import Memory
 from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build
-from clsplat.device.shapes import Shape, default_shape, kind_of, shape_of
+from clsplat.device.shapes import Shape, kind_of, shape_of
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError
 
@@ -82,7 +82,7 @@ class Device:
         self.name = device.name.strip()
         self.driver = device.platform.version.strip()
         self.kind = kind_of(device)
-        self.shape = shape or default_shape(device)
+        self.shape = shape or shape_of(device)
         self.max_allocation = int(device.max_mem_alloc_size)
         self.memory = Memory()
         self.context = cl.Context([device])
@@ -191,8 +191,7 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 @lru_cache(maxsize=8)
 def _open(index: int) -> Device:
-    device = all_devices()[index]
-    return Device(device, shape_of(device))
+    return Device(all_devices()[index])
 
 
 def open_device(selector: str | None = None, memory_limit: int | None = None) -> Device:

@@ -74,7 +74,7 @@ def candidates(device: cl.Device) -> list[Shape]:
 
 
 def shape_of(device: cl.Device) -> Shape:
-    """What a device that is opened by name gets. Raises DeviceError for a CLSPLAT_SHAPE that makes no sense."""
+    """What a device gets that is opened without another. Raises DeviceError for a CLSPLAT_SHAPE that makes no sense."""
     default = default_shape(device)
     text = os.environ.get("CLSPLAT_SHAPE")
     if not text:

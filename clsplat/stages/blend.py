@@ -26,7 +26,8 @@ class Blended:
     stops: DeviceArray
 
 
-def _items(device: Device) -> int:
+def tile_items(device: Device) -> int:
+    """Work-items that share a tile: no more than it has vectors."""
     return min(device.shape.items, TILE * TILE // device.shape.lanes)
 
 
@@ -48,7 +49,7 @@ def blend(
     image = work.array("image", (3, rows, stride))
     transmittance = work.array("transmittance", (rows, stride))
     stops = work.array("stops", (rows, stride), np.int32)
-    items = _items(device)
+    items = tile_items(device)
     launch_groups(
         device,
         device.kernels("blend", ITEMS=items).blend,
@@ -83,7 +84,7 @@ def count_pairs(
     Contributing: added to the pixel's colour. Evaluated: alpha was worked out, in a lane of a vector that was visited.
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    items = _items(device)
+    items = tile_items(device)
     rows, stride = tiles_y * TILE, tiles_x * TILE
     planes = (  # those of `blend`: it writes the same values again
         work.array("image", (3, rows, stride)),
@@ -129,7 +130,7 @@ def blend_grad(
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]
     slots = work.array("slots", (pairs, SLOT_ABSOLUTE if absolute else SLOT_PLAIN))
-    items = _items(device)
+    items = tile_items(device)
     defines = {"ABSOLUTE_GRADIENTS": True} if absolute else {}
     launch_groups(
         device,

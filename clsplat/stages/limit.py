@@ -13,6 +13,7 @@ from clsplat.device.buffers import allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups, launch_items
 from clsplat.device.layout import SPLAT, TILE
+from clsplat.stages.blend import tile_items
 
 _SPLATS = 64
 _GROUPS = {"cpu": 4, "gpu": 32, "other": 32}
@@ -33,7 +34,7 @@ class Limits:
 
 def measure_limits(device: Device, *, seconds: float = 0.1, repeat: int = 5, copy_bytes: int = _COPY_BYTES) -> Limits:
     """The best of `repeat` runs each; those of the arithmetic are made to last about `seconds`."""
-    items = min(device.shape.items, TILE * TILE // device.shape.lanes)
+    items = tile_items(device)
     return Limits(
         _pairs_per_second(device, items, seconds, repeat),
         _copy_rate(device, copy_bytes, repeat),

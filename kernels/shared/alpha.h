@@ -8,6 +8,11 @@
 #define REACHES(mask) ANYL(mask)
 #endif
 
+// u of a pixel, from the mean's offset (dx, dy) to it.
+static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
+  return fmaL((floatL)(l12), dy, l11 * dx);
+}
+
 // log2 of alpha before the cap, from the mean's offset in (u, v).
 static inline floatL log2_alpha(floatL u, floatL v, float log2o) {
   return fmaL(-u, u, fmaL(-v, v, (floatL)(log2o)));
