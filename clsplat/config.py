@@ -98,6 +98,10 @@ class OptimiserConfig:
     """Rate of the log scales."""
     quaternions_rate: float = 1e-3
     """Rate of the raw quaternions."""
+    sparse: bool = False
+    """Leave Gaussians that a step's view does not show as they are, their moments too (approximate)."""
+    sh_rest_every: int = 1
+    """Steps from one update of the higher SH bands to the next (approximate above 1)."""
     cooldown: int = 0
     """Over the last so many steps every rate falls, exponentially, to `cooldown_to` of itself; 0 for none."""
     cooldown_to: float = 0.1
@@ -114,7 +118,7 @@ class OptimiserConfig:
         rates = tuple(each.name for each in fields(self) if each.name.endswith(("_rate", "_rate_end")))
         rules: tuple[_Rule, ...] = (
             (rates, lambda value: 0 <= value < inf, "a finite number, at least 0"),
-            (("means_rate_steps",), lambda value: value >= 1, "at least 1"),
+            (("means_rate_steps", "sh_rest_every"), lambda value: value >= 1, "at least 1"),
             (("cooldown",), lambda value: value >= 0, "at least 0"),
             (("cooldown_to",), lambda value: 0 < value <= 1, "more than 0, at most 1"),
             (("beta1", "beta2"), lambda value: 0 <= value < 1, "at least 0, less than 1"),
@@ -192,6 +196,9 @@ class TrainConfig:
     """Behind the Gaussians, and behind images with alpha; random is a new colour each step, evaluated on black."""
     warmup: tuple[int, ...] = (250, 500)
     """Steps after which the training resolution doubles; two of them start at a quarter, '' at the full size."""
+    frequency_steps: int = 0
+    """Steps within which the training resolution rises from an eighth of the size as the photographs' spectra ask, in
+    place of --warmup; 0 goes by --warmup."""
     resolution: int = 0
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
     test_every: int = 8
@@ -212,7 +219,11 @@ class TrainConfig:
             (("sh_degree",), lambda value: 0 <= value <= 3, "0 to 3"),
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
             (("iterations", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
-            (("seed", "resolution", "test_every", "checkpoint_every"), lambda value: value >= 0, "at least 0"),
+            (
+                ("seed", "frequency_steps", "resolution", "test_every", "checkpoint_every"),
+                lambda value: value >= 0,
+                "at least 0",
+            ),
         )
         _check(self, "--", rules)
         for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):

@@ -151,10 +151,13 @@ class Rasterizer:
         gradients: DeviceGaussians,
         *,
         absolute: bool = False,
+        sh_rest: bool = True,
     ) -> DeviceArray:
-        """The gradient of projection, for some rows or all: as `backward`, from what blending's gradient is."""
-        screen = self.work.array("screen", (gaussians.count, 2))
-        project_grad(self.device, gaussians, frame.camera_array, projected, slots, gradients, screen, absolute=absolute)
+        """The gradient of projection, for some rows or all: as `backward`, from what blending's gradient is; that of
+        the higher SH bands if asked for."""
+        device, screen = self.device, self.work.array("screen", (gaussians.count, 2))
+        of = (gaussians, frame.camera_array, projected, slots, gradients, screen)
+        project_grad(device, *of, absolute=absolute, sh_rest=sh_rest)
         return screen
 
     def pair_gradients(self, frame: Frame, image_gradient: DeviceArray, *, absolute: bool = False) -> Slots:

@@ -20,8 +20,9 @@ from clsplat.gaussians import Gaussians
 from clsplat.initialise import from_points, random_points
 from clsplat.needs import plan_step
 from clsplat.rendering import Rasterizer
+from clsplat.resolution import sizes_of
 from clsplat.runs import Checkpoint
-from clsplat.stages.adam import adam
+from clsplat.stages.adam import adam, updates_sh_rest
 from clsplat.stages.density import NO_ROW, DensityStatistics, add_statistics, gather, new_statistics, widen
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.project import (
@@ -51,10 +52,10 @@ class Photographs:
 
     def __init__(self, views: list[View]) -> None:
         self._views = views
-        self._factor = 0
+        self._factor = 0.0
         self._held: dict[int, NDArray[Any]] = {}
 
-    def load(self, index: int, factor: int) -> NDArray[Any]:
+    def load(self, index: int, factor: float) -> NDArray[Any]:
         """View `index` at 1/factor of its size, (H, W, 3 or 4), straight alpha."""
         if factor != self._factor:
             self._factor = factor
@@ -62,7 +63,7 @@ class Photographs:
         if index not in self._held:
             camera = self._views[index].camera
             image: NDArray[np.float32] = self._views[index].load(
-                max(camera.width // factor, 1), max(camera.height // factor, 1)
+                max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
             )
             levels = np.rint(image * 255)
             exact = (
@@ -81,6 +82,9 @@ class Trainer:
         self.views = scene.require_training_views()
         self.rasterizer = Rasterizer(device, config.rasterizer)
         self.photographs = Photographs(self.views)
+        self.sizes = sizes_of(
+            config.warmup, config.frequency_steps, len(self.views), lambda index: self.views[index].load()
+        )
         self.rng = np.random.default_rng(config.seed)
         self.step = 0
         self.queue: list[int] = []
@@ -150,7 +154,7 @@ class Trainer:
         self._control_density()
         self.step += 1
         self._raise_sh_degree()
-        view, factor = self._next_view(), self._factor()
+        view, factor = self._next_view(), self.sizes.factor(self.step)
         image = self.photographs.load(view, factor)
         camera = self.views[view].camera.resized(image.shape[1], image.shape[0])
         self.background.set(self._background_colour())
@@ -166,11 +170,18 @@ class Trainer:
         for start, stop, (parameters, first, second) in parts(work, *model, keep=True):  # one, if the model fits
             projected = frame.projected.rows(start, stop)
             screen = self.rasterizer.row_gradients(
-                parameters, frame, projected, slots.rows(start, stop), self.gradients, absolute=absolute
+                parameters,
+                frame,
+                projected,
+                slots.rows(start, stop),
+                self.gradients,
+                absolute=absolute,
+                sh_rest=updates_sh_rest(config.optimiser, self.step),
             )
             if self.step < config.density.stop:
                 add_statistics(device, self.statistics.rows(start, stop), camera, projected, screen)
-            adam(device, self.step, self.rates(), config.optimiser, parameters, self.gradients, first, second)
+            moved = (parameters, self.gradients, first, second)
+            adam(device, self.step, self.rates(), config.optimiser, *moved, projected.tile_counts)
         return result
 
     def rates(self) -> dict[str, float]:
@@ -189,9 +200,6 @@ class Trainer:
             "sh_rest": optimiser.sh_rest_rate,
         }
         return {group: rate * cooled for group, rate in rates.items()}
-
-    def _factor(self) -> int:
-        return 1 << sum(self.step <= end for end in self.config.warmup)
 
     def _next_view(self) -> int:
         if not self.queue:

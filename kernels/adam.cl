@@ -1,31 +1,80 @@
-// Adam (Kingma and Ba 2015, algorithm 1; docs/gradients.md, equation 42) on one parameter group as a flat array, LANES
-// elements a work-item. It leaves the gradient zero, so that the next step need only write the rows of visible
-// Gaussians.
+// Adam (Kingma and Ba 2015, algorithm 1; docs/gradients.md, equation 42) on one parameter group. It leaves the gradient
+// zero, so that the next step need only write the rows of visible Gaussians.
+// rate: learning rate / (1 - beta1^t); root: 1 / sqrt(1 - beta2^t).
 #include "shared/math.h"
 #include "shared/lanes.h"
 
-// parameters, gradients, first, second (n). rate: learning rate / (1 - beta1^t); root: 1 / sqrt(1 - beta2^t).
+// What to subtract from a vector of parameters; *m and *v become the new moments.
+static inline floatL change(floatL g, float rate, float root, float beta1, float beta2, float epsilon, floatL *m,
+                            floatL *v) {
+  *m = fmaL((floatL)(beta1), *m, (1.0f - beta1) * g);
+  *v = fmaL((floatL)(beta2), *v, (1.0f - beta2) * (g * g));
+  return rate * *m / fmaL(sqrt(*v), (floatL)(root), (floatL)(epsilon));
+}
+
+// One element, as `change` has it.
+static inline void step_element(size_t i, float rate, float root, float beta1, float beta2, float epsilon,
+                                __global float *parameters, __global float *gradients, __global float *first,
+                                __global float *second) {
+  const float g = gradients[i];
+  const float m = fma1(beta1, first[i], (1.0f - beta1) * g);
+  const float v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));
+  first[i] = m;
+  second[i] = v;
+  parameters[i] -= rate * m / fma1(sqrt(v), root, epsilon);
+  gradients[i] = 0.0f;
+}
+
+// The group as a flat array, LANES elements a work-item. parameters, gradients, first, second (n).
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
                    const float epsilon, __global float *parameters, __global float *gradients,
                    __global float *first, __global float *second) {
   const ulong i = get_global_id(0) * (ulong)LANES;
   if (i + LANES <= n) {
-    const floatL g = LOADL(gradients + i);
-    const floatL m = fmaL((floatL)(beta1), LOADL(first + i), (1.0f - beta1) * g);
-    const floatL v = fmaL((floatL)(beta2), LOADL(second + i), (1.0f - beta2) * (g * g));
+    floatL m = LOADL(first + i), v = LOADL(second + i);
+    const floatL by = change(LOADL(gradients + i), rate, root, beta1, beta2, epsilon, &m, &v);
     STOREL(m, first + i);
     STOREL(v, second + i);
-    STOREL(LOADL(parameters + i) - rate * m / fmaL(sqrt(v), (floatL)(root), (floatL)(epsilon)), parameters + i);
+    STOREL(LOADL(parameters + i) - by, parameters + i);
     STOREL((floatL)(0.0f), gradients + i);
     return;
   }
-  for (ulong k = i; k < n; ++k) {
-    const float g = gradients[k];
-    const float m = fma1(beta1, first[k], (1.0f - beta1) * g);
-    const float v = fma1(beta2, second[k], (1.0f - beta2) * (g * g));
-    first[k] = m;
-    second[k] = v;
-    parameters[k] -= rate * m / fma1(sqrt(v), root, epsilon);
-    gradients[k] = 0.0f;
+  for (ulong k = i; k < n; ++k)
+    step_element(k, rate, root, beta1, beta2, epsilon, parameters, gradients, first, second);
+}
+
+#ifdef WIDTH
+// Only the rows of visible Gaussians, LANES rows a work-item (OptimiserConfig.sparse); gradients of the others are zero
+// already. tile_counts (n): 0 where hidden; parameters, gradients, first, second (n, WIDTH).
+__kernel void adam_visible(const uint n, const float rate, const float root, const float beta1, const float beta2,
+                           const float epsilon, __global const uint *tile_counts, __global float *parameters,
+                           __global float *gradients, __global float *first, __global float *second) {
+  const uint row = get_global_id(0) * LANES;
+  if (row >= n) return;
+  int visible[LANES], some = 0;
+  for (uint lane = 0; lane < LANES; ++lane) {
+    visible[lane] = row + lane < n && tile_counts[row + lane] > 0 ? -1 : 0;
+    some |= visible[lane];
+  }
+  if (!some) return;
+  const size_t begin = (size_t)row * WIDTH, end = (size_t)n * WIDTH;
+  if (n - row < LANES) {
+    for (size_t i = begin; i < end; ++i)
+      if (visible[(i - begin) / WIDTH])
+        step_element(i, rate, root, beta1, beta2, epsilon, parameters, gradients, first, second);
+    return;
+  }
+  for (uint k = 0; k < WIDTH; ++k) {
+    const size_t i = begin + k * LANES;
+    IntLanes taken;
+    for (uint lane = 0; lane < LANES; ++lane) taken.lane[lane] = visible[(k * LANES + lane) / WIDTH];
+    const floatL m_before = LOADL(first + i), v_before = LOADL(second + i);
+    floatL m = m_before, v = v_before;
+    const floatL by = change(LOADL(gradients + i), rate, root, beta1, beta2, epsilon, &m, &v);
+    STOREL(taken.all ? m : m_before, first + i);
+    STOREL(taken.all ? v : v_before, second + i);
+    STOREL(LOADL(parameters + i) - (taken.all ? by : (floatL)(0.0f)), parameters + i);
+    STOREL((floatL)(0.0f), gradients + i);
   }
 }
+#endif

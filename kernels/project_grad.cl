@@ -154,9 +154,11 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
     __global float *d_f = d_sh_rest + (size_t)3 * (coefficients - 1) * i;
     for (int k = 1; k < SH_USED(coefficients); ++k, f += 3, d_f += 3) {
       const float along = basis[k].lane[lane];
+#ifndef NO_SH_REST // OptimiserConfig.sh_rest_every
       d_f[0] = along * d_colour.x;
       d_f[1] = along * d_colour.y;
       d_f[2] = along * d_colour.z;
+#endif
       weight[k].lane[lane] = fma1(d_colour.x, f[0], fma1(d_colour.y, f[1], d_colour.z * f[2]));
     }
   }

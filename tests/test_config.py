@@ -24,6 +24,7 @@ OUT_OF_RANGE = {
     "--optimiser.opacities-rate": ("-1", "nan", "inf"),
     "--optimiser.scales-rate": ("-1", "nan", "inf"),
     "--optimiser.quaternions-rate": ("-1", "nan", "-inf"),
+    "--optimiser.sh-rest-every": ("0", "-3"),
     "--optimiser.cooldown": ("-1",),
     "--optimiser.cooldown-to": ("0", "1.1", "nan"),
     "--optimiser.beta1": ("-0.1", "1", "nan"),

@@ -8,10 +8,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from clsplat.config import OptimiserConfig
+from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
 from clsplat.stages.project import GROUPS, DeviceGaussians
+
+
+def updates_sh_rest(config: OptimiserConfig, step: int) -> bool:
+    """Whether step number `step` (from 1) updates the higher SH bands."""
+    return step % config.sh_rest_every == 0
 
 
 @stage("adam")
@@ -24,25 +30,29 @@ def adam(
     gradients: DeviceGaussians,
     first: DeviceGaussians,
     second: DeviceGaussians,
+    tile_counts: DeviceArray,
 ) -> None:
-    """Step number `step` (from 1) with the constants of `config` and a rate per group; leaves the gradients zero."""
-    kernel, lanes = device.kernels("adam").adam, device.shape.lanes
+    """Step number `step` (from 1) with the constants of `config` and a rate per group; leaves the gradients zero.
+
+    tile_counts (n,) uint32: 0 where the view does not show a Gaussian, for `config.sparse`.
+    """
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
-    root = (1.0 - beta2**step) ** -0.5
+    lanes = device.shape.lanes
     for group in GROUPS:
-        n = parameters[group].size
-        launch_items(
-            device,
-            kernel,
-            -(-n // lanes),
-            np.uint64(n),  # of SH more than 32 bits count, from 95 million Gaussians on
-            rates[group] / (1.0 - beta1**step),
-            root,
-            beta1,
-            beta2,
-            epsilon,
-            parameters[group],
-            gradients[group],
-            first[group],
-            second[group],
-        )
+        updates = step
+        if group == "sh_rest":
+            if not updates_sh_rest(config, step):
+                continue
+            updates = step // config.sh_rest_every
+        constants = (rates[group] / (1.0 - beta1**updates), (1.0 - beta2**updates) ** -0.5, beta1, beta2, epsilon)
+        arrays = (parameters[group], gradients[group], first[group], second[group])
+        size, rows = parameters[group].size, parameters.count
+        if size == 0:
+            continue
+        if config.sparse:
+            kernel = device.kernels("adam", WIDTH=size // rows).adam_visible
+            launch_items(device, kernel, -(-rows // lanes), rows, *constants, tile_counts, *arrays)
+        else:
+            kernel = device.kernels("adam").adam
+            # Of SH more than 32 bits count, from 95 million Gaussians on.
+            launch_items(device, kernel, -(-size // lanes), np.uint64(size), *constants, *arrays)

@@ -303,9 +303,15 @@ def project_grad(
     screen: DeviceArray,
     *,
     absolute: bool = False,
+    sh_rest: bool = True,
 ) -> None:
-    """Fill the visible Gaussians' rows of `gradients` and `screen` (n, 2) from the pairs' slots."""
-    defines = {"ABSOLUTE_GRADIENTS": absolute, "ADDED_UP": slots.first_slots is None}
+    """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` (n, 2) from the pairs'
+    slots."""
+    defines = {
+        "ABSOLUTE_GRADIENTS": absolute,
+        "ADDED_UP": slots.first_slots is None,
+        "NO_SH_REST": not sh_rest and gaussians.coefficients > 1,
+    }
     defines = {name: True for name, wanted in defines.items() if wanted}
     n = gaussians.count
     launch_items(

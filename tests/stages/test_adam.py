@@ -8,6 +8,7 @@ import pytest
 from compare import assert_close
 
 from clsplat.config import OptimiserConfig
+from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.reference.adam import adam as reference
 from clsplat.stages.adam import adam
@@ -19,6 +20,7 @@ def test_steps(shaped_device: Device, count: int) -> None:
     rng = np.random.default_rng(count)
     rates = {group: 10.0**-index for index, group in enumerate(GROUPS)}
     shapes = group_shapes(count, 4)
+    counts = upload(shaped_device, np.ones(count, np.uint32))
     p, g, m, v = (allocate_gaussians(shaped_device, count, 4, zero=True) for _ in range(4))
     wanted = {}
     for group in GROUPS:
@@ -32,7 +34,7 @@ def test_steps(shaped_device: Device, count: int) -> None:
             wanted[group] = reference(
                 wanted[group][0], gradient.astype(np.float64), *wanted[group][1:], step, rates[group], 0.9, 0.999, 1e-15
             )
-        adam(shaped_device, step, rates, OptimiserConfig(), p, g, m, v)
+        adam(shaped_device, step, rates, OptimiserConfig(), p, g, m, v, counts)
     for group in GROUPS:
         # beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3: 1e-5 of a step, of which there were four.
         assert_close(p[group].get(), wanted[group][0], relative=1e-6, absolute=1e-4 * rates[group])
@@ -42,5 +44,49 @@ def test_steps(shaped_device: Device, count: int) -> None:
 def test_no_gradient_no_step(device: Device) -> None:
     p, g, m, v = (allocate_gaussians(device, 20, 1, zero=True) for _ in range(4))
     p["means"].fill(0.5)
-    adam(device, 1, dict.fromkeys(GROUPS, 0.1), OptimiserConfig(), p, g, m, v)
+    adam(device, 1, dict.fromkeys(GROUPS, 0.1), OptimiserConfig(), p, g, m, v, upload(device, np.ones(20, np.uint32)))
     assert np.all(p["means"].get() == 0.5)
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 100])
+def test_sparse_steps_are_those_of_the_visible(shaped_device: Device, count: int) -> None:
+    """Rows that the view shows get the bits of the dense step, the others keep all of theirs."""
+    rng = np.random.default_rng(count)
+    visible = rng.random(count) < 0.4
+    visible[: count // 3] = False  # whole vectors of hidden ones, and of visible ones
+    visible[2 * count // 3 :] = True
+    counts = upload(shaped_device, visible.astype(np.uint32) * 3)
+    dense, sparse = ([allocate_gaussians(shaped_device, count, 16, zero=True) for _ in range(4)] for _ in range(2))
+    before = {}
+    for group, shape in group_shapes(count, 16).items():
+        for index in range(4):
+            values = rng.random(shape).astype(np.float32)
+            if index == 1:
+                values[~visible] = 0.0
+            before[group, index] = values
+            dense[index][group].set(values)
+            sparse[index][group].set(values)
+    rates = dict.fromkeys(GROUPS, 0.1)
+    adam(shaped_device, 3, rates, OptimiserConfig(), *dense, counts)
+    adam(shaped_device, 3, rates, OptimiserConfig(sparse=True), *sparse, counts)
+    for (group, index), values in before.items():
+        got = sparse[index][group].get()
+        np.testing.assert_array_equal(got[visible], dense[index][group].get()[visible], err_msg=group)
+        np.testing.assert_array_equal(got[~visible], values[~visible], err_msg=group)
+
+
+def test_sh_rest_waits_for_its_step(device: Device) -> None:
+    """Its second update, at step 6 of every third, is Adam's second step."""
+    config = OptimiserConfig(sh_rest_every=3)
+    p, g, m, v = (allocate_gaussians(device, 5, 4, zero=True) for _ in range(4))
+    counts = upload(device, np.ones(5, np.uint32))
+    wanted = (np.zeros((5, 3, 3)), np.zeros((5, 3, 3)), np.zeros((5, 3, 3)))
+    for step in range(1, 8):
+        g["sh_rest"].fill(0.5 * step if step % 3 == 0 else 0.0)
+        before = p["sh_rest"].get()
+        adam(device, step, dict.fromkeys(GROUPS, 0.1), config, p, g, m, v, counts)
+        if step % 3:
+            np.testing.assert_array_equal(p["sh_rest"].get(), before)
+        else:
+            wanted = reference(wanted[0], np.full((5, 3, 3), 0.5 * step), *wanted[1:], step // 3, 0.1)
+    assert_close(p["sh_rest"].get(), wanted[0], relative=1e-6, absolute=1e-5)  # as in test_steps

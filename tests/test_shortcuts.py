@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What training may leave out: hidden Gaussians' steps, steps of the higher SH bands, pixels while little is learnt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny import CONFIG, HEIGHT, WIDTH, short, write_scene
+
+from clsplat.config import OptimiserConfig
+from clsplat.device.context import Device
+from clsplat.gaussians import Gaussians
+from clsplat.initialise import from_points
+from clsplat.runs import Run
+from clsplat.scene import Scene, load_scene
+from clsplat.stages.project import download_gaussians
+from clsplat.trainer import Trainer
+from clsplat.training import train
+
+ALL = replace(short(frequency_steps=20), optimiser=replace(CONFIG.optimiser, sparse=True, sh_rest_every=3))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("scene")))
+
+
+def with_one_behind(scene: Scene) -> Gaussians:
+    """Its last Gaussian lies far behind each camera."""
+    points = np.concatenate([scene.points, [[0.0, 0.0, -500.0]]]).astype(np.float32)
+    colors = np.concatenate([scene.point_colors, scene.point_colors[:1]])
+    model = from_points(points, colors, sh_degree=1)
+    model.log_scales[-1] = model.log_scales[0]
+    return model
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_sparse_steps_leave_the_hidden(scene: Scene, default_device: Device, sparse: bool) -> None:
+    """Dense Adam goes on moving a hidden Gaussian by what its first moment remembers."""
+    config = replace(short(warmup=(), density={"every": 0}), optimiser=OptimiserConfig(sparse=sparse))
+    model = with_one_behind(scene)
+    trainer = Trainer(scene, config, default_device, model)
+    moment = trainer.first["means"].get()
+    moment[-1] = 0.5
+    trainer.first["means"].set(moment)
+    for _ in range(3):
+        trainer.train_step()
+    after = download_gaussians(trainer.parameters)
+    assert np.all(np.any(after.means[:-1] != model.means[:-1], axis=1)), "those in view move"
+    assert np.array_equal(after.means[-1], model.means[-1]) == sparse
+    assert np.array_equal(trainer.first["means"].get()[-1], moment[-1]) == sparse
+
+
+def test_sh_rest_moves_in_its_steps_alone(scene: Scene, default_device: Device) -> None:
+    config = replace(short(warmup=(), density={"every": 0}), optimiser=OptimiserConfig(sh_rest_every=3))
+    model = with_one_behind(scene)
+    trainer = Trainer(scene, replace(config, sh_degree_every=1), default_device, model)
+    for step in range(1, 8):
+        before = trainer.parameters["sh_rest"].get(), trainer.parameters["sh_dc"].get()
+        trainer.train_step()
+        after = trainer.parameters["sh_rest"].get(), trainer.parameters["sh_dc"].get()
+        kept = np.zeros_like(after[0])
+        kept[:, : before[0].shape[1]] = before[0]
+        assert np.array_equal(after[0], kept) == (step % 3 != 0)
+        assert not np.array_equal(after[1], before[1]), "the constant moves in every step"
+
+
+def test_sizes_rise_with_the_frequencies(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(scene, short(frequency_steps=30, density={"every": 0}), default_device)
+    sizes, real = [], trainer.rasterizer.forward
+
+    def forward(gaussians: Any, camera: Any, background: Any) -> Any:
+        assert camera.fx / camera.width == pytest.approx(50 / WIDTH)
+        sizes.append((camera.width, camera.height))
+        return real(gaussians, camera, background)
+
+    monkeypatch.setattr(trainer.rasterizer, "forward", forward)
+    for _ in range(31):
+        trainer.train_step()
+    widths = [width for width, _ in sizes]
+    assert widths == sorted(widths)
+    assert widths[0] < WIDTH / 2
+    assert len(set(widths)) > 3
+    assert sizes[-1] == (WIDTH, HEIGHT)
+    assert all(abs(height - width * HEIGHT / WIDTH) < 1.5 for width, height in sizes)
+
+
+@pytest.mark.parametrize("step", [1, 4, 15, 20, 33])
+def test_stopping_and_going_on_gives_the_same_bytes(
+    scene: Scene, default_device: Device, tmp_path: Path, step: int
+) -> None:
+    straight = Run.create(tmp_path / "straight", ALL)
+    train(scene, ALL, device=default_device, run=straight)
+    part = replace(ALL, iterations=step)
+    train(scene, part, device=default_device, run=Run.create(tmp_path / "run", part))
+    run = Run.create(tmp_path / "run", ALL, resume=True)
+    train(scene, ALL, device=default_device, run=run, resume=True)
+    assert run.model_path.read_bytes() == straight.model_path.read_bytes()
