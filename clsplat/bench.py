@@ -140,7 +140,7 @@ def bench(
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
 
     def draw() -> Frame:
-        return rasterizer.forward(gaussians, subject.camera, trainer.background)
+        return rasterizer.forward(gaussians, subject.camera, trainer.background, backward=False)
 
     frame = draw()
     visible = int(np.count_nonzero(frame.projected.tile_counts.get()))
@@ -350,7 +350,7 @@ def compare(
         return Error.of(part, reference), Error.of(picture, exact)
 
     def draw(rasterizer: Rasterizer) -> Frame:
-        return rasterizer.forward(on_device, camera, background)
+        return rasterizer.forward(on_device, camera, background, backward=False)
 
     exact = _picture(draw(Rasterizer(device, PRESETS["exact"], work)))
     rasterizers = {name: Rasterizer(device, config, work) for name, config in candidates.items()}

@@ -62,8 +62,8 @@ class Need:
 
     @property
     def pair(self) -> int:
-        """Of each pair: keys, sort, lists; slot."""
-        return 36 + 4 * self.slot
+        """Of each pair: keys, sort, lists; slot and cells where there is a gradient."""
+        return 36 + (4 * self.slot + 4 if self.slot else 0)
 
     @property
     def pairs(self) -> int:

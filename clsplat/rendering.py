@@ -94,8 +94,13 @@ class Rasterizer:
             self.work.clear()
         self.capacity = plan.pairs
 
-    def forward(self, gaussians: AnyGaussians, camera: Camera, background: DeviceArray) -> Frame:
-        """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2)."""
+    def forward(
+        self, gaussians: AnyGaussians, camera: Camera, background: DeviceArray, *, backward: bool = True
+    ) -> Frame:
+        """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
+
+        backward: whether the gradient will be asked for; what only that needs is left out else.
+        """
         device, work = self.device, self.work
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
         camera_array.set(pack)
@@ -106,9 +111,9 @@ class Rasterizer:
         for band in bands:
             del part  # its arrays may have to make room for larger ones
             part = self._part(projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
-            blended = blend(
-                device, work, part.lists, projected.splats, background, camera.width, camera.height, part.band
-            )
+            size = (camera.width, camera.height)
+            record = backward and len(bands) == 1
+            blended = blend(device, work, part.lists, projected.splats, background, *size, band, record=record)
         assert part is not None, "an image has a tile"
         return Frame(camera, camera_array, background, projected, bands, part, blended)
 
@@ -217,7 +222,7 @@ class Renderer:
         """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object."""
         on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
         self._background.set(np.asarray(background, np.float32))
-        blended = self._rasterizer.forward(on_device, camera, self._background).blended
+        blended = self._rasterizer.forward(on_device, camera, self._background, backward=False).blended
         height, width = camera.height, camera.width
         planes = blended.image.get()[:, :height, :width]
         alpha: Float32 = np.float32(1) - blended.transmittance.get()[:height, :width]

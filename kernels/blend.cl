@@ -17,6 +17,11 @@
 #else
 #define GOES_ON(open) ((open) != 0)
 #endif
+#ifdef RECORD_CELLS
+#define RECORD(statements) statements
+#else
+#define RECORD(statements)
+#endif
 #ifdef COUNT_PAIRS // a build for `clsplat bench`
 #define COUNT(statements) statements
 #else
@@ -26,12 +31,16 @@
 // first_tile: the image's tile that is the first of the lists' (a band of tiles, or all), in row-major order.
 // ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), background (3) -> image (3, height, width),
 // transmittance (height, width): what is left at the end; stops (height, width): the sorted index from which on the
-// pixel takes no more, -1 in padding. Sizes are padded to whole tiles; padding is black.
+// pixel takes no more, -1 in padding. Sizes are padded to whole tiles; padding is black. cells_from_sorted (pairs): the
+// cells of the tile, as bits, in which the Gaussian contributes, for the gradient to go through.
 GROUP __kernel void blend(const int first_tile, const int tiles_x, const int width, const int height,
                           __global const uint *ranges, __global const uint *gaussian_from_sorted,
                           __global const float *splats,
                           __global const float *background, __global float *image, __global float *transmittance,
                           __global int *stops
+#ifdef RECORD_CELLS
+                          , __global uint *cells_from_sorted
+#endif
 #ifdef COUNT_PAIRS
                           , __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
 #endif
@@ -56,14 +65,22 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     if (ANYL(t[k] > 0.0f)) OPEN_CELL(open, cell);
   }
 
-  for (int i = begin; i < end && GOES_ON(open); ++i) {
+  int i = begin;
+  Reach reaches[BATCH]; // together, ahead of their use: else each waits for the end of the last one's cells
+  for (; i < end && GOES_ON(open); ++i) {
+    if ((i - begin) % BATCH == 0)
+      for (int j = 0; j < BATCH; ++j) {
+        const uint next = gaussian_from_sorted[min(i + j, end - 1)];
+        reaches[j] = reach_of(splats + (size_t)SPLAT_SIZE * next, tile_x, tile_y);
+      }
     PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i + AHEAD < end ? i + AHEAD : end - 1]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     const float log2o = splat[SPLAT_LOG2O];
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
     const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
-    const Reach reach = reach_of(splat, tile_x, tile_y);
+    const Reach reach = reaches[(i - begin) % BATCH];
+    RECORD(uint cells = 0;)
     FOR_CELLS(cell, IN_OPEN(reach, open)) {
       const int k = cell / ITEMS;
       const floatL dy = my - AT_Y(cell);
@@ -72,6 +89,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
       COUNT(evaluated += LANES;)
       const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
       if (REACHES(reached)) {
+        RECORD(cells |= 1u << cell;)
         const floatL before = t[k];
         floatL alpha = exp2L(power);
         alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
@@ -92,7 +110,9 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
         }
       }
     }
+    RECORD(cells_from_sorted[i] = cells;)
   }
+  RECORD(for (; i < end; ++i) cells_from_sorted[i] = 0;)
 
 #ifdef COUNT_PAIRS
 #if LANES == 1

@@ -13,6 +13,12 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
+#ifdef RECORD_CELLS // by blend: each cell that is visited has a pixel that takes the Gaussian
+#define CONTRIBUTES(mask) 1
+#else
+#define CONTRIBUTES(mask) REACHES(mask)
+#endif
+
 #if ITEMS > 1
 // slot[field] = the sum of value over the group, in a fixed tree.
 static inline void group_sums(float *values, __local float *scratch, __global float *slot) {
@@ -37,7 +43,11 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
                                __global const uint *gaussian_from_sorted, __global const uint *slot_from_sorted,
                                __global const float *splats, __global const float *background,
                                __global const float *image_gradient, __global const float *transmittance,
-                               __global const int *stops, __global float *slots) {
+                               __global const int *stops, __global float *slots
+#ifdef RECORD_CELLS
+                               , __global const uint *cells_from_sorted
+#endif
+) {
 #if ITEMS > 1
   __local float scratch[SLOT_STRIDE * ITEMS];
   __local int group_last;
@@ -88,7 +98,15 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     const float log2o = splat[SPLAT_LOG2O];
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
     const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
+#ifdef RECORD_CELLS
+    const uint reach = cells_from_sorted[i];
+    if (reach == 0) {
+      for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = 0.0f;
+      continue;
+    }
+#else
     const Reach reach = reach_of(splat, tile_x, tile_y);
+#endif
     const floatL zero = (floatL)(0.0f);
     floatL sum_g = zero, sum_gu = zero, sum_gv = zero, sum_guu = zero, sum_guv = zero, sum_gvv = zero;
     floatL d_red = zero, d_green = zero, d_blue = zero;
@@ -101,7 +119,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
       const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;
       const floatL power = log2_alpha(u, v, log2o);
       const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
-      if (REACHES(taken)) {
+      if (CONTRIBUTES(taken)) {
         const floatL uncapped = AS_FLOATL(AS_INTL(exp2L(power)) & taken);
         const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
         const floatL inverse = 1.0f / (1.0f - alpha);

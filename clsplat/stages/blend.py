@@ -19,11 +19,15 @@ from clsplat.stages.ranges import TileLists
 
 @dataclass(frozen=True, eq=False)
 class Blended:
-    """Planes padded to whole tiles: image (3, rows, stride), transmittance (rows, stride), stops (rows, stride)."""
+    """Planes padded to whole tiles: image (3, rows, stride), transmittance (rows, stride), stops (rows, stride).
+
+    cells_from_sorted (pairs) uint32: the cells in which each pair's Gaussian contributes, as bits; or None.
+    """
 
     image: DeviceArray
     transmittance: DeviceArray
     stops: DeviceArray
+    cells_from_sorted: DeviceArray | None
 
 
 def tile_items(device: Device) -> int:
@@ -41,18 +45,27 @@ def blend(
     width: int,
     height: int,
     band: Band | None = None,
+    *,
+    record: bool = True,
 ) -> Blended:
     """Blend the Gaussians of each of the band's tiles, all tiles if none is given, front to back over the background
-    (3,). Pixels of other tiles are left as they are."""
+    (3,). Pixels of other tiles are left as they are.
+
+    record: keep the cells that the gradient has to go through, where the kernels' shape has them.
+    """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     rows, stride = tiles_y * TILE, tiles_x * TILE
     image = work.array("image", (3, rows, stride))
     transmittance = work.array("transmittance", (rows, stride))
     stops = work.array("stops", (rows, stride), np.int32)
     items = tile_items(device)
+    cells = None
+    if record and items == 1 and device.shape.lanes >= 8:
+        cells = work.array("cells_from_sorted", lists.gaussian_from_sorted.shape, np.uint32)
+    defines = {"RECORD_CELLS": True} if cells else {}
     launch_groups(
         device,
-        device.kernels("blend", ITEMS=items).blend,
+        device.kernels("blend", ITEMS=items, **defines).blend,
         band.tiles if band else tiles_x * tiles_y,
         items,
         band.first if band else 0,
@@ -66,8 +79,9 @@ def blend(
         image,
         transmittance,
         stops,
+        *([cells] if cells else []),
     )
-    return Blended(image, transmittance, stops)
+    return Blended(image, transmittance, stops, cells)
 
 
 def count_pairs(
@@ -131,7 +145,9 @@ def blend_grad(
     pairs = lists.gaussian_from_sorted.shape[0]
     slots = work.array("slots", (pairs, SLOT_ABSOLUTE if absolute else SLOT_PLAIN))
     items = tile_items(device)
-    defines = {"ABSOLUTE_GRADIENTS": True} if absolute else {}
+    cells = blended.cells_from_sorted
+    wanted = {"ABSOLUTE_GRADIENTS": absolute, "RECORD_CELLS": cells is not None}
+    defines = {name: True for name, needed in wanted.items() if needed}
     launch_groups(
         device,
         device.kernels("blend_grad", ITEMS=items, **defines).blend_grad,
@@ -149,5 +165,6 @@ def blend_grad(
         blended.transmittance,
         blended.stops,
         slots,
+        *([cells] if cells else []),
     )
     return slots

@@ -11,8 +11,12 @@ import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
 from pipeline import BACKGROUND, Pipeline, shaped
 
+from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.reference import render as reference
+from clsplat.rendering import Rasterizer
+from clsplat.stages.blend import blend_grad
+from clsplat.stages.project import upload_gaussians
 
 SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
 
@@ -117,3 +121,32 @@ def test_stacked_opaque_gaussians(shaped_device: Device) -> None:
     wanted = reference.forward(*scene, BACKGROUND).blended.image
     assert_close_images(Pipeline.run(shaped_device, scene).image, wanted, 2e-5, flips=1e-3)
     assert np.abs(wanted - wanted[0, 0]).max() > 0.1, "the Gaussians are to be seen"
+
+
+@pytest.mark.parametrize("name", scenes.SHAPE_MATTERS)
+@pytest.mark.parametrize("lanes", [8, 16])
+def test_recorded_cells_are_those_that_contribute(device: Device, name: str, lanes: int) -> None:
+    """The gradient has the same bits as without the record, and a pair without cells has none."""
+    run = Pipeline.run(shaped(device, lanes, 1), scenes.NAMED[name]())
+    frame, rasterizer = run.frame, run.rasterizer
+    blended = frame.blended
+    assert blended.cells_from_sorted is not None
+    values = np.random.default_rng(0).standard_normal(blended.image.shape).astype(np.float32)
+    gradient = upload(rasterizer.device, values)
+    of = (rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background)
+    recorded = blend_grad(*of, blended, gradient).get()
+    assert_same_bits(recorded, blend_grad(*of, replace(blended, cells_from_sorted=None), gradient).get())
+    empty = blended.cells_from_sorted.get() == 0
+    assert not recorded[frame.lists.slot_from_sorted.get()[empty]].any()
+    assert recorded.any()
+
+
+def test_without_a_gradient_nothing_is_recorded(default_device: Device) -> None:
+    gaussians, camera = scenes.NAMED["overlap"]()
+    rasterizer = Rasterizer(default_device)
+    background = upload(default_device, np.array(BACKGROUND, np.float32))
+    on_device = upload_gaussians(default_device, gaussians)
+    frame = rasterizer.forward(on_device, camera, background, backward=False)
+    without = frame.blended.image.get()
+    assert frame.blended.cells_from_sorted is None
+    assert_same_bits(without, rasterizer.forward(on_device, camera, background).blended.image.get())
