@@ -165,10 +165,10 @@ def bench(
     stages = {name: record for name, record in in_frame.stages.items() if name in FORWARD}
     stages.update({name: record for name, record in in_step.stages.items() if name not in stages})
     table = {name: _row(record, limits) for name, record in stages.items()}
-    for name in ("blend", "blend_grad"):
+    for name, limit in (("blend", limits.pairs_per_second), ("blend_grad", limits.gradient_pairs_per_second)):
         if name in table and table[name]["ms"] > 0:
             rate = 1e3 * contributing / table[name]["ms"]
-            table[name].update(pairs_per_second=rate, share_of_arithmetic=rate / limits.pairs_per_second)
+            table[name].update(pairs_per_second=rate, share_of_arithmetic=rate / limit)
     return {
         "device": device.name,
         "driver": device.driver,
@@ -420,14 +420,17 @@ def table(result: dict[str, Any]) -> str:
     """What `bench` measured, for people."""
     stages, limit, pairs = result["stages"], result["limit"], result["pairs"]
     driver, size = result["driver"].split("  ")[0], f"{result['width']}x{result['height']}"
-    arithmetic, copying = limit["pairs_per_second"] * 1e-9, limit["copy_bytes_per_second"] * 1e-9
+    arithmetic, gradient, copying = (
+        limit[name] * 1e-9 for name in ("pairs_per_second", "gradient_pairs_per_second", "copy_bytes_per_second")
+    )
     seen = f"{result['gaussians']:,} Gaussians, SH degree {result['sh_degree']}, {result['visible']:,} visible"
+    most = f"{arithmetic:.2f} Gpairs/s of blending arithmetic, {gradient:.2f} of its gradient's"
     of_pixels = f"{pairs['contributing']:,} that contribute, {pairs['evaluated']:,} evaluated"
     lines = [
         f"{result['device']}, {driver}, {limit['lanes']} lanes x {limit['items']} items",
         f"{result['source']}: {seen}, at {size}",
         f"pairs: {pairs['listed']:,} of tiles; of pixels {of_pixels}",
-        f"limits: {arithmetic:.2f} Gpairs/s of blending arithmetic, {copying:.1f} GB/s of copying",
+        f"limits: {most}, {copying:.1f} GB/s of copying",
         "",
     ]
     header = ("stage", "ms", "wall ms", "launches", "MB", "GB/s", "of copy", "Gpairs/s", "of arithmetic")

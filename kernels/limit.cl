@@ -37,6 +37,47 @@ GROUP __kernel void limit_blend(const int rounds, __global const float *splats, 
   sums[get_global_id(0)] = sum;
 }
 
+// As limit_blend, the arithmetic of blending's gradient: alpha once more, transmittance by division, nine sums.
+GROUP __kernel void limit_blend_grad(const int rounds, __global const float *splats, __global float *sums) {
+  float sum = 0.0f;
+  for (int k = 0; k < OWNED; ++k) {
+    const floatL x = PIXELS_X(k), y = PIXELS_Y(k), zero = (floatL)(0.0f);
+    const floatL g_red = 0.1f * x, g_green = 0.1f * y, g_blue = (floatL)(0.5f);
+    floatL t = (floatL)(1e-4f), behind = zero, sum_g = zero, sum_gu = zero, sum_gv = zero, sum_guu = zero;
+    floatL sum_guv = zero, sum_gvv = zero, d_red = zero, d_green = zero, d_blue = zero;
+    for (int i = 0; i < rounds; ++i) {
+      __global const float *splat = splats + SPLAT_SIZE * (i % LIMIT_SPLATS);
+      const floatL dy = splat[SPLAT_PIXEL_Y] - y;
+      const floatL u = whitened_u(splat[SPLAT_L11], splat[SPLAT_L12], splat[SPLAT_PIXEL_X] - x, dy);
+      const floatL v = splat[SPLAT_L22] * dy;
+      const floatL power = log2_alpha(u, v, splat[SPLAT_LOG2O]);
+      const floatL uncapped = power >= LOG2_ALPHA_MIN ? exp2L(power) : zero;
+      const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
+      const floatL inverse = 1.0f / (1.0f - alpha);
+      const floatL before = t * inverse;
+      const floatL shade = fmaL(g_red, (floatL)(splat[SPLAT_RED]),
+                                fmaL(g_green, (floatL)(splat[SPLAT_GREEN]), g_blue * splat[SPLAT_BLUE]));
+      const floatL weight = alpha * before;
+      const floatL d_alpha = fmaL(before, shade, -(behind * inverse));
+      const floatL g = uncapped < ALPHA_MAX ? alpha * d_alpha : zero;
+      behind = fmaL(weight, shade, behind);
+      t = before < 1.0f ? before : (floatL)(1e-4f);
+      d_red = fmaL(weight, g_red, d_red);
+      d_green = fmaL(weight, g_green, d_green);
+      d_blue = fmaL(weight, g_blue, d_blue);
+      const floatL gu = g * u, gv = g * v;
+      sum_g += g;
+      sum_gu += gu;
+      sum_gv += gv;
+      sum_guu = fmaL(gu, u, sum_guu);
+      sum_guv = fmaL(gu, v, sum_guv);
+      sum_gvv = fmaL(gv, v, sum_gvv);
+    }
+    sum += sumL(sum_g + sum_gu + sum_gv + sum_guu + sum_guv + sum_gvv + d_red + d_green + d_blue + t);
+  }
+  sums[get_global_id(0)] = sum;
+}
+
 // from (n) -> to (n): LANES elements a work-item.
 __kernel void limit_copy(const uint n, __global const float *from, __global float *to) {
   const uint i = get_global_id(0) * LANES;

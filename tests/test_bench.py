@@ -165,7 +165,7 @@ def test_switches_show_in_the_counts(default_device: Device) -> None:
 
 def test_limits_are_finite_in_every_shape(shaped_device: Device) -> None:
     limits = quick_limits(shaped_device)
-    for value in (limits.pairs_per_second, limits.copy_bytes_per_second):
+    for value in (limits.pairs_per_second, limits.gradient_pairs_per_second, limits.copy_bytes_per_second):
         assert np.isfinite(value)
         assert value > 0
     assert limits.lanes == shaped_device.shape.lanes
@@ -174,7 +174,7 @@ def test_limits_are_finite_in_every_shape(shaped_device: Device) -> None:
 @pytest.mark.parametrize("shape", [None, (1, 64)], ids=str)
 def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
     device = profiled.with_shape(lanes=shape[0], items=shape[1]) if shape else profiled
-    result = measure.bench(measure.synthetic(300, 50, 40), device, repeat=2, limits=Limits(1e9, 1e10, 8, 1))
+    result = measure.bench(measure.synthetic(300, 50, 40), device, repeat=2, limits=Limits(1e9, 5e8, 1e10, 8, 1))
     assert set(result["stages"]) >= FRAME | STEP
     assert result["timer"] == "events"
     for name in FRAME | STEP:
@@ -187,13 +187,17 @@ def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
     blend = result["stages"]["blend"]
     assert blend["pairs_per_second"] == pytest.approx(1e3 * result["pairs"]["contributing"] / blend["ms"])
     assert blend["share_of_arithmetic"] == pytest.approx(blend["pairs_per_second"] / 1e9)
+    gradient = result["stages"]["blend_grad"]
+    assert gradient["share_of_arithmetic"] == pytest.approx(gradient["pairs_per_second"] / 5e8)
     adam = result["stages"]["adam"]
     # Parameters, gradients and both moments of 59 floats, read and written.
     assert adam["bytes"] == 300 * 59 * 4 * 4 * 2
 
 
 def test_wall_time_where_events_have_none(default_device: Device) -> None:
-    result = measure.bench(measure.synthetic(200, 40, 30), default_device, repeat=1, limits=Limits(1e9, 1e10, 8, 1))
+    result = measure.bench(
+        measure.synthetic(200, 40, 30), default_device, repeat=1, limits=Limits(1e9, 5e8, 1e10, 8, 1)
+    )
     assert result["timer"] == "wall"
     assert all(result["stages"][name]["ms"] == result["stages"][name]["wall_ms"] for name in FRAME | STEP)
 

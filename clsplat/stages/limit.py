@@ -23,10 +23,12 @@ _COPY_BYTES = 256 * 2**20
 
 @dataclass(frozen=True)
 class Limits:
-    """pairs_per_second: blending's arithmetic alone, with every lane in use; copy_bytes_per_second: bytes read and
-    bytes written of a copy that no cache holds; lanes and items: the shape of both."""
+    """pairs_per_second, gradient_pairs_per_second: the arithmetic of blending and of its gradient alone, with every
+    lane in use; copy_bytes_per_second: bytes read and bytes written of a copy that no cache holds; lanes and items: the
+    shape of all."""
 
     pairs_per_second: float
+    gradient_pairs_per_second: float
     copy_bytes_per_second: float
     lanes: int
     items: int
@@ -36,7 +38,8 @@ def measure_limits(device: Device, *, seconds: float = 0.1, repeat: int = 5, cop
     """The best of `repeat` runs each; those of the arithmetic are made to last about `seconds`."""
     items = tile_items(device)
     return Limits(
-        _pairs_per_second(device, items, seconds, repeat),
+        _pairs_per_second(device, "limit_blend", items, seconds, repeat),
+        _pairs_per_second(device, "limit_blend_grad", items, seconds, repeat),
         _copy_rate(device, copy_bytes, repeat),
         device.shape.lanes,
         items,
@@ -55,8 +58,8 @@ def _splats() -> NDArray[np.float32]:
     return splats
 
 
-def _pairs_per_second(device: Device, items: int, seconds: float, repeat: int) -> float:
-    kernel = device.kernels("limit", ITEMS=items).limit_blend
+def _pairs_per_second(device: Device, name: str, items: int, seconds: float, repeat: int) -> float:
+    kernel = getattr(device.kernels("limit", ITEMS=items), name)
     groups = _GROUPS[device.kind] * int(device.cl_device.max_compute_units)
     splats = upload(device, _splats())
     sums = allocate(device, (groups * items,), np.float32)
