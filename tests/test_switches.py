@@ -26,11 +26,26 @@ from clsplat.stages.project import upload_gaussians
 EXACT_OFF = {
     "constant extent": RasterizerConfig(extent="constant"),
     "box": RasterizerConfig(tile_test="box"),
+    "square": RasterizerConfig(tile_test="square"),
+    "pairs by depth": RasterizerConfig(depth_sort="pairs"),
+    "all bits": RasterizerConfig(key_bits="all"),
+    "pairs by all bits": RasterizerConfig(depth_sort="pairs", key_bits="all"),
     "rows": RasterizerConfig(row_skip=False),
     "columns": RasterizerConfig(column_skip=False),
     "vectors": RasterizerConfig(vector_skip=False),
     "early stop": RasterizerConfig(early_stop=False),
-    "all": RasterizerConfig("constant", "box", False, False, False, False),
+    "last contributor": RasterizerConfig(last_contributor=False),
+    "all": RasterizerConfig(
+        extent="constant",
+        tile_test="square",
+        depth_sort="pairs",
+        key_bits="all",
+        row_skip=False,
+        column_skip=False,
+        vector_skip=False,
+        early_stop=False,
+        last_contributor=False,
+    ),
 }
 """Every exact switch turned off, alone and together."""
 
@@ -118,8 +133,9 @@ def test_switches_that_are_off_do_more_work(default_device: Device) -> None:
     }
     assert pairs["constant extent"] > pairs["default"]
     assert pairs["box"] > pairs["default"]
-    assert pairs["all"] > max(pairs["box"], pairs["constant extent"])
-    assert pairs["rows"] == pairs["default"]
+    assert pairs["square"] > pairs["box"]
+    assert pairs["all"] > max(pairs["square"], pairs["constant extent"])
+    assert pairs["rows"] == pairs["pairs by depth"] == pairs["default"]
 
 
 @pytest.mark.parametrize("name", NAMES)

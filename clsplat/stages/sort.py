@@ -26,9 +26,12 @@ def scratch_bytes(device: Device, n: int) -> int:
 
 
 def radix_sort(
-    device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int
+    device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int, base: int = 0
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort by the lowest `bits` of the keys; (sorted keys, positions), in workspace arrays under `name`."""
+    """Sort by the lowest `bits` of the keys less `base`; (sorted keys, positions), in workspace arrays under `name`.
+
+    As few passes as the widest digit allows, and their digits of even width.
+    """
     n = keys.shape[0]
     groups, chunk = chunking(device, n)
     items = device.shape.items
@@ -46,7 +49,7 @@ def radix_sort(
         keys_out = work.array(f"{name}_keys{index % 2}", (n,), np.uint32)
         positions_out = work.array(f"{name}_positions{index % 2}", (n,), np.uint32)
         launch_groups(
-            device, kernels.radix_histogram, groups, items, n, chunk, shift, digits, keys, histograms, counters
+            device, kernels.radix_histogram, groups, items, n, chunk, base, shift, digits, keys, histograms, counters
         )
         scan(device, work, histograms, histograms, total)
         launch_groups(
@@ -56,6 +59,7 @@ def radix_sort(
             items,
             n,
             chunk,
+            base,
             shift,
             digits,
             index == 0,
@@ -95,8 +99,11 @@ def bitonic_sort(device: Device, work: Workspace, name: str, keys: DeviceArray) 
     return keys_out, positions_out
 
 
-def sort(device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int) -> tuple[DeviceArray, DeviceArray]:
-    """The quicker of the two for so many keys; `bits` is how many low bits of the keys can be set."""
+def sort(
+    device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int, base: int = 0
+) -> tuple[DeviceArray, DeviceArray]:
+    """The quicker of the two for so many keys; `bits` is how many low bits of the keys less `base` can be set, `base`
+    no larger than any key."""
     if keys.shape[0] <= BITONIC_WINS[device.kind]:
         return bitonic_sort(device, work, name, keys)
-    return radix_sort(device, work, name, keys, bits)
+    return radix_sort(device, work, name, keys, bits, base)
