@@ -46,8 +46,8 @@ class RasterizerConfig:
     """A Gaussian is listed in the tiles that its ellipse reaches; that the ellipse's bounding box does; or that the
     square of its longest half axis does, as in the code of Kerbl et al."""
     depth_sort: Literal["visible", "pairs"] = "visible"
-    """The visible Gaussians are sorted by depth, and their pairs with tiles, stably, by tile; or all pairs are sorted by
-    tile and depth, as in the code of Kerbl et al."""
+    """The visible Gaussians are sorted by depth, and their pairs with tiles, stably, by tile; or all pairs are sorted
+    by tile and depth, as in the code of Kerbl et al."""
     key_bits: Literal["needed", "all"] = "needed"
     """Sort by the bits in which the depths of the frame and its tiles differ, or by 32 of each."""
     row_skip: bool = True

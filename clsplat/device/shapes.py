@@ -33,8 +33,8 @@ class Shape:
 
     @property
     def digit_bits(self) -> int:
-        """Radix sort digit, at most: a counter per digit and item has to fit the 32 KiB of local memory."""
-        return 13 if self.items == 1 else 4
+        """Radix sort digit: a counter per digit and item has to fit local memory."""
+        return 11 if self.items == 1 else 4
 
 
 def kind_of(device: cl.Device) -> str:

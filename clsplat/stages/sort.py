@@ -18,11 +18,22 @@ BITONIC_WINS = {"cpu": 512, "gpu": BITONIC_MAX, "other": BITONIC_MAX}
 """Up to this many keys one launch of bitonic sort beats the radix sort's dozen."""
 
 
+WIDE_DIGIT, WIDE_FROM = 13, 1 << 17
+"""From so many keys on a digit may be so wide where a group is one item: its counters fill the 32 KiB of local memory,
+and fewer passes save more than the larger histograms cost."""
+
+
+def _widest_digit(device: Device, n: int) -> int:
+    return WIDE_DIGIT if device.shape.items == 1 and n >= WIDE_FROM else device.shape.digit_bits
+
+
 def scratch_bytes(device: Device, n: int) -> int:
     """At most so many bytes do sorts and scans of up to `n` elements need, beside the arrays under their names."""
     shape = device.shape
     groups = min(shape.chunks, -(-n // 1024)) if shape.items == 1 else -(-n // (16 * shape.items))
-    return 4 * (1 << shape.digit_bits) * max(groups, 1) + 8 * max(groups, shape.chunks)  # histograms, sums of scans
+    return 4 * (1 << _widest_digit(device, n)) * max(groups, 1) + 8 * max(
+        groups, shape.chunks
+    )  # histograms, sums of scans
 
 
 def radix_sort(
@@ -36,8 +47,7 @@ def radix_sort(
     groups, chunk = chunking(device, n)
     items = device.shape.items
     kernels = device.kernels("sort_radix")
-    digit_bits = device.shape.digit_bits
-    passes = max(-(-bits // digit_bits), 1)
+    passes = max(-(-bits // _widest_digit(device, n)), 1)
     digit_bits = -(-bits // passes) or 1
     digits = 1 << digit_bits
     histograms = work.array("radix_histograms", (digits * groups,), np.uint32)
