@@ -21,17 +21,17 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config import PRESETS, DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
 from clsplat.gaussians import Gaussians
 from clsplat.initialise import from_points, random_points
+from clsplat.needs import plan_step
 from clsplat.rendering import Frame, Rasterizer, Renderer
 from clsplat.runs import Run, is_run
 from clsplat.scene import Scene, View, load_scene
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.limit import Limits, measure_limits
-from clsplat.stages.project import upload_gaussians
 from clsplat.trainer import Trainer
 from clsplat.undistort import Lens
 
@@ -46,6 +46,8 @@ FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")
 """Stages that are measured in a frame; the others in a training step."""
 CROP = 192
 """Side in pixels of what is compared with the float64 reference, in the middle of the image; smaller ones are whole."""
+ALL_OFF = "all exact switches off"
+"""Of several values that a switch can have, the one that does most."""
 PSNR_MAX = 160.0
 """PSNR of equal images, which would be infinite."""
 
@@ -308,13 +310,17 @@ def settings() -> dict[str, RasterizerConfig]:
     changes: dict[str, dict[str, Any]] = {
         "extent constant": {"extent": "constant"},
         "tile-test box": {"tile_test": "box"},
+        "tile-test square": {"tile_test": "square"},
+        "depth-sort pairs": {"depth_sort": "pairs"},
+        "key-bits all": {"key_bits": "all"},
         "no row-skip": {"row_skip": False},
         "no column-skip": {"column_skip": False},
         "no vector-skip": {"vector_skip": False},
         "no early-stop": {"early_stop": False},
+        "no last-contributor": {"last_contributor": False},
     }
     together: dict[str, Any] = {key: value for change in changes.values() for key, value in change.items()}
-    changes["all exact switches off"] = together
+    changes[ALL_OFF] = together
     changes["extent 3sigma"] = {"extent": "3sigma"}
     changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
     changes.update({f"alpha-min {steps}/255": {"alpha_min": steps / 255} for steps in (2, 4)})
@@ -334,13 +340,14 @@ def compare(
     repeat: int = 5,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Run time against error of each setting: median time of a frame, the settings taken in turn; its difference from
-    the float64 reference on a crop, and from the exact preset's frame on the whole image."""
+    """Run time against error of each setting: median times of a frame and of a training step, the settings taken in
+    turn; the frame's difference from the float64 reference on a crop, and from the exact preset's frame on the whole
+    image. Where both are among the settings, also how many times faster all exact switches together make them."""
     say = progress or (lambda *_: None)
     candidates = candidates or settings()
-    on_device, work = upload_gaussians(device, subject.gaussians), Workspace(device)
+    trainer, camera = _trainer(subject, device, PRESETS["exact"]), subject.camera
+    model, work = trainer.parameters, trainer.rasterizer.work
     background = upload(device, np.zeros(3, np.float32))
-    camera = subject.camera
     x0, y0, width, height = crop = _crop(camera)
     say("float64 reference", None)
     reference = reference_crop(subject.gaussians, camera, crop)
@@ -350,26 +357,37 @@ def compare(
         return Error.of(part, reference), Error.of(picture, exact)
 
     def draw(rasterizer: Rasterizer) -> Frame:
-        return rasterizer.forward(on_device, camera, background, backward=False)
+        return rasterizer.forward(model, camera, background, backward=False)
 
-    exact = _picture(draw(Rasterizer(device, PRESETS["exact"], work)))
+    def step(rasterizer: Rasterizer) -> None:
+        trainer.rasterizer = rasterizer
+        trainer.train_step()
+
+    exact = _picture(draw(trainer.rasterizer))
     rasterizers = {name: Rasterizer(device, config, work) for name, config in candidates.items()}
+    for rasterizer in rasterizers.values():
+        config = rasterizer.config
+        rasterizer.follow(plan_step(device, model.count, model.coefficients, [camera], config, absolute=False))
     found = {}
     for done, (name, rasterizer) in enumerate(rasterizers.items()):
         say("settings", done / len(rasterizers))
         found[name] = errors(_picture(draw(rasterizer)))
-    times: dict[str, list[float]] = {name: [] for name in rasterizers}
+        step(rasterizer)
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in rasterizers}
     for done in range(repeat):
         say("times", done / repeat)
         for name, rasterizer in rasterizers.items():
-            times[name].append(wall_ms(device, partial(draw, rasterizer)))
+            both = wall_ms(device, partial(draw, rasterizer)), wall_ms(device, partial(step, rasterizer))
+            times[name].append(both)
+    medians = {name: tuple(map(statistics.median, zip(*each, strict=True))) for name, each in times.items()}
     whole = (width, height) == (camera.width, camera.height)
     points = []
     for name, (from_reference, from_exact) in found.items():
         points.append(
             {
                 "name": name,
-                "frame_ms": statistics.median(times[name]),
+                "frame_ms": medians[name][0],
+                "iteration_ms": medians[name][1],
                 "against_float64": asdict(from_reference),
                 "against_exact": asdict(from_exact),
                 **asdict(from_reference if whole else from_exact),
@@ -378,7 +396,12 @@ def compare(
     on_front = front([(point["frame_ms"], point["psnr"]) for point in points])
     for point, best in zip(points, on_front, strict=True):
         point["on_front"] = best
+    on = next((name for name, config in candidates.items() if config == PRESETS["exact"]), None)
+    faster = None
+    if on is not None and ALL_OFF in medians:
+        faster = {key: medians[ALL_OFF][k] / medians[on][k] for k, key in enumerate(("frame", "iteration"))}
     return {
+        "exact_switches_faster": faster,
         "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
         "crop": list(crop),
         "exact_against_float64": asdict(errors(exact)[0]),
@@ -459,17 +482,22 @@ def table(result: dict[str, Any]) -> str:
 
 def settings_table(result: dict[str, Any]) -> str:
     """What `compare` measured, for people."""
-    rows: list[tuple[str, ...]] = [("setting", "ms", "PSNR dB", "largest", "front")]
+    rows: list[tuple[str, ...]] = [("setting", "ms", "step ms", "PSNR dB", "largest", "front")]
     for point in result["points"]:
         psnr = "same bits" if point["max_abs"] == 0 else f"{point['psnr']:.1f}"
         front_mark = "*" if point["on_front"] else ""
-        rows.append((point["name"], f"{point['frame_ms']:.2f}", psnr, f"{point['max_abs']:.2g}", front_mark))
+        times = (f"{point['frame_ms']:.2f}", f"{point['iteration_ms']:.2f}")
+        rows.append((point["name"], *times, psnr, f"{point['max_abs']:.2g}", front_mark))
     known, (_, _, width, height) = result["exact_against_float64"], result["crop"]
     note = (
         f"error against {result['error_is_against']}; exact against float64 on {width}x{height} pixels: "
         f"{known['psnr']:.1f} dB, {known['max_abs']:.2g}"
     )
-    return "\n".join([*columns(rows), "", note])
+    lines = [*columns(rows), "", note]
+    if (faster := result["exact_switches_faster"]) is not None:
+        each = f"a frame {faster['frame']:.2f} times faster, a training step {faster['iteration']:.2f} times"
+        lines.append(f"the exact switches together: {each}")
+    return "\n".join(lines)
 
 
 def columns(rows: list[tuple[str, ...]]) -> list[str]:

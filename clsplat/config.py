@@ -34,15 +34,22 @@ def _check(config: object, prefix: str, rules: tuple[_Rule, ...]) -> None:
 class RasterizerConfig:
     """What the rasterizer skips. The error of each switch, and the time it buys, are in docs/performance.md.
 
-    `extent` "constant", `tile_test` "box" and the four `_skip` and `_stop` switches change no bit of a frame; they are
-    there to be measured. The others are approximate where they differ from the default.
+    `extent` "constant", `tile_test`, `depth_sort`, `key_bits`, `last_contributor` and the four `_skip` and `_stop`
+    switches change no bit of a frame; they are there to be measured. The others are approximate where they differ from
+    the default.
     """
 
     extent: Literal["opacity", "constant", "3sigma"] = "opacity"
     """How far a Gaussian reaches: to where its alpha is alpha-min; as far as an opaque one would, whatever its
     opacity; or three standard deviations, which cuts what is visible of opaque ones (approximate)."""
-    tile_test: Literal["ellipse", "box"] = "ellipse"
-    """A Gaussian is listed in the tiles that its ellipse reaches, or in those that the ellipse's bounding box does."""
+    tile_test: Literal["ellipse", "box", "square"] = "ellipse"
+    """A Gaussian is listed in the tiles that its ellipse reaches; that the ellipse's bounding box does; or that the
+    square of its longest half axis does, as in the code of Kerbl et al."""
+    depth_sort: Literal["visible", "pairs"] = "visible"
+    """The visible Gaussians are sorted by depth, and their pairs with tiles, stably, by tile; or all pairs are sorted
+    by tile and depth, as in the code of Kerbl et al."""
+    key_bits: Literal["needed", "all"] = "needed"
+    """Sort by the bits in which the depths of the frame and its tiles differ, or by 32 of each."""
     row_skip: bool = True
     """Visit only the rows of a tile that the bounding box reaches."""
     column_skip: bool = True
@@ -51,6 +58,8 @@ class RasterizerConfig:
     """Leave a vector of pixels when the Gaussian contributes to none of them."""
     early_stop: bool = True
     """Leave a tile when all its pixels are opaque; else go on to its last Gaussian, to no effect."""
+    last_contributor: bool = True
+    """A tile's gradient begins at the last Gaussian that one of its pixels takes, or at its last, to no effect."""
     sh_degree_limit: int = 3
     """Leave out the SH bands above this degree (approximate)."""
     alpha_min: float = 1 / 255

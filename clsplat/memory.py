@@ -34,7 +34,7 @@ class Need:
 
     gaussians: how many; floats: parameters of one; models: arrays of so many parameters, 1 for a frame and 4 for a
     step; slot: floats of a pair's slot, 0 for a frame; planes: all that is as large as the image; loss: of which the
-    loss's scratch memory; scratch: whatever is left over.
+    loss's scratch memory; scratch: whatever is left over; sorts_pairs: whether all pairs are sorted by depth.
     """
 
     gaussians: int
@@ -44,6 +44,7 @@ class Need:
     planes: int
     loss: int
     scratch: int
+    sorts_pairs: bool = False
 
     @property
     def row(self) -> int:
@@ -63,7 +64,8 @@ class Need:
     @property
     def pair(self) -> int:
         """Of each pair: keys, sort, lists; slot and cells where there is a gradient."""
-        return 36 + (4 * self.slot + 4 if self.slot else 0)
+        gradient = 4 * self.slot + 4 if self.slot else 0
+        return 36 + (20 if self.sorts_pairs else 0) + gradient
 
     @property
     def pairs(self) -> int:

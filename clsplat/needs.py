@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from clsplat.camera import Camera
+from clsplat.config import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.device.layout import PAD, SLOT_ABSOLUTE, SLOT_PLAIN, TILE
 from clsplat.memory import Need, Plan, plan
@@ -19,19 +20,34 @@ _SMALL = 4096
 """Camera, background, totals and the like."""
 
 
-def plan_frame(device: Device, gaussians: int, coefficients: int, camera: Camera) -> Plan:
+def plan_frame(device: Device, gaussians: int, coefficients: int, camera: Camera, config: RasterizerConfig) -> Plan:
     """Of rendering alone. Raises CapacityError."""
-    return _plan(device, gaussians, coefficients, [camera], training=False, slot=0)
+    return _plan(device, gaussians, coefficients, [camera], config, training=False, slot=0)
 
 
-def plan_step(device: Device, gaussians: int, coefficients: int, cameras: Iterable[Camera], *, absolute: bool) -> Plan:
+def plan_step(
+    device: Device,
+    gaussians: int,
+    coefficients: int,
+    cameras: Iterable[Camera],
+    config: RasterizerConfig,
+    *,
+    absolute: bool,
+) -> Plan:
     """Of a training step, from any of the cameras. Raises CapacityError."""
     slot = SLOT_ABSOLUTE if absolute else SLOT_PLAIN
-    return _plan(device, gaussians, coefficients, cameras, training=True, slot=slot)
+    return _plan(device, gaussians, coefficients, cameras, config, training=True, slot=slot)
 
 
 def _plan(
-    device: Device, gaussians: int, coefficients: int, cameras: Iterable[Camera], *, training: bool, slot: int
+    device: Device,
+    gaussians: int,
+    coefficients: int,
+    cameras: Iterable[Camera],
+    config: RasterizerConfig,
+    *,
+    training: bool,
+    slot: int,
 ) -> Plan:
     planes = loss = 0
     for camera in cameras:
@@ -53,5 +69,6 @@ def _plan(
         planes=planes + loss,
         loss=loss,
         scratch=scratch_bytes(device, longest) + _SMALL,
+        sorts_pairs=config.depth_sort == "pairs",
     )
     return plan(need, device.budget, device.max_allocation, device.row_alignment)

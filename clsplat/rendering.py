@@ -19,7 +19,17 @@ from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
 from clsplat.needs import plan_frame
 from clsplat.stages.blend import Blended, blend, blend_grad
-from clsplat.stages.duplicate import MAX_PAIRS, Band, Counted, Pairs, count, count_band, duplicate, plan_bands
+from clsplat.stages.duplicate import (
+    MAX_PAIRS,
+    Band,
+    Counted,
+    Pairs,
+    count,
+    count_band,
+    duplicate,
+    duplicate_and_sort,
+    plan_bands,
+)
 from clsplat.stages.project import (
     AnyGaussians,
     DeviceGaussians,
@@ -85,6 +95,7 @@ class Rasterizer:
         self.config = config or RasterizerConfig()
         self.device = device.with_switches(kernel_defines(self.config))
         self.work = work or Workspace(device)
+        self._all_bits = self.config.key_bits == "all"
         self.capacity = min(device.max_allocation // (4 * SLOT_ABSOLUTE), MAX_PAIRS)
 
     def follow(self, plan: Plan) -> None:
@@ -105,7 +116,7 @@ class Rasterizer:
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
         camera_array.set(pack)
         projected = project(device, work, gaussians, camera, camera_array)
-        counted = count(device, work, projected.tile_counts)
+        counted = count(device, work, projected.splats, projected.tile_counts, all_bits=self._all_bits)
         bands = self._plan(projected, counted, tiles_of(camera))
         part = None
         for band in bands:
@@ -130,9 +141,10 @@ class Rasterizer:
 
     def _part(self, projected: Projected, band: Band, tiles: tuple[int, int], counted: Counted | None = None) -> Part:
         device, work = self.device, self.work
-        counted = counted or count_band(device, work, projected, tiles, band)
-        pairs = duplicate(device, work, projected.splats, counted, tiles, band)
-        return Part(band, counted, pairs, tile_lists(device, work, pairs, band.tiles))
+        counted = counted or count_band(device, work, projected, tiles, band, all_bits=self._all_bits)
+        listing = duplicate_and_sort if self.config.depth_sort == "pairs" else duplicate
+        pairs = listing(device, work, projected.splats, counted, tiles, band)
+        return Part(band, counted, pairs, tile_lists(device, work, pairs, band.tiles, all_bits=self._all_bits))
 
     def backward(
         self,
@@ -233,7 +245,7 @@ class Renderer:
         count, coefficients = len(gaussians), gaussians.sh.shape[1]
         asked = (count, coefficients, camera.width, camera.height)
         if self._planned != asked:
-            plan = plan_frame(self.device, count, coefficients, camera)
+            plan = plan_frame(self.device, count, coefficients, camera, self._rasterizer.config)
             self._rasterizer.follow(plan)
             if plan.streamed or (self._held is not None and isinstance(self._held[1], HostGaussians)):
                 self._held = None

@@ -80,7 +80,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
   barrier(CLK_LOCAL_MEM_FENCE);
   last = group_last;
 #endif
-#ifdef NO_EARLY_STOP
+#ifdef NO_LAST_CONTRIBUTOR // RasterizerConfig.last_contributor: begin at the end of the list, to no effect
   last = end;
 #endif
 

@@ -1,6 +1,7 @@
 // From visible Gaussians to one (tile, Gaussian) pair for each tile that an ellipse reaches, in order of depth, so that
 // a stable sort by tile alone leaves each tile's Gaussians front to back.
 #include "shared/math.h"
+#include "shared/group.h"
 #include "shared/tile.h"
 #include "shared/prefetch.h"
 
@@ -11,15 +12,37 @@ static inline void band_span(const Ellipse *e, int ty, int tiles_x, int first_ti
   *x1 = max(*x0, min(*x1, end_tile - ty * tiles_x));
 }
 
-// tile_counts (n), rank (n): scan of the visible -> gaussian_from_visible, depth_keys (visible). A positive float's
-// bits sort as it does.
-__kernel void compact_visible(const uint n, __global const uint *tile_counts, __global const uint *ranks,
-                              __global const float *splats, __global uint *gaussian_from_visible,
-                              __global uint *depth_keys) {
-  const uint i = get_global_id(0);
-  if (i >= n || tile_counts[i] == 0) return;
-  gaussian_from_visible[ranks[i]] = i;
-  depth_keys[ranks[i]] = as_uint(splats[(size_t)SPLAT_SIZE * i + SPLAT_DEPTH]);
+// tile_counts (n), ranks (n): scan of the visible, visible and pairs (1): totals -> gaussian_from_visible, depth_keys
+// (visible); found (4), zeroed before: both totals, the complement of the smallest key, the largest. A positive
+// float's bits sort as it does. A group owns a chunk.
+GROUP __kernel void compact_visible(const uint n, const uint chunk, __global const uint *tile_counts,
+                                    __global const uint *ranks, __global const float *splats,
+                                    __global const uint *visible, __global const uint *pairs,
+                                    __global uint *gaussian_from_visible, __global uint *depth_keys,
+                                    __global uint *found) {
+  __local uint extremes[2];
+  if (get_local_id(0) == 0) extremes[0] = extremes[1] = 0;
+  BARRIER_LOCAL();
+  const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
+  uint turned = 0, largest = 0;
+  for (uint i = begin + get_local_id(0); i < end; i += ITEMS) {
+    if (tile_counts[i] == 0) continue;
+    const uint key = as_uint(splats[(size_t)SPLAT_SIZE * i + SPLAT_DEPTH]);
+    gaussian_from_visible[ranks[i]] = i;
+    depth_keys[ranks[i]] = key;
+    turned = max(turned, ~key);
+    largest = max(largest, key);
+  }
+  atomic_max(extremes, turned);
+  atomic_max(extremes + 1, largest);
+  BARRIER_LOCAL();
+  if (get_local_id(0) != 0) return;
+  atomic_max(found + 2, extremes[0]);
+  atomic_max(found + 3, extremes[1]);
+  if (get_group_id(0) == 0) {
+    found[0] = visible[0];
+    found[1] = pairs[0];
+  }
 }
 
 // order (visible): by depth -> gaussian_from_rank, counts (visible)
@@ -93,4 +116,36 @@ __kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y
       gaussian_from_slot[slot] = i;
     }
   }
+}
+
+// gaussian_from_visible (visible), slots as above -> tile_keys, depth_keys, gaussian_from_slot (pairs): a pair for each
+// slot, in order of Gaussians.
+__kernel void duplicate_slots(const uint visible, const int tiles_x, const int tiles_y, const int first_tile,
+                              const int end_tile, __global const uint *gaussian_from_visible,
+                              __global const uint *slots, __global const float *splats, __global uint *tile_keys,
+                              __global uint *depth_keys, __global uint *gaussian_from_slot) {
+  const uint index = get_global_id(0);
+  if (index >= visible) return;
+  const uint i = gaussian_from_visible[index];
+  __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
+  const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
+  const uint depth = as_uint(splat[SPLAT_DEPTH]);
+  uint slot = slots[i];
+  const int y0 = max(e.tile_y0, first_tile / tiles_x), y1 = min(e.tile_y1, (end_tile - 1) / tiles_x + 1);
+  for (int ty = y0; ty < y1; ++ty) {
+    int x0, x1;
+    band_span(&e, ty, tiles_x, first_tile, end_tile, &x0, &x1);
+    for (int tx = x0; tx < x1; ++tx, ++slot) {
+      tile_keys[slot] = ty * tiles_x + tx - first_tile;
+      depth_keys[slot] = depth;
+      gaussian_from_slot[slot] = i;
+    }
+  }
+}
+
+// slot_from_pair (pairs): by depth, tiles (pairs): by slot -> tile_keys (pairs): by depth
+__kernel void order_tiles(const uint pairs, __global const uint *slot_from_pair, __global const uint *tiles,
+                          __global uint *tile_keys) {
+  const uint pair = get_global_id(0);
+  if (pair < pairs) tile_keys[pair] = tiles[slot_from_pair[pair]];
 }

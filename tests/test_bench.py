@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -311,6 +312,28 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
     assert 20 < coarse["psnr"] < 80
     assert result["exact_against_float64"]["max_abs"] < 2e-5
     assert any(point["on_front"] for point in result["points"])
+    assert all(point["iteration_ms"] > 0 for point in result["points"])
+    assert result["exact_switches_faster"] is None, "nothing has them off"
+
+
+def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measure, "CROP", 48)
+    every = measure.settings()
+    off = every[measure.ALL_OFF]
+    for field, value in asdict(off).items():
+        if isinstance(value, bool | str):  # the numbers are approximations
+            assert value != getattr(RasterizerConfig(), field), field
+    assert (off.tile_test, off.alpha_min) == ("square", RasterizerConfig().alpha_min)
+    times = iter([50.0, 100.0, 150.0, 210.0])  # of a frame and of a step, on and off
+    monkeypatch.setattr(measure, "wall_ms", lambda _device, work: (work(), next(times))[1])
+    candidates = {"preset exact = default": PRESETS["exact"], measure.ALL_OFF: off}
+    result = measure.compare(measure.synthetic(300, 70, 50), profiled, candidates, repeat=1)
+    assert [(point["frame_ms"], point["iteration_ms"]) for point in result["points"]] == [(50, 100), (150, 210)]
+    assert result["points"][1]["max_abs"] == 0.0
+    assert result["exact_switches_faster"] == {"frame": 3.0, "iteration": 2.1}
+    text = measure.settings_table(result)
+    assert "a frame 3.00 times faster, a training step 2.10 times" in text
+    assert "step ms" in text
 
 
 def test_small_frames_are_compared_with_float64(profiled: Device) -> None:

@@ -14,7 +14,7 @@ from tiny import CONFIG, short, write_scene
 
 import clsplat
 from clsplat.cli import main
-from clsplat.config import TrainConfig
+from clsplat.config import RasterizerConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
 from clsplat.memory import Need, plan
@@ -48,6 +48,16 @@ def test_a_frame_in_less_memory(default_device: Device, share: float) -> None:
     assert device.memory.peak <= limit
     assert_same_bits(got.image, wanted.image)
     assert_same_bits(got.alpha, wanted.alpha)
+
+
+def test_a_frame_that_sorts_all_pairs_in_less_memory(default_device: Device) -> None:
+    config = RasterizerConfig(tile_test="square", depth_sort="pairs")
+    scene, camera = random_cloud(6000, 11, 100, 80)
+    free = with_limit(default_device, None)
+    wanted = Renderer(free, config=config).render(scene, camera)
+    device = with_limit(default_device, free.memory.peak // 2)
+    assert_same_bits(Renderer(device, config=config).render(scene, camera).image, wanted.image)
+    assert device.memory.peak <= free.memory.peak // 2
 
 
 def test_frames_of_many_sizes_and_models(default_device: Device) -> None:

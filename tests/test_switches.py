@@ -18,6 +18,8 @@ from pipeline import BACKGROUND, Pipeline, shaped
 from clsplat.config import PRESETS, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
+from clsplat.device.layout import SPLAT, TILE
+from clsplat.device.source import kernel_root, kernel_source
 from clsplat.device.switches import kernel_defines
 from clsplat.errors import InputError
 from clsplat.rendering import Rasterizer
@@ -26,11 +28,26 @@ from clsplat.stages.project import upload_gaussians
 EXACT_OFF = {
     "constant extent": RasterizerConfig(extent="constant"),
     "box": RasterizerConfig(tile_test="box"),
+    "square": RasterizerConfig(tile_test="square"),
+    "pairs by depth": RasterizerConfig(depth_sort="pairs"),
+    "all bits": RasterizerConfig(key_bits="all"),
+    "pairs by all bits": RasterizerConfig(depth_sort="pairs", key_bits="all"),
     "rows": RasterizerConfig(row_skip=False),
     "columns": RasterizerConfig(column_skip=False),
     "vectors": RasterizerConfig(vector_skip=False),
     "early stop": RasterizerConfig(early_stop=False),
-    "all": RasterizerConfig("constant", "box", False, False, False, False),
+    "last contributor": RasterizerConfig(last_contributor=False),
+    "all": RasterizerConfig(
+        extent="constant",
+        tile_test="square",
+        depth_sort="pairs",
+        key_bits="all",
+        row_skip=False,
+        column_skip=False,
+        vector_skip=False,
+        early_stop=False,
+        last_contributor=False,
+    ),
 }
 """Every exact switch turned off, alone and together."""
 
@@ -54,12 +71,19 @@ def sheaf() -> scenes.Scene:
     return gaussians, camera
 
 
-NAMES = ("overlap", "saturating", "needles", "cloud", "sheaf")
+def wall() -> scenes.Scene:
+    """Layers so wide that every tile is opaque long before its last Gaussian."""
+    gaussians, camera = scenes.NAMED["saturating"]()
+    gaussians.log_scales[:] += 1.5
+    return gaussians, camera
+
+
+NAMES = ("overlap", "saturating", "needles", "cloud", "sheaf", "wall")
 
 
 def scene(name: str) -> scenes.Scene:
-    if name == "sheaf":
-        return sheaf()
+    if name in ("sheaf", "wall"):
+        return sheaf() if name == "sheaf" else wall()
     return scenes.random_cloud(1000, 8, 100, 70) if name == "cloud" else scenes.NAMED[name]()
 
 
@@ -83,6 +107,31 @@ def gradients(pipeline: Pipeline) -> dict[str, NDArray[np.float32]]:
 def test_default_bits_are_the_stored_ones(device: Device) -> None:
     wanted = json.loads((Path(__file__).parent / "golden" / "frames.json").read_text())["checksums"]
     assert checksums(device) == wanted, "see tools/make_golden.py if the change is meant to change bits"
+
+
+def test_every_define_is_looked_at_by_a_kernel() -> None:
+    texts = [kernel_source(path.stem) for path in kernel_root().glob("*.cl")]
+    for config in (*EXACT_OFF.values(), *(config for config, _ in APPROXIMATE.values())):
+        for name in kernel_defines(config):
+            assert any(name in text for text in texts), name
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_last_contributor_is_where_the_gradient_begins(default_device: Device, on: bool) -> None:
+    """A Gaussian behind an opaque tile whose colour is not a number spoils the gradient if it is looked at."""
+    config = RasterizerConfig(vector_skip=False, last_contributor=on)
+    pipeline = run(shaped(default_device, 8, 1), "wall", config)
+    frame = pipeline.frame
+    rows, stride = frame.blended.stops.shape
+    stops = frame.blended.stops.get().reshape(rows // TILE, TILE, stride // TILE, TILE).max(axis=(1, 3)).ravel()
+    listed, ranges = frame.lists.gaussian_from_sorted.get(), frame.lists.ranges.get()
+    read = {i for (begin, _), stop in zip(ranges, stops, strict=True) for i in listed[begin : stop + 1]}
+    behind = sorted(set(listed) - read)
+    assert behind
+    splats = frame.projected.splats.get()
+    splats[behind, SPLAT.index("RED")] = np.nan
+    frame.projected.splats.set(splats)
+    assert all(np.isfinite(values).all() for values in gradients(pipeline).values()) == on
 
 
 def test_default_is_the_plain_text() -> None:
@@ -118,8 +167,9 @@ def test_switches_that_are_off_do_more_work(default_device: Device) -> None:
     }
     assert pairs["constant extent"] > pairs["default"]
     assert pairs["box"] > pairs["default"]
-    assert pairs["all"] > max(pairs["box"], pairs["constant extent"])
-    assert pairs["rows"] == pairs["default"]
+    assert pairs["square"] > pairs["box"]
+    assert pairs["all"] > max(pairs["square"], pairs["constant extent"])
+    assert pairs["rows"] == pairs["pairs by depth"] == pairs["default"]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -22,11 +22,13 @@ def kernel_defines(config: RasterizerConfig) -> dict[str, object]:
     elif config.extent == "constant":
         defines["EXTENT_BUDGET"] = _literal(-math.log2(config.alpha_min))
     flags = {
-        "BOX_TILE_TEST": config.tile_test == "box",
+        "BOX_TILE_TEST": config.tile_test != "ellipse",
+        "SQUARE_TILE_TEST": config.tile_test == "square",
         "NO_ROW_SKIP": not config.row_skip,
         "NO_COLUMN_SKIP": not config.column_skip,
         "NO_VECTOR_SKIP": not config.vector_skip,
         "NO_EARLY_STOP": not config.early_stop,
+        "NO_LAST_CONTRIBUTOR": not config.last_contributor,
     }
     defines.update({name: True for name, wanted in flags.items() if wanted})
     if config.sh_degree_limit != default.sh_degree_limit:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches duplicate.cl: visible Gaussians in order of depth, and a (tile, Gaussian) pair for each tile they reach."""
+"""Launches duplicate.cl: a (tile, Gaussian) pair for each tile that a visible Gaussian reaches, in order of depth."""
 
 from __future__ import annotations
 
@@ -9,18 +9,14 @@ import numpy as np
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
-from clsplat.device.launch import launch_items
+from clsplat.device.launch import launch_groups, launch_items
 from clsplat.device.layout import TILE
 from clsplat.device.memory import mebibytes
 from clsplat.device.profile import stage
 from clsplat.errors import CapacityError
 from clsplat.stages.project import Projected
-from clsplat.stages.scan import scan
+from clsplat.stages.scan import chunking, scan
 from clsplat.stages.sort import sort
-
-_KEY_BITS = 31
-"""Bits of a positive float32."""
-
 
 MAX_PAIRS = 2**31 - 1024
 """In one band: what `stops` count is signed, and read a little ahead of."""
@@ -41,22 +37,25 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """tile_counts, ranks, first_slots (n): a Gaussian's tiles, and the scans of them as flags and as numbers;
-    visible and pairs: the totals, pairs capped at 2^32 - 1."""
+    """tile_counts, first_slots (n): a Gaussian's tiles, and their scan; gaussian_from_visible, depth_keys (visible):
+    in order of Gaussians; visible and pairs: the totals, pairs capped at 2^32 - 1; least_key and key_bits: what every
+    depth key has at least, and how many low bits of the rest can be set."""
 
     tile_counts: DeviceArray
-    ranks: DeviceArray
     first_slots: DeviceArray
+    gaussian_from_visible: DeviceArray
+    depth_keys: DeviceArray
     visible: int
     pairs: int
+    least_key: int
+    key_bits: int
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """gaussian_from_rank (visible): by depth, ties by index; tile_keys, slot_from_pair (pairs): in that order;
-    first_slots (n): where a Gaussian's slots begin; gaussian_from_slot (pairs)."""
+    """tile_keys, slot_from_pair (pairs): by depth, ties by index of the Gaussian; first_slots (n): where a Gaussian's
+    slots begin; gaussian_from_slot (pairs)."""
 
-    gaussian_from_rank: DeviceArray
     tile_keys: DeviceArray
     slot_from_pair: DeviceArray
     first_slots: DeviceArray
@@ -64,8 +63,11 @@ class Pairs:
 
 
 @stage("duplicate")
-def count(device: Device, work: Workspace, tile_counts: DeviceArray) -> Counted:
-    """How many Gaussians are visible, and how many pairs they make; waits for the device."""
+def count(
+    device: Device, work: Workspace, splats: DeviceArray, tile_counts: DeviceArray, *, all_bits: bool = False
+) -> Counted:
+    """Which Gaussians are visible, how many pairs they make, and by which bits their depths differ, or with `all_bits`
+    32; waits for the device."""
     (n,) = tile_counts.shape
     ranks = work.array("visible_ranks", (n,), np.uint32)
     visible_total = work.array("visible_total", (1,), np.uint32)
@@ -73,11 +75,51 @@ def count(device: Device, work: Workspace, tile_counts: DeviceArray) -> Counted:
     scan(device, work, tile_counts, ranks, visible_total, as_flags=True)
     first_slots = work.array("first_slots", (n,), np.uint32)
     scan(device, work, tile_counts, first_slots, pairs_total)
-    return Counted(tile_counts, ranks, first_slots, int(visible_total.get()[0]), int(pairs_total.get()[0]))
+    gaussian_from_visible = work.array("gaussian_from_visible", (n,), np.uint32)
+    depth_keys = work.array("depth_keys", (n,), np.uint32)
+    found = work.array("found", (4,), np.uint32)
+    found.fill(0)
+    groups, chunk = chunking(device, n)
+    launch_groups(
+        device,
+        device.kernels("duplicate").compact_visible,
+        groups,
+        device.shape.items,
+        n,
+        chunk,
+        tile_counts,
+        ranks,
+        splats,
+        visible_total,
+        pairs_total,
+        gaussian_from_visible,
+        depth_keys,
+        found,
+    )
+    visible, pairs, turned, largest = (int(value) for value in found.get())
+    least = 0 if all_bits else 2**32 - 1 - turned
+    return Counted(
+        tile_counts,
+        first_slots,
+        gaussian_from_visible.reshaped(visible),
+        depth_keys.reshaped(visible),
+        visible,
+        pairs,
+        least,
+        32 if all_bits else max(largest - least, 1).bit_length(),
+    )
 
 
 @stage("duplicate")
-def count_band(device: Device, work: Workspace, projected: Projected, tiles: tuple[int, int], band: Band) -> Counted:
+def count_band(
+    device: Device,
+    work: Workspace,
+    projected: Projected,
+    tiles: tuple[int, int],
+    band: Band,
+    *,
+    all_bits: bool = False,
+) -> Counted:
     """`count` of the band's tiles alone. It replaces what an earlier count has left in the workspace."""
     n = projected.tile_counts.shape[0]
     band_counts = work.array("band_counts", (n,), np.uint32)
@@ -93,7 +135,7 @@ def count_band(device: Device, work: Workspace, projected: Projected, tiles: tup
         projected.splats,
         band_counts,
     )
-    return count(device, work, band_counts)
+    return count(device, work, projected.splats, band_counts, all_bits=all_bits)
 
 
 @stage("duplicate")
@@ -135,22 +177,8 @@ def duplicate(
 ) -> Pairs:
     """Sort the visible Gaussians by depth and emit their pairs in that order."""
     visible, pairs, first_slots = counted.visible, counted.pairs, counted.first_slots
-    n = counted.tile_counts.shape[0]
     kernels = device.kernels("duplicate")
-    gaussian_from_visible = work.array("gaussian_from_visible", (visible,), np.uint32)
-    depth_keys = work.array("depth_keys", (visible,), np.uint32)
-    launch_items(
-        device,
-        kernels.compact_visible,
-        n if visible else 0,
-        n,
-        counted.tile_counts,
-        counted.ranks,
-        splats,
-        gaussian_from_visible,
-        depth_keys,
-    )
-    _, order = sort(device, work, "depth", depth_keys, _KEY_BITS)
+    _, order = sort(device, work, "depth", counted.depth_keys, counted.key_bits, counted.least_key)
     gaussian_from_rank = work.array("gaussian_from_rank", (visible,), np.uint32)
     counts = work.array("rank_counts", (visible,), np.uint32)
     launch_items(
@@ -159,7 +187,7 @@ def duplicate(
         visible,
         visible,
         order,
-        gaussian_from_visible,
+        counted.gaussian_from_visible,
         counted.tile_counts,
         gaussian_from_rank,
         counts,
@@ -185,4 +213,36 @@ def duplicate(
         slot_from_pair,
         gaussian_from_slot,
     )
-    return Pairs(gaussian_from_rank, tile_keys, slot_from_pair, first_slots, gaussian_from_slot)
+    return Pairs(tile_keys, slot_from_pair, first_slots, gaussian_from_slot)
+
+
+@stage("duplicate")
+def duplicate_and_sort(
+    device: Device, work: Workspace, splats: DeviceArray, counted: Counted, tiles: tuple[int, int], band: Band
+) -> Pairs:
+    """What `duplicate` gives, by sorting all pairs by depth, as in the code of Kerbl et al.: with the sort by tile that
+    follows, the lower half of one by keys of 64 bits."""
+    visible, pairs = counted.visible, counted.pairs
+    kernels = device.kernels("duplicate")
+    tile_from_slot = work.array("tile_from_slot", (pairs,), np.uint32)
+    pair_depths = work.array("pair_depths", (pairs,), np.uint32)
+    gaussian_from_slot = work.array("gaussian_from_slot", (pairs,), np.uint32)
+    launch_items(
+        device,
+        kernels.duplicate_slots,
+        visible,
+        visible,
+        *tiles,
+        band.first,
+        band.end,
+        counted.gaussian_from_visible,
+        counted.first_slots,
+        splats,
+        tile_from_slot,
+        pair_depths,
+        gaussian_from_slot,
+    )
+    _, slot_from_pair = sort(device, work, "pair_depth", pair_depths, counted.key_bits, counted.least_key)
+    tile_keys = work.array("tile_keys", (pairs,), np.uint32)
+    launch_items(device, kernels.order_tiles, pairs, pairs, slot_from_pair, tile_from_slot, tile_keys)
+    return Pairs(tile_keys, slot_from_pair, counted.first_slots, gaussian_from_slot)

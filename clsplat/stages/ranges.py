@@ -25,10 +25,12 @@ class TileLists:
 
 
 @stage("ranges")
-def tile_lists(device: Device, work: Workspace, pairs: Pairs, tiles: int) -> TileLists:
-    """A stable sort by tile of pairs that are in order of depth: each tile's Gaussians front to back."""
+def tile_lists(device: Device, work: Workspace, pairs: Pairs, tiles: int, *, all_bits: bool = False) -> TileLists:
+    """A stable sort by tile of pairs that are in order of depth: each tile's Gaussians front to back. By as many bits
+    as the tiles need, or with `all_bits` by 32."""
     count = pairs.tile_keys.shape[0]
-    keys, pair_from_sorted = sort(device, work, "tile", pairs.tile_keys, max(tiles - 1, 1).bit_length())
+    bits = 32 if all_bits else max(tiles - 1, 1).bit_length()
+    keys, pair_from_sorted = sort(device, work, "tile", pairs.tile_keys, bits)
     ranges = work.array("ranges", (tiles, 2), np.uint32)
     ranges.fill(0)
     slot_from_sorted = work.array("slot_from_sorted", (count,), np.uint32)

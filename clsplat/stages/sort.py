@@ -18,23 +18,36 @@ BITONIC_WINS = {"cpu": 512, "gpu": BITONIC_MAX, "other": BITONIC_MAX}
 """Up to this many keys one launch of bitonic sort beats the radix sort's dozen."""
 
 
+WIDE_DIGIT, WIDE_FROM = 13, 1 << 17
+"""From so many keys on a digit may be so wide where a group is one item: its counters fill the 32 KiB of local memory,
+and fewer passes save more than the larger histograms cost."""
+
+
+def _widest_digit(device: Device, n: int) -> int:
+    return WIDE_DIGIT if device.shape.items == 1 and n >= WIDE_FROM else device.shape.digit_bits
+
+
 def scratch_bytes(device: Device, n: int) -> int:
     """At most so many bytes do sorts and scans of up to `n` elements need, beside the arrays under their names."""
     shape = device.shape
     groups = min(shape.chunks, -(-n // 1024)) if shape.items == 1 else -(-n // (16 * shape.items))
-    return 4 * (1 << shape.digit_bits) * max(groups, 1) + 8 * max(groups, shape.chunks)  # histograms, sums of scans
+    return 4 * (1 << _widest_digit(device, n)) * max(groups, 1) + 8 * max(
+        groups, shape.chunks
+    )  # histograms, sums of scans
 
 
 def radix_sort(
-    device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int
+    device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int, base: int = 0
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort by the lowest `bits` of the keys; (sorted keys, positions), in workspace arrays under `name`."""
+    """Sort by the lowest `bits` of the keys less `base`; (sorted keys, positions), in workspace arrays under `name`.
+
+    As few passes as the widest digit allows, and their digits of even width.
+    """
     n = keys.shape[0]
     groups, chunk = chunking(device, n)
     items = device.shape.items
     kernels = device.kernels("sort_radix")
-    digit_bits = device.shape.digit_bits
-    passes = max(-(-bits // digit_bits), 1)
+    passes = max(-(-bits // _widest_digit(device, n)), 1)
     digit_bits = -(-bits // passes) or 1
     digits = 1 << digit_bits
     histograms = work.array("radix_histograms", (digits * groups,), np.uint32)
@@ -46,7 +59,7 @@ def radix_sort(
         keys_out = work.array(f"{name}_keys{index % 2}", (n,), np.uint32)
         positions_out = work.array(f"{name}_positions{index % 2}", (n,), np.uint32)
         launch_groups(
-            device, kernels.radix_histogram, groups, items, n, chunk, shift, digits, keys, histograms, counters
+            device, kernels.radix_histogram, groups, items, n, chunk, base, shift, digits, keys, histograms, counters
         )
         scan(device, work, histograms, histograms, total)
         launch_groups(
@@ -56,6 +69,7 @@ def radix_sort(
             items,
             n,
             chunk,
+            base,
             shift,
             digits,
             index == 0,
@@ -95,8 +109,11 @@ def bitonic_sort(device: Device, work: Workspace, name: str, keys: DeviceArray) 
     return keys_out, positions_out
 
 
-def sort(device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int) -> tuple[DeviceArray, DeviceArray]:
-    """The quicker of the two for so many keys; `bits` is how many low bits of the keys can be set."""
+def sort(
+    device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int, base: int = 0
+) -> tuple[DeviceArray, DeviceArray]:
+    """The quicker of the two for so many keys; `bits` is how many low bits of the keys less `base` can be set, `base`
+    no larger than any key."""
     if keys.shape[0] <= BITONIC_WINS[device.kind]:
         return bitonic_sort(device, work, name, keys)
-    return radix_sort(device, work, name, keys, bits)
+    return radix_sort(device, work, name, keys, bits, base)

@@ -35,12 +35,30 @@ typedef struct {
   int tile_x0, tile_x1, tile_y0, tile_y1; // tiles that its box reaches
 } Ellipse;
 
+#ifdef SQUARE_TILE_TEST
+// In pixels: the larger eigenvalue of the covariance, as Kerbl et al.'s code has it, which comes back from its whitening.
+static inline float longest_half_axis(__global const float *splat) {
+  const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
+  const float syy = 1.0f / (l22 * l22);
+  const float sxy = -(l12 / l11) * syy;
+  const float sxx = 1.0f / (l11 * l11) + sxy * sxy / syy;
+  const float middle = 0.5f * (sxx + syy), half_difference = 0.5f * (sxx - syy);
+  const float larger = middle + sqrt(half_difference * half_difference + sxy * sxy);
+  return sqrt(EXTENT(splat[SPLAT_LOG2O]) * larger);
+}
+#endif
+
 static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int tiles_y) {
   Ellipse e;
   e.mx = splat[SPLAT_PIXEL_X] + splat[SPLAT_SUB_X];
   e.my = splat[SPLAT_PIXEL_Y] + splat[SPLAT_SUB_Y];
   e.half_w = splat[SPLAT_HALF_W];
   e.half_h = splat[SPLAT_HALF_H];
+#ifdef SQUARE_TILE_TEST // RasterizerConfig.tile_test; no smaller than the box, whatever rounding does
+  const float radius = longest_half_axis(splat);
+  e.half_w = radius > e.half_w ? radius : e.half_w;
+  e.half_h = radius > e.half_h ? radius : e.half_h;
+#endif
   e.tile_x0 = first_cell(e.mx - e.half_w, (float)TILE, tiles_x);
   e.tile_x1 = end_cell(e.mx + e.half_w, (float)TILE, tiles_x);
   e.tile_y0 = first_cell(e.my - e.half_h, (float)TILE, tiles_y);

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT, TILE
@@ -38,10 +39,14 @@ class Pipeline:
 
     @classmethod
     def run(
-        cls, device: Device, scene: tuple[Gaussians, Camera], background: tuple[float, float, float] = BACKGROUND
+        cls,
+        device: Device,
+        scene: tuple[Gaussians, Camera],
+        background: tuple[float, float, float] = BACKGROUND,
+        config: RasterizerConfig | None = None,
     ) -> Pipeline:
         gaussians, camera = scene
-        rasterizer = Rasterizer(device)
+        rasterizer = Rasterizer(device, config)
         on_device = upload_gaussians(device, gaussians)
         frame = rasterizer.forward(on_device, camera, upload(device, np.array(background, np.float32)))
         return cls(rasterizer, on_device, camera, frame)

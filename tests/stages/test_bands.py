@@ -33,10 +33,17 @@ def in_bands(device: Device, name: str, capacity: int, config: RasterizerConfig 
     return Pipeline(rasterizer, on_device, camera, frame)
 
 
-def check(device: Device, name: str, capacity: int | None = None, *, absolute: bool = False) -> None:
-    whole = Pipeline.run(device, NAMED[name]())
+def check(
+    device: Device,
+    name: str,
+    capacity: int | None = None,
+    config: RasterizerConfig | None = None,
+    *,
+    absolute: bool = False,
+) -> None:
+    whole = Pipeline.run(device, NAMED[name](), config=config)
     total = whole.frame.pairs.tile_keys.shape[0]
-    banded = in_bands(device, name, capacity or most_in_a_tile(whole))
+    banded = in_bands(device, name, capacity or most_in_a_tile(whole), config)
     assert whole.frame.bands == (Band(0, len(whole.frame.lists.ranges.get())),)
     assert len(banded.frame.bands) >= (2 if most_in_a_tile(whole) < total else 1)
     assert_same_bits(banded.frame.blended.image.get(), whole.frame.blended.image.get())
@@ -58,6 +65,11 @@ def test_bands_change_no_bit(default_device: Device, name: str) -> None:
 @pytest.mark.parametrize("name", SHAPE_MATTERS)
 def test_in_every_shape(shaped_device: Device, name: str) -> None:
     check(shaped_device, name)
+
+
+@pytest.mark.parametrize("name", ["random_cloud", "overlap", "many_per_tile"])
+def test_bands_of_squares_whose_pairs_are_sorted(default_device: Device, name: str) -> None:
+    check(default_device, name, config=RasterizerConfig(tile_test="square", depth_sort="pairs", key_bits="all"))
 
 
 def test_absolute_gradients(default_device: Device) -> None:

@@ -8,9 +8,13 @@ import pytest
 import scenes
 from pipeline import Pipeline
 
+from clsplat.config import RasterizerConfig
+from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
+from clsplat.device.layout import SPLAT
 from clsplat.reference import render as reference
-from clsplat.reference.tiles import touched_tiles
+from clsplat.reference.tiles import square_tiles, touched_tiles
+from clsplat.stages.duplicate import count
 
 NAMES = [*scenes.NAMED, "cloud"]
 IN_EVERY_SHAPE = ["off_frustum", "equal_depth", "cloud"]
@@ -68,5 +72,74 @@ def test_lists_are_front_to_back(shaped_device: Device, name: str) -> None:
 
 def test_equal_depths_go_by_index(device: Device) -> None:
     run = Pipeline.run(device, scenes.equal_depth())
-    ranks = run.frame.pairs.gaussian_from_rank.get()
-    np.testing.assert_array_equal(ranks, np.sort(ranks))
+    pairs = run.frame.pairs
+    gaussians = pairs.gaussian_from_slot.get()[pairs.slot_from_pair.get()]
+    assert len(np.unique(gaussians)) > 1
+    np.testing.assert_array_equal(gaussians, np.sort(gaussians))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_squares_are_those_of_the_longest_half_axis(device: Device, name: str) -> None:
+    scene = make(name)
+    run = Pipeline.run(device, scene, config=RasterizerConfig(tile_test="square"))
+    projected, camera = reference.forward(*scene).projected, run.camera
+    size = camera.width, camera.height
+    # A hair inside the threshold as above; TILE_SLACK is 0.01 pixels, and float32 loses a part in 1e5 of wide squares.
+    inner = square_tiles(projected, *size, threshold=(1 + 1e-5) / 255)
+    reach = np.where(projected.visible, projected.half_extents.max(axis=-1), 0).max()
+    outer = square_tiles(projected, *size, slack=0.02 + 1e-5 * reach, threshold=(1 - 1e-5) / 255)
+    for gaussian, got in enumerate(run.tiles_of()):
+        assert set(inner[gaussian]) <= got <= set(outer[gaussian]), gaussian
+    assert [len(tiles) for tiles in run.tiles_of()] == list(run.frame.projected.tile_counts.get())
+
+
+@pytest.mark.parametrize("name", IN_EVERY_SHAPE)
+@pytest.mark.parametrize("key_bits", ["needed", "all"])
+def test_sorting_all_pairs_makes_the_same_lists(shaped_device: Device, key_bits: str, name: str) -> None:
+    wanted = Pipeline.run(shaped_device, make(name)).frame
+    config = RasterizerConfig(depth_sort="pairs", key_bits=key_bits)  # type: ignore[arg-type]  # one of them
+    got = Pipeline.run(shaped_device, make(name), config=config).frame
+    for array in ("ranges", "gaussian_from_sorted", "slot_from_sorted"):
+        np.testing.assert_array_equal(getattr(got.lists, array).get(), getattr(wanted.lists, array).get(), array)
+
+
+def counted(device: Device, depths: np.ndarray, visible: np.ndarray, **options: bool):  # type: ignore[no-untyped-def]
+    splats = np.zeros((len(depths), len(SPLAT)), np.float32)
+    splats[:, SPLAT.index("DEPTH")] = depths
+    tiles = np.where(visible, 3, 0).astype(np.uint32)
+    return count(device, Workspace(device), upload(device, splats), upload(device, tiles), **options)
+
+
+@pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 1025, 9000])
+def test_key_bits_are_those_in_which_the_visible_depths_differ(shaped_device: Device, n: int) -> None:
+    rng = np.random.default_rng(n)
+    depths, visible = rng.uniform(1.5, 11, n).astype(np.float32), rng.random(n) < 0.7
+    visible[0] = True
+    depths[~visible] = rng.choice([1e-3, 1e5, -1.0], int((~visible).sum()))  # of culled Gaussians: whatever was there
+    keys = depths[visible].view(np.uint32)
+    got = counted(shaped_device, depths, visible)
+    assert (got.visible, got.pairs) == (visible.sum(), 3 * visible.sum())
+    assert got.least_key == keys.min()
+    assert got.key_bits == max(int(keys.max() - keys.min()).bit_length(), 1)
+    np.testing.assert_array_equal(got.depth_keys.get(), keys)
+    np.testing.assert_array_equal(got.gaussian_from_visible.get(), np.flatnonzero(visible))
+    every = counted(shaped_device, depths, visible, all_bits=True)
+    assert (every.least_key, every.key_bits) == (0, 32)
+
+
+def test_key_bits_of_no_gaussian_and_of_equal_ones(shaped_device: Device) -> None:
+    none = counted(shaped_device, np.ones(70, np.float32), np.zeros(70, np.bool_))
+    assert (none.visible, none.pairs, none.key_bits) == (0, 0, 1)
+    assert counted(shaped_device, np.full(70, 4.0, np.float32), np.ones(70, np.bool_)).key_bits == 1
+
+
+def test_fewer_bits_are_fewer_launches(default_device: Device) -> None:
+    launches = {}
+    for key_bits in ("needed", "all"):
+        config = RasterizerConfig(key_bits=key_bits)  # type: ignore[arg-type]  # one of them
+        run = Pipeline.run(default_device, make("cloud"), config=config)
+        with default_device.recorder.recording(default_device, wait=False) as stages:
+            run.rasterizer.forward(run.gaussians, run.camera, run.frame.background)
+        launches[key_bits] = {name: stages[name].launches for name in ("duplicate", "ranges")}
+    for name in ("duplicate", "ranges"):
+        assert launches["needed"][name] < launches["all"][name], name

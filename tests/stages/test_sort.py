@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.stages.sort import BITONIC_MAX, BITONIC_WINS, bitonic_sort, radix_sort, sort
+from clsplat.stages.sort import BITONIC_MAX, BITONIC_WINS, WIDE_FROM, bitonic_sort, radix_sort, sort
 
 SIZES = (0, 1, 2, 63, 64, 65, 127, 128, 129, 1023, 1024, 1025, 4096)
 RADIX_SIZES = (*SIZES, 8 * 1024 + 1, 70_001)
@@ -21,8 +21,10 @@ def check(keys: NDArray[np.uint32], result: tuple[NDArray[np.uint32], NDArray[np
     np.testing.assert_array_equal(result[0], keys[expected])
 
 
-def radix(device: Device, keys: NDArray[np.uint32], bits: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    out = radix_sort(device, Workspace(device), "test", upload(device, keys), bits)
+def radix(
+    device: Device, keys: NDArray[np.uint32], bits: int, base: int = 0
+) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    out = radix_sort(device, Workspace(device), "test", upload(device, keys), bits, base)
     return out[0].get(), out[1].get()
 
 
@@ -47,6 +49,22 @@ def test_bitonic_random(shaped_device: Device, n: int) -> None:
 def test_radix_few_bits_is_stable(shaped_device: Device, bits: int) -> None:
     keys = np.random.default_rng(bits).integers(0, 2**bits, 5000, dtype=np.uint32)
     check(keys, radix(shaped_device, keys, bits))
+
+
+@pytest.mark.parametrize(("base", "bits"), [(1, 11), (0x3FC00123, 24), (0x3FC00123, 27), (2**32 - 2**13, 13)])
+def test_radix_of_keys_that_begin_at_a_base(shaped_device: Device, base: int, bits: int) -> None:
+    """Two keys differ by as much as `bits` can hold, and across a multiple of it."""
+    rest = np.random.default_rng(bits).integers(0, 2**bits, 5000, dtype=np.uint32)
+    rest[[7, 4000]] = 2**bits - 1, 0
+    keys = np.uint32(base) + rest
+    check(keys, radix(shaped_device, keys, bits, base))
+
+
+@pytest.mark.parametrize("bits", [13, 26])
+@pytest.mark.parametrize("n", [WIDE_FROM - 1, WIDE_FROM])
+def test_radix_by_wide_digits(shaped_device: Device, n: int, bits: int) -> None:
+    keys = np.uint32(12345) + np.random.default_rng(n).integers(0, 2**bits, n, dtype=np.uint32)
+    check(keys, radix(shaped_device, keys, bits, 12345))
 
 
 @pytest.mark.parametrize("value", [0, 1, 0x7FFFFFFF, 0xFFFFFFFF])
