@@ -26,12 +26,12 @@ from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
 from clsplat.gaussians import Gaussians
 from clsplat.initialise import from_points, random_points
-from clsplat.rendering import Frame, Rasterizer, Renderer
+from clsplat.rendering import Frame, Rasterizer, Renderer, held_sh
 from clsplat.runs import Run, is_run
 from clsplat.scene import Scene, View, load_scene
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.limit import Limits, measure_limits
-from clsplat.stages.project import upload_gaussians
+from clsplat.stages.project import AnyGaussians, upload_gaussians
 from clsplat.trainer import Trainer
 from clsplat.undistort import Lens
 
@@ -138,6 +138,8 @@ def bench(
     say("frame", None)
     trainer = _trainer(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
+    if _of_held_models(config) != _of_held_models(RasterizerConfig()):  # a frame's, not a training step's
+        gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
     def draw() -> Frame:
         return rasterizer.forward(gaussians, subject.camera, trainer.background)
@@ -312,11 +314,16 @@ def settings() -> dict[str, RasterizerConfig]:
         "no column-skip": {"column_skip": False},
         "no vector-skip": {"vector_skip": False},
         "no early-stop": {"early_stop": False},
+        "no frustum-cull": {"frustum_cull": False},
+        "no opacity-cull": {"opacity_cull": False},
     }
     together: dict[str, Any] = {key: value for change in changes.values() for key, value in change.items()}
     changes["all exact switches off"] = together
     changes["extent 3sigma"] = {"extent": "3sigma"}
     changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
+    changes.update({f"sh-tolerance {steps}/255": {"sh_tolerance": steps / 255} for steps in (1, 4, 16)})
+    changes.update({f"sh-angle {degrees:g}": {"sh_angle": degrees} for degrees in (0.5, 2.0)})
+    changes["sh-storage half"] = {"sh_storage": "half"}
     changes.update({f"alpha-min {steps}/255": {"alpha_min": steps / 255} for steps in (2, 4)})
     changes.update({f"transmittance-min {value:g}": {"transmittance_min": value} for value in (1e-3, 1e-2)})
     named.update({name: replace(RasterizerConfig(), **change) for name, change in changes.items()})
@@ -324,6 +331,19 @@ def settings() -> dict[str, RasterizerConfig]:
     for name, config in named.items():
         merged[config] = f"{merged[config]} = {name.removeprefix('preset ')}" if config in merged else name
     return {name: config for config, name in merged.items()}
+
+
+def _of_held_models(config: RasterizerConfig) -> tuple[object, ...]:
+    """The switches of which a model on the device depends."""
+    return config.sh_tolerance, config.sh_angle, config.sh_storage
+
+
+def aside(camera: Camera, gaussians: Gaussians, degrees: float) -> Camera:
+    """The camera moved to its right, so that half of the Gaussians before it turn by more than `degrees`."""
+    depths = gaussians.means @ camera.rotation[2] + camera.translation[2]
+    before = depths[depths > camera.near]
+    step = np.tan(np.radians(degrees)) * float(np.median(before)) if len(before) else 0.0
+    return replace(camera, translation=camera.translation - np.array([step, 0.0, 0.0]))
 
 
 def compare(
@@ -335,10 +355,13 @@ def compare(
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Run time against error of each setting: median time of a frame, the settings taken in turn; its difference from
-    the float64 reference on a crop, and from the exact preset's frame on the whole image."""
+    the float64 reference on a crop, and from the exact preset's frame on the whole image.
+
+    Where colours are kept from frame to frame, they are those of a frame from `aside`: half of them are used again.
+    """
     say = progress or (lambda *_: None)
     candidates = candidates or settings()
-    on_device, work = upload_gaussians(device, subject.gaussians), Workspace(device)
+    work = Workspace(device)
     background = upload(device, np.zeros(3, np.float32))
     camera = subject.camera
     x0, y0, width, height = crop = _crop(camera)
@@ -349,19 +372,29 @@ def compare(
         part = picture[y0 : y0 + height, x0 : x0 + width]
         return Error.of(part, reference), Error.of(picture, exact)
 
-    def draw(rasterizer: Rasterizer) -> Frame:
-        return rasterizer.forward(on_device, camera, background)
+    def draw(rasterizer: Rasterizer, at: Camera = camera) -> Frame:
+        return rasterizer.forward(models[_of_held_models(rasterizer.config)], at, background)
 
+    def prepare(rasterizer: Rasterizer) -> None:
+        if (degrees := rasterizer.config.sh_angle) > 0:
+            draw(rasterizer, aside(camera, subject.gaussians, degrees))
+
+    models: dict[tuple[object, ...], AnyGaussians] = {}
+    for config in (PRESETS["exact"], *candidates.values()):
+        if (kind := _of_held_models(config)) not in models:
+            models[kind] = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
     exact = _picture(draw(Rasterizer(device, PRESETS["exact"], work)))
     rasterizers = {name: Rasterizer(device, config, work) for name, config in candidates.items()}
     found = {}
     for done, (name, rasterizer) in enumerate(rasterizers.items()):
         say("settings", done / len(rasterizers))
+        prepare(rasterizer)
         found[name] = errors(_picture(draw(rasterizer)))
     times: dict[str, list[float]] = {name: [] for name in rasterizers}
     for done in range(repeat):
         say("times", done / repeat)
         for name, rasterizer in rasterizers.items():
+            prepare(rasterizer)
             times[name].append(wall_ms(device, partial(draw, rasterizer)))
     whole = (width, height) == (camera.width, camera.height)
     points = []

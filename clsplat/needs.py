@@ -6,11 +6,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from clsplat.camera import Camera
+from clsplat.config import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.device.layout import PAD, SLOT_ABSOLUTE, SLOT_PLAIN, TILE
 from clsplat.memory import Need, Plan, plan
 from clsplat.stages.loss import strips
-from clsplat.stages.project import tiles_of
+from clsplat.stages.project import KEPT_COLOUR, tiles_of
 from clsplat.stages.sort import scratch_bytes
 
 _SOURCE = 16
@@ -19,19 +20,32 @@ _SMALL = 4096
 """Camera, background, totals and the like."""
 
 
-def plan_frame(device: Device, gaussians: int, coefficients: int, camera: Camera) -> Plan:
-    """Of rendering alone. Raises CapacityError."""
-    return _plan(device, gaussians, coefficients, [camera], training=False, slot=0)
+def plan_frame(device: Device, gaussians: int, floats: int, camera: Camera, config: RasterizerConfig) -> Plan:
+    """Of rendering alone; floats: parameters of a Gaussian (`ShStorage.floats`). Raises CapacityError."""
+    kept = 4 * KEPT_COLOUR if config.sh_angle > 0 else 0
+    return _plan(device, gaussians, floats, [camera], training=False, slot=0, extra=kept + _shown(config))
 
 
-def plan_step(device: Device, gaussians: int, coefficients: int, cameras: Iterable[Camera], *, absolute: bool) -> Plan:
+def plan_step(
+    device: Device,
+    gaussians: int,
+    coefficients: int,
+    cameras: Iterable[Camera],
+    config: RasterizerConfig,
+    *,
+    absolute: bool,
+) -> Plan:
     """Of a training step, from any of the cameras. Raises CapacityError."""
-    slot = SLOT_ABSOLUTE if absolute else SLOT_PLAIN
-    return _plan(device, gaussians, coefficients, cameras, training=True, slot=slot)
+    slot, floats = SLOT_ABSOLUTE if absolute else SLOT_PLAIN, 11 + 3 * coefficients
+    return _plan(device, gaussians, floats, cameras, training=True, slot=slot, extra=_shown(config))
+
+
+def _shown(config: RasterizerConfig) -> int:
+    return 0 if config.frustum_cull and config.opacity_cull else 4
 
 
 def _plan(
-    device: Device, gaussians: int, coefficients: int, cameras: Iterable[Camera], *, training: bool, slot: int
+    device: Device, gaussians: int, floats: int, cameras: Iterable[Camera], *, training: bool, slot: int, extra: int
 ) -> Plan:
     planes = loss = 0
     for camera in cameras:
@@ -43,7 +57,6 @@ def _plan(
         own = 20 * pixels + 12 * tiles_x * tiles_y + ((24 + _SOURCE) * pixels + sums if training else 0)
         loss = max(loss, scratch if training else 0)
         planes = max(planes, own)
-    floats = 11 + 3 * coefficients
     longest = max(gaussians, device.budget // 36)
     need = Need(
         gaussians=gaussians,
@@ -53,5 +66,6 @@ def _plan(
         planes=planes + loss,
         loss=loss,
         scratch=scratch_bytes(device, longest) + _SMALL,
+        extra=extra,
     )
     return plan(need, device.budget, device.max_allocation, device.row_alignment)

@@ -17,7 +17,6 @@ from clsplat.memory import Plan, parse_bytes
 
 if TYPE_CHECKING:
     from clsplat.camera import Camera
-    from clsplat.config import RasterizerConfig
     from clsplat.device.context import Device
     from clsplat.gaussians import Gaussians
     from clsplat.runs import Run
@@ -241,6 +240,7 @@ def render(verb: Render) -> int:
     if verb.alpha and verb.background is not None:
         raise InputError("--alpha and --background exclude each other: with alpha there is no background")
     background = parse_colour(verb.background or "black")
+    verb.rasterizer.check()
     limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
     if not verb.cameras.is_dir():
@@ -250,7 +250,7 @@ def render(verb: Render) -> int:
         raise InputError(f"{verb.cameras}: has no images, expected at least one")
     paths = output_paths(verb.output, list(cameras))
     gaussians = _load_model(verb.model)
-    renderer = Renderer(open_device(verb.device, limit), config=_rasterizer(verb))
+    renderer = Renderer(open_device(verb.device, limit), config=verb.rasterizer)
 
     written = []
     for name, camera in cameras.items():
@@ -268,15 +268,6 @@ def render(verb: Render) -> int:
     if verb.json:
         print(json.dumps(written, indent=2))
     return 0
-
-
-def _rasterizer(verb: Render) -> RasterizerConfig:
-    from clsplat.config import PRESETS
-    from clsplat.runs import Run
-
-    if verb.preset is None and verb.model.is_dir():
-        return Run.open(verb.model).config.rasterizer
-    return PRESETS[verb.preset or "default"]
 
 
 def bench(verb: Bench) -> int:

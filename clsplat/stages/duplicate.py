@@ -41,10 +41,12 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """tile_counts, ranks, first_slots (n): a Gaussian's tiles, and the scans of them as flags and as numbers;
-    visible and pairs: the totals, pairs capped at 2^32 - 1."""
+    """tile_counts, ranks, first_slots (n): a Gaussian's tiles, and the scans of `shown` as flags and of the tiles;
+    shown (n): not 0 where a Gaussian is visible, the tile_counts unless culling is switched off; visible and pairs:
+    the totals, pairs capped at 2^32 - 1."""
 
     tile_counts: DeviceArray
+    shown: DeviceArray
     ranks: DeviceArray
     first_slots: DeviceArray
     visible: int
@@ -64,16 +66,17 @@ class Pairs:
 
 
 @stage("duplicate")
-def count(device: Device, work: Workspace, tile_counts: DeviceArray) -> Counted:
+def count(device: Device, work: Workspace, tile_counts: DeviceArray, shown: DeviceArray | None = None) -> Counted:
     """How many Gaussians are visible, and how many pairs they make; waits for the device."""
     (n,) = tile_counts.shape
+    shown = shown or tile_counts
     ranks = work.array("visible_ranks", (n,), np.uint32)
     visible_total = work.array("visible_total", (1,), np.uint32)
     pairs_total = work.array("pairs_total", (1,), np.uint32)
-    scan(device, work, tile_counts, ranks, visible_total, as_flags=True)
+    scan(device, work, shown, ranks, visible_total, as_flags=True)
     first_slots = work.array("first_slots", (n,), np.uint32)
     scan(device, work, tile_counts, first_slots, pairs_total)
-    return Counted(tile_counts, ranks, first_slots, int(visible_total.get()[0]), int(pairs_total.get()[0]))
+    return Counted(tile_counts, shown, ranks, first_slots, int(visible_total.get()[0]), int(pairs_total.get()[0]))
 
 
 @stage("duplicate")
@@ -93,7 +96,7 @@ def count_band(device: Device, work: Workspace, projected: Projected, tiles: tup
         projected.splats,
         band_counts,
     )
-    return count(device, work, band_counts)
+    return count(device, work, band_counts, projected.shown)
 
 
 @stage("duplicate")
@@ -144,7 +147,7 @@ def duplicate(
         kernels.compact_visible,
         n if visible else 0,
         n,
-        counted.tile_counts,
+        counted.shown,
         counted.ranks,
         splats,
         gaussian_from_visible,
