@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import InputError
 
-WORTHWHILE = 0.1
+WORTHWHILE = 0.5
 """Share of the coefficients above band 0 that has to fall away before each Gaussian has a degree of its own."""
 
 _HALF_MAX = float(np.finfo(np.float16).max)

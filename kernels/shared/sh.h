@@ -60,7 +60,7 @@ static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, f
           c14 * (xx - yy) * weight[14];
 }
 
-// Floats from the bits of finite halves, exactly, also where they are denormal. (vload_half is a call in some drivers.)
+// Floats from the bits of finite halves, exactly, also where they are denormal. (vload_half is a slow call in some drivers.)
 static inline float4 float_from_half(int4 bits) {
   const int4 magnitude = bits & 0x7fff;
   const float4 normal = as_float4((magnitude << 13) + (112 << 23));
@@ -73,18 +73,16 @@ static inline float4 float_from_half(int4 bits) {
 // are stored (RasterizerConfig.sh_storage).
 #ifdef SH_HALF
 typedef ushort shT;
-typedef ushort4 sh4U __attribute__((aligned(2)));
-#define SH_CHANNELS(v) float_from_half(convert_int4(v))
-#define SH_THREE(f) (ushort4)((f)[0], (f)[1], (f)[2], 0)
+static inline float4 sh_channels(__global const shT *f, int last) {
+  return float_from_half((int4)(f[0], f[1], f[2], 0)); // to convert a ushort4 is a call in PoCL 3.0
+}
 #else
 typedef float shT;
 typedef float4 sh4U __attribute__((aligned(4)));
-#define SH_CHANNELS(v) (v)
-#define SH_THREE(f) (float4)((f)[0], (f)[1], (f)[2], 0.0f)
-#endif
 static inline float4 sh_channels(__global const shT *f, int last) {
-  return SH_CHANNELS(last ? SH_THREE(f) : *(__global const sh4U *)f);
+  return last ? (float4)(f[0], f[1], f[2], 0.0f) : *(__global const sh4U *)f;
 }
+#endif
 
 static inline float4 sh_fma(float a, float4 b, float4 c) {
 #ifdef FMA_BY_CONTRACTION
