@@ -11,7 +11,7 @@ from clsplat.device.context import Device
 from clsplat.device.layout import PAD, SLOT_ABSOLUTE, SLOT_PLAIN, TILE
 from clsplat.memory import Need, Plan, plan
 from clsplat.stages.loss import strips
-from clsplat.stages.project import KEPT_COLOUR, tiles_of
+from clsplat.stages.project import tiles_of
 from clsplat.stages.sort import scratch_bytes
 
 _SOURCE = 16
@@ -22,8 +22,7 @@ _SMALL = 4096
 
 def plan_frame(device: Device, gaussians: int, floats: int, camera: Camera, config: RasterizerConfig) -> Plan:
     """Of rendering alone; floats: parameters of a Gaussian (`ShStorage.floats`). Raises CapacityError."""
-    kept = 4 * KEPT_COLOUR if config.sh_angle > 0 else 0
-    return _plan(device, gaussians, floats, [camera], training=False, slot=0, extra=kept + _shown(config))
+    return _plan(device, gaussians, floats, [camera], training=False, slot=0, extra=_shown(config))
 
 
 def plan_step(

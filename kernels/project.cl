@@ -92,8 +92,9 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   direction[2].all = dz;
   IntLanes fresh; // not where nothing is kept yet: that is NaN
   fresh.all = fmaL(cx, cx, fmaL(cy, cy, cz * cz)) <= SH_CHORD2;
+  if (ANYL(valid.all & !fresh.all))
 #endif
-  sh_basis(SH_USED(coefficients), dx, dy, dz, &basis[0].all);
+    sh_basis(SH_USED(coefficients), dx, dy, dz, &basis[0].all);
 
   for (uint lane = 0; lane < lanes_used; ++lane) {
     if (!valid.lane[lane]) continue;

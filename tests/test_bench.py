@@ -309,6 +309,36 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
     assert any(point["on_front"] for point in result["points"])
 
 
+def test_half_of_the_colours_are_kept_where_they_can_be(profiled: Device) -> None:
+    subject = measure.synthetic(300, 70, 50)
+    camera, moved = subject.camera, measure.aside(subject.camera, subject.gaussians, 2.0)
+    ways = [subject.gaussians.means - each.position for each in (camera, moved)]
+    units = [way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways]
+    angles = np.degrees(np.arccos((units[0] * units[1]).sum(axis=1)))
+    assert np.median(angles) == pytest.approx(2.0, rel=0.2)  # less off the axis
+    configs = {
+        "exact": RasterizerConfig(),
+        "angle": RasterizerConfig(sh_angle=2.0),
+        "0.5": RasterizerConfig(sh_angle=0.5),
+    }
+    exact, angle, less = measure.compare(subject, profiled, configs, repeat=2)["points"]
+    errors = [point["against_exact"]["max_abs"] for point in (exact, less, angle)]
+    assert errors[0] == 0
+    assert 0 < errors[1] < errors[2] < 0.1
+
+
+@pytest.mark.usefixtures("_quick")
+def test_a_held_model_is_what_frames_are_measured_of(profiled: Device) -> None:
+    subject = measure.synthetic(300, 50, 40)
+    limits = Limits(1e9, 1e10, 8, 1)
+    sizes = []
+    for storage in ("float", "half"):
+        config = RasterizerConfig(sh_storage=storage)
+        result = measure.bench(subject, profiled, config, repeat=1, limits=limits)
+        sizes.append(result["stages"]["project"]["bytes"])
+    assert sizes[0] - sizes[1] == 300 * 90
+
+
 def test_small_frames_are_compared_with_float64(profiled: Device) -> None:
     result = measure.compare(measure.synthetic(200, 40, 30), profiled, {"exact": PRESETS["exact"]}, repeat=1)
     assert result["error_is_against"] == "the float64 reference"

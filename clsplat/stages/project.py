@@ -40,9 +40,10 @@ class ShStorage:
 
     @property
     def floats(self) -> int:
-        """Of one Gaussian's parameters, in what floats take, rounded up."""
+        """Of one Gaussian's parameters and what is kept beside them, in what floats take, rounded up."""
         rest = 3 * (self.coefficients - 1)
-        return 14 + (-(-rest // 2) if self.half else rest) + (self.degrees is not None)
+        beside = (self.degrees is not None) + (KEPT_COLOUR if self.cache else 0)
+        return 14 + (-(-rest // 2) if self.half else rest) + beside
 
 
 @dataclass(frozen=True, eq=False)
