@@ -321,7 +321,7 @@ def settings() -> dict[str, RasterizerConfig]:
     changes["all exact switches off"] = together
     changes["extent 3sigma"] = {"extent": "3sigma"}
     changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
-    changes.update({f"sh-tolerance {steps}/255": {"sh_tolerance": steps / 255} for steps in (1, 4, 16)})
+    changes.update({f"sh-tolerance {steps}/255": {"sh_tolerance": steps / 255} for steps in (4, 16, 64)})
     changes.update({f"sh-angle {degrees:g}": {"sh_angle": degrees} for degrees in (0.5, 2.0)})
     changes["sh-storage half"] = {"sh_storage": "half"}
     changes.update({f"alpha-min {steps}/255": {"alpha_min": steps / 255} for steps in (2, 4)})

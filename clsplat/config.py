@@ -63,7 +63,8 @@ class RasterizerConfig:
     """Leave out the SH bands above this degree (approximate)."""
     sh_tolerance: float = 0.0
     """Leave out a Gaussian's highest SH bands as long as that changes no channel of its colour by more than this, from
-    any direction: 0 leaves out those that are zero (approximate above 0)."""
+    any direction: 0 leaves out those that are zero (approximate above 0). Bands that none needs are always left out,
+    those that some need only where that is half of all coefficients: from there on it pays."""
     sh_angle: float = 0.0
     """Keep a Gaussian's colour from frame to frame until its direction from the camera has turned by more than this, in
     degrees; 0 works it out in every frame (approximate above 0, where frames depend on those before)."""

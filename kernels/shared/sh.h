@@ -60,7 +60,7 @@ static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, f
           c14 * (xx - yy) * weight[14];
 }
 
-// Floats from the bits of finite halves, exactly, also where they are denormal. (vload_half is a slow call in some drivers.)
+// Floats from the bits of finite halves, exactly, also where they are denormal; vload_half is slower.
 static inline float4 float_from_half(int4 bits) {
   const int4 magnitude = bits & 0x7fff;
   const float4 normal = as_float4((magnitude << 13) + (112 << 23));
@@ -74,7 +74,7 @@ static inline float4 float_from_half(int4 bits) {
 #ifdef SH_HALF
 typedef ushort shT;
 static inline float4 sh_channels(__global const shT *f, int last) {
-  return float_from_half((int4)(f[0], f[1], f[2], 0)); // to convert a ushort4 is a call in PoCL 3.0
+  return float_from_half((int4)(f[0], f[1], f[2], 0)); // a ushort4 takes PoCL 3.0 longer to convert
 }
 #else
 typedef float shT;
