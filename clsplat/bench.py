@@ -12,31 +12,26 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config import PRESETS, DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
-from clsplat.device.buffers import upload
+from clsplat.config import DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
 from clsplat.gaussians import Gaussians
 from clsplat.initialise import from_points, random_points
-from clsplat.needs import plan_step
-from clsplat.rendering import Frame, Rasterizer, Renderer
+from clsplat.rendering import Frame, Renderer, held_sh
 from clsplat.runs import Run, is_run
 from clsplat.scene import Scene, View, load_scene
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.limit import Limits, measure_limits
+from clsplat.stages.project import upload_gaussians
 from clsplat.trainer import Trainer
 from clsplat.undistort import Lens
-
-if TYPE_CHECKING:
-    from clsplat.reference.project import Projected
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -44,12 +39,6 @@ Progress = Callable[[str, float | None], None]
 
 FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")
 """Stages that are measured in a frame; the others in a training step."""
-CROP = 192
-"""Side in pixels of what is compared with the float64 reference, in the middle of the image; smaller ones are whole."""
-ALL_OFF = "all exact switches off"
-"""Of several values that a switch can have, the one that does most."""
-PSNR_MAX = 160.0
-"""PSNR of equal images, which would be infinite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +127,10 @@ def bench(
     say("limits", None)
     limits = limits or measure_limits(device)
     say("frame", None)
-    trainer = _trainer(subject, device, config)
+    trainer = trainer_of(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
+    if held_kind(config) != held_kind(RasterizerConfig()):  # a frame's, not a training step's
+        gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
     def draw() -> Frame:
         return rasterizer.forward(gaussians, subject.camera, trainer.background, backward=False)
@@ -258,7 +249,7 @@ class _Picture(View):
         return self.pixels
 
 
-def _trainer(subject: Subject, device: Device, config: RasterizerConfig) -> Trainer:
+def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Trainer:
     """A trainer whose steps do all the work of a real one and leave the model as it is: every rate is zero."""
     camera = subject.camera
     photograph = subject.photograph
@@ -281,162 +272,16 @@ def _trainer(subject: Subject, device: Device, config: RasterizerConfig) -> Trai
     return Trainer(scene, settings, device, subject.gaussians)
 
 
-def _picture(frame: Frame) -> Float32:
+def picture_of(frame: Frame) -> Float32:
     """(H, W, 3) on the host."""
     camera = frame.camera
     planes: Float32 = frame.blended.image.get()[:, : camera.height, : camera.width]
     return np.ascontiguousarray(planes.transpose(1, 2, 0))
 
 
-@dataclass(frozen=True)
-class Error:
-    """Of a picture: PSNR over all pixels and channels in dB, at most PSNR_MAX, and the largest absolute difference."""
-
-    psnr: float
-    max_abs: float
-
-    @classmethod
-    def of(cls, picture: NDArray[Any], wanted: NDArray[Any]) -> Error:
-        """Compared in float64, not clamped."""
-        difference = np.asarray(picture, np.float64) - np.asarray(wanted, np.float64)
-        mse = float(np.mean(np.square(difference)))
-        psnr = min(-10 * float(np.log10(mse)), PSNR_MAX) if mse > 0 else PSNR_MAX
-        return cls(psnr, float(np.abs(difference).max()))
-
-
-def settings() -> dict[str, RasterizerConfig]:
-    """The points of the plot: presets, and each switch away from its default alone, and the exact ones together."""
-    named = {f"preset {name}": config for name, config in PRESETS.items()}
-    changes: dict[str, dict[str, Any]] = {
-        "extent constant": {"extent": "constant"},
-        "tile-test box": {"tile_test": "box"},
-        "tile-test square": {"tile_test": "square"},
-        "depth-sort pairs": {"depth_sort": "pairs"},
-        "key-bits all": {"key_bits": "all"},
-        "no row-skip": {"row_skip": False},
-        "no column-skip": {"column_skip": False},
-        "no vector-skip": {"vector_skip": False},
-        "no early-stop": {"early_stop": False},
-        "no last-contributor": {"last_contributor": False},
-    }
-    together: dict[str, Any] = {key: value for change in changes.values() for key, value in change.items()}
-    changes[ALL_OFF] = together
-    changes["extent 3sigma"] = {"extent": "3sigma"}
-    changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
-    changes.update({f"alpha-min {steps}/255": {"alpha_min": steps / 255} for steps in (2, 4)})
-    changes.update({f"transmittance-min {value:g}": {"transmittance_min": value} for value in (1e-3, 1e-2)})
-    named.update({name: replace(RasterizerConfig(), **change) for name, change in changes.items()})
-    merged: dict[RasterizerConfig, str] = {}
-    for name, config in named.items():
-        merged[config] = f"{merged[config]} = {name.removeprefix('preset ')}" if config in merged else name
-    return {name: config for config, name in merged.items()}
-
-
-def compare(
-    subject: Subject,
-    device: Device,
-    candidates: dict[str, RasterizerConfig] | None = None,
-    *,
-    repeat: int = 5,
-    progress: Progress | None = None,
-) -> dict[str, Any]:
-    """Run time against error of each setting: median times of a frame and of a training step, the settings taken in
-    turn; the frame's difference from the float64 reference on a crop, and from the exact preset's frame on the whole
-    image. Where both are among the settings, also how many times faster all exact switches together make them."""
-    say = progress or (lambda *_: None)
-    candidates = candidates or settings()
-    trainer, camera = _trainer(subject, device, PRESETS["exact"]), subject.camera
-    model, work = trainer.parameters, trainer.rasterizer.work
-    background = upload(device, np.zeros(3, np.float32))
-    x0, y0, width, height = crop = _crop(camera)
-    say("float64 reference", None)
-    reference = reference_crop(subject.gaussians, camera, crop)
-
-    def errors(picture: Float32) -> tuple[Error, Error]:
-        part = picture[y0 : y0 + height, x0 : x0 + width]
-        return Error.of(part, reference), Error.of(picture, exact)
-
-    def draw(rasterizer: Rasterizer) -> Frame:
-        return rasterizer.forward(model, camera, background, backward=False)
-
-    def step(rasterizer: Rasterizer) -> None:
-        trainer.rasterizer = rasterizer
-        trainer.train_step()
-
-    exact = _picture(draw(trainer.rasterizer))
-    rasterizers = {name: Rasterizer(device, config, work) for name, config in candidates.items()}
-    for rasterizer in rasterizers.values():
-        config = rasterizer.config
-        rasterizer.follow(plan_step(device, model.count, model.coefficients, [camera], config, absolute=False))
-    found = {}
-    for done, (name, rasterizer) in enumerate(rasterizers.items()):
-        say("settings", done / len(rasterizers))
-        found[name] = errors(_picture(draw(rasterizer)))
-        step(rasterizer)
-    times: dict[str, list[tuple[float, float]]] = {name: [] for name in rasterizers}
-    for done in range(repeat):
-        say("times", done / repeat)
-        for name, rasterizer in rasterizers.items():
-            both = wall_ms(device, partial(draw, rasterizer)), wall_ms(device, partial(step, rasterizer))
-            times[name].append(both)
-    medians = {name: tuple(map(statistics.median, zip(*each, strict=True))) for name, each in times.items()}
-    whole = (width, height) == (camera.width, camera.height)
-    points = []
-    for name, (from_reference, from_exact) in found.items():
-        points.append(
-            {
-                "name": name,
-                "frame_ms": medians[name][0],
-                "iteration_ms": medians[name][1],
-                "against_float64": asdict(from_reference),
-                "against_exact": asdict(from_exact),
-                **asdict(from_reference if whole else from_exact),
-            }
-        )
-    on_front = front([(point["frame_ms"], point["psnr"]) for point in points])
-    for point, best in zip(points, on_front, strict=True):
-        point["on_front"] = best
-    on = next((name for name, config in candidates.items() if config == PRESETS["exact"]), None)
-    faster = None
-    if on is not None and ALL_OFF in medians:
-        faster = {key: medians[ALL_OFF][k] / medians[on][k] for k, key in enumerate(("frame", "iteration"))}
-    return {
-        "exact_switches_faster": faster,
-        "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
-        "crop": list(crop),
-        "exact_against_float64": asdict(errors(exact)[0]),
-        "points": points,
-    }
-
-
-def front(points: list[tuple[float, float]]) -> list[bool]:
-    """Of (cost, quality) pairs those that none beats in one without losing in the other."""
-    return [
-        not any(c <= cost and q >= quality and (c < cost or q > quality) for c, q in points) for cost, quality in points
-    ]
-
-
-def _crop(camera: Camera) -> tuple[int, int, int, int]:
-    """x, y, width, height."""
-    width, height = min(CROP, camera.width), min(CROP, camera.height)
-    return (camera.width - width) // 2, (camera.height - height) // 2, width, height
-
-
-def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, int, int]) -> Float64:
-    """A part of the frame in float64, over black, (height, width, 3): the twin, but for Gaussians that cannot reach."""
-    from clsplat.reference.blend import blend
-    from clsplat.reference.project import project
-    from clsplat.reference.render import parameters
-    from clsplat.reference.sort import depth_order
-
-    x, y, width, height = crop
-    projected: Projected = project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
-    means = projected.means2d - (x, y)
-    reach = 1.1 * projected.half_extents + 1.0
-    near = (means > -reach).all(axis=1) & (means < np.array([width, height]) + reach).all(axis=1)
-    order = depth_order(projected.depths, projected.visible & near)
-    image: Float64 = blend(replace(projected, means2d=means), order, width, height).image
-    return image
+def held_kind(config: RasterizerConfig) -> tuple[object, ...]:
+    """The switches of which a model on the device depends."""
+    return config.sh_tolerance, config.sh_angle, config.sh_storage
 
 
 def table(result: dict[str, Any]) -> str:
@@ -478,26 +323,6 @@ def table(result: dict[str, Any]) -> str:
     times = f"frame {result['frame_ms']:.2f} ms, training step {result['iteration_ms']:.2f} ms"
     load = f"load average {result['load_average'] or 0:.1f}"
     return "\n".join([*lines, "", f"{times}: medians of {result['repeat']}; {note}; {load}"])
-
-
-def settings_table(result: dict[str, Any]) -> str:
-    """What `compare` measured, for people."""
-    rows: list[tuple[str, ...]] = [("setting", "ms", "step ms", "PSNR dB", "largest", "front")]
-    for point in result["points"]:
-        psnr = "same bits" if point["max_abs"] == 0 else f"{point['psnr']:.1f}"
-        front_mark = "*" if point["on_front"] else ""
-        times = (f"{point['frame_ms']:.2f}", f"{point['iteration_ms']:.2f}")
-        rows.append((point["name"], *times, psnr, f"{point['max_abs']:.2g}", front_mark))
-    known, (_, _, width, height) = result["exact_against_float64"], result["crop"]
-    note = (
-        f"error against {result['error_is_against']}; exact against float64 on {width}x{height} pixels: "
-        f"{known['psnr']:.1f} dB, {known['max_abs']:.2g}"
-    )
-    lines = [*columns(rows), "", note]
-    if (faster := result["exact_switches_faster"]) is not None:
-        each = f"a frame {faster['frame']:.2f} times faster, a training step {faster['iteration']:.2f} times"
-        lines.append(f"the exact switches together: {each}")
-    return "\n".join(lines)
 
 
 def columns(rows: list[tuple[str, ...]]) -> list[str]:

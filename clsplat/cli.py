@@ -157,7 +157,8 @@ class Render:
     scale: float = 1.0
     """Size relative to the camera's, where neither width nor height is given."""
     preset: Annotated[Preset | None, arg(metavar="exact|default|fast")] = None
-    """Bundle of rasterizer settings; the run's own, or the default's, if not given."""
+    """Bundle of rasterizer settings; the run's own, or the default's, if not given. A --rasterizer flag goes before
+    it."""
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
@@ -166,6 +167,7 @@ class Render:
     If not given: all that the device has."""
     json: Flag = False
     """Print the images written as JSON: name, path, width, height, seconds."""
+    rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
 
 @dataclass(frozen=True)
@@ -295,6 +297,13 @@ def parse(arguments: Sequence[str]) -> Verb:
     elif isinstance(verb, Bench) and verb.preset != "default":
         bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False)
         verb = _tyro(Bench, arguments[1:], prog="clsplat bench", default=bench)
+    elif isinstance(verb, Render) and (verb.preset is not None or verb.model.is_dir()):
+        from clsplat.runs import Run
+
+        bundle = PRESETS[verb.preset] if verb.preset else Run.open(verb.model).config.rasterizer
+        if bundle != RasterizerConfig():
+            render = replace(verb, rasterizer=bundle, alpha=False, json=False)
+            verb = _tyro(Render, arguments[1:], prog="clsplat render", default=render)
     return verb
 
 

@@ -34,9 +34,10 @@ def _check(config: object, prefix: str, rules: tuple[_Rule, ...]) -> None:
 class RasterizerConfig:
     """What the rasterizer skips. The error of each switch, and the time it buys, are in docs/performance.md.
 
-    `extent` "constant", `tile_test`, `depth_sort`, `key_bits`, `last_contributor` and the four `_skip` and `_stop`
-    switches change no bit of a frame; they are there to be measured. The others are approximate where they differ from
-    the default.
+    `extent` "constant", `tile_test`, `depth_sort`, `key_bits`, `last_contributor`, `record_cells` and the `_skip`, `_stop`
+    and `_cull` switches change no bit of a frame; they are there to be measured. The others are approximate where they differ from
+    the default. `sh_tolerance`, `sh_angle` and `sh_storage` are of frames of a model that is held on the device
+    (`Renderer`), not of training.
     """
 
     extent: Literal["opacity", "constant", "3sigma"] = "opacity"
@@ -60,8 +61,27 @@ class RasterizerConfig:
     """Leave a tile when all its pixels are opaque; else go on to its last Gaussian, to no effect."""
     last_contributor: bool = True
     """A tile's gradient begins at the last Gaussian that one of its pixels takes, or at its last, to no effect."""
+    record_cells: bool = True
+    """A tile's gradient visits the cells of pixels in which a Gaussian contributes, as blending has recorded them; else
+    it finds those that the ellipse reaches once more."""
+    frustum_cull: bool = True
+    """Leave out a Gaussian that reaches no tile of the image before its colour is worked out; else it has a colour and
+    a place in the order of depth, to no effect. What is not in front of the near plane has no projection, and is always
+    left out."""
+    opacity_cull: bool = True
+    """Leave out a Gaussian whose opacity is not over alpha-min before its colour is worked out; else as with
+    frustum-cull off, wherever it lies: it has no extent."""
     sh_degree_limit: int = 3
     """Leave out the SH bands above this degree (approximate)."""
+    sh_tolerance: float = 0.0
+    """Leave out a Gaussian's highest SH bands as long as that changes no channel of its colour by more than this, from
+    any direction: 0 leaves out those that are zero (approximate above 0). Bands that none needs are always left out,
+    those that some need only where that is half of all coefficients: from there on it pays."""
+    sh_angle: float = 0.0
+    """Keep a Gaussian's colour from frame to frame until its direction from the camera has turned by more than this, in
+    degrees; 0 works it out in every frame (approximate above 0, where frames depend on those before)."""
+    sh_storage: Literal["float", "half"] = "float"
+    """Keep the SH bands above 0 in 32 or in 16 bits (half is approximate, of half the memory)."""
     alpha_min: float = 1 / 255
     """Skip a Gaussian at a pixel where its alpha is less (approximate above 1/255, less than one 8-bit step)."""
     transmittance_min: float = 1e-4
@@ -72,6 +92,8 @@ class RasterizerConfig:
         """Raise InputError naming the first setting whose value makes no sense."""
         rules: tuple[_Rule, ...] = (
             (("sh_degree_limit",), lambda value: 0 <= value <= 3, "0 to 3"),
+            (("sh_tolerance",), lambda value: 0 <= value <= 1, "0 to 1"),
+            (("sh_angle",), lambda value: 0 <= value <= 90, "0 to 90 degrees"),
             (("alpha_min",), lambda value: 1e-3 <= value < 0.5, "0.001 to 0.5"),
             (("transmittance_min",), lambda value: 1e-6 <= value < 0.5, "1e-6 to 0.5"),
         )

@@ -34,7 +34,8 @@ class Need:
 
     gaussians: how many; floats: parameters of one; models: arrays of so many parameters, 1 for a frame and 4 for a
     step; slot: floats of a pair's slot, 0 for a frame; planes: all that is as large as the image; loss: of which the
-    loss's scratch memory; scratch: whatever is left over; sorts_pairs: whether all pairs are sorted by depth.
+    loss's scratch memory; scratch: whatever is left over; sorts_pairs: whether all pairs are sorted by depth; extra: of
+    each Gaussian, what switches add.
     """
 
     gaussians: int
@@ -45,11 +46,12 @@ class Need:
     loss: int
     scratch: int
     sorts_pairs: bool = False
+    extra: int = 0
 
     @property
     def row(self) -> int:
         """Of each Gaussian, beside its parameters: splat, counts, scans, sort by depth; screen and statistics."""
-        return 64 + 12 + 36 + (20 if self.slot else 0)
+        return 64 + 12 + 36 + (20 if self.slot else 0) + self.extra
 
     @property
     def banded_row(self) -> int:

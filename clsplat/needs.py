@@ -20,9 +20,9 @@ _SMALL = 4096
 """Camera, background, totals and the like."""
 
 
-def plan_frame(device: Device, gaussians: int, coefficients: int, camera: Camera, config: RasterizerConfig) -> Plan:
-    """Of rendering alone. Raises CapacityError."""
-    return _plan(device, gaussians, coefficients, [camera], config, training=False, slot=0)
+def plan_frame(device: Device, gaussians: int, floats: int, camera: Camera, config: RasterizerConfig) -> Plan:
+    """Of rendering alone; floats: parameters of a Gaussian (`ShStorage.floats`). Raises CapacityError."""
+    return _plan(device, gaussians, floats, [camera], config, training=False, slot=0)
 
 
 def plan_step(
@@ -35,14 +35,14 @@ def plan_step(
     absolute: bool,
 ) -> Plan:
     """Of a training step, from any of the cameras. Raises CapacityError."""
-    slot = SLOT_ABSOLUTE if absolute else SLOT_PLAIN
-    return _plan(device, gaussians, coefficients, cameras, config, training=True, slot=slot)
+    slot, floats = SLOT_ABSOLUTE if absolute else SLOT_PLAIN, 11 + 3 * coefficients
+    return _plan(device, gaussians, floats, cameras, config, training=True, slot=slot)
 
 
 def _plan(
     device: Device,
     gaussians: int,
-    coefficients: int,
+    floats: int,
     cameras: Iterable[Camera],
     config: RasterizerConfig,
     *,
@@ -59,7 +59,6 @@ def _plan(
         own = 20 * pixels + 12 * tiles_x * tiles_y + ((24 + _SOURCE) * pixels + sums if training else 0)
         loss = max(loss, scratch if training else 0)
         planes = max(planes, own)
-    floats = 11 + 3 * coefficients
     longest = max(gaussians, device.budget // 36)
     need = Need(
         gaussians=gaussians,
@@ -70,5 +69,6 @@ def _plan(
         loss=loss,
         scratch=scratch_bytes(device, longest) + _SMALL,
         sorts_pairs=config.depth_sort == "pairs",
+        extra=0 if config.frustum_cull and config.opacity_cull else 4,
     )
     return plan(need, device.budget, device.max_allocation, device.row_alignment)

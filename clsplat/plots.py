@@ -30,7 +30,7 @@ def check_plot(path: Path) -> None:
 
 
 def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> None:
-    """What `clsplat.bench.compare` found: milliseconds a frame against PSNR and against the largest difference."""
+    """What `clsplat.tradeoff.compare` found: milliseconds a frame against PSNR and against the largest difference."""
     points = result["points"]
     figure = _figure(title, 2)
     upper, lower = figure.axes

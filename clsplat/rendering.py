@@ -18,6 +18,7 @@ from clsplat.device.switches import kernel_defines
 from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
 from clsplat.needs import plan_frame
+from clsplat.sh import check_half, coefficients_in_use, needed_degrees
 from clsplat.stages.blend import Blended, blend, blend_grad
 from clsplat.stages.duplicate import (
     MAX_PAIRS,
@@ -35,6 +36,7 @@ from clsplat.stages.project import (
     DeviceGaussians,
     HostGaussians,
     Projected,
+    ShStorage,
     Slots,
     add_slots,
     host_gaussians,
@@ -116,14 +118,14 @@ class Rasterizer:
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
         camera_array.set(pack)
         projected = project(device, work, gaussians, camera, camera_array)
-        counted = count(device, work, projected.splats, projected.tile_counts, all_bits=self._all_bits)
+        counted = count(device, work, projected.splats, projected.tile_counts, projected.shown, all_bits=self._all_bits)
         bands = self._plan(projected, counted, tiles_of(camera))
         part = None
         for band in bands:
             del part  # its arrays may have to make room for larger ones
             part = self._part(projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
             size = (camera.width, camera.height)
-            record = backward and len(bands) == 1
+            record = backward and len(bands) == 1 and self.config.record_cells
             blended = blend(device, work, part.lists, projected.splats, background, *size, band, record=record)
         assert part is not None, "an image has a tile"
         return Frame(camera, camera_array, background, projected, bands, part, blended)
@@ -211,8 +213,23 @@ class RenderResult:
     alpha: Float32
 
 
+def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
+    """What the settings keep of the SH of a model that is held to be rendered. Raises InputError where a coefficient
+    is more than a half holds."""
+    half = config.sh_storage == "half"
+    if half:
+        check_half(gaussians.sh)
+    degrees = needed_degrees(gaussians.sh, config.sh_tolerance)
+    coefficients, differ = coefficients_in_use(degrees)
+    return ShStorage(coefficients, degrees if differ else None, half, config.sh_angle > 0)
+
+
 class Renderer:
-    """Renders models; keeps the last one on the device. It can work in another's rasterizer and its memory."""
+    """Renders models; keeps the last one on the device. It can work in another's rasterizer and its memory.
+
+    With `sh_angle` a frame depends on those before it of the same model; not where a model is streamed, as there is no
+    place for its colours then.
+    """
 
     def __init__(
         self,
@@ -225,8 +242,9 @@ class Renderer:
         self._rasterizer = rasterizer or Rasterizer(self.device, config)
         self._rows = 0
         self._background = allocate(self.device, (3,), np.float32)
-        self._held: tuple[Gaussians, AnyGaussians] | None = None
-        self._planned: tuple[int, int, int, int] | None = None
+        self._sh: tuple[Gaussians, ShStorage] | None = None
+        self._held: AnyGaussians | None = None
+        self._planned: tuple[object, ...] | None = None
 
     def render(
         self, gaussians: Gaussians | AnyGaussians, camera: Camera, background: Sequence[float] = (0.0, 0.0, 0.0)
@@ -242,20 +260,21 @@ class Renderer:
 
     def _hold(self, gaussians: Gaussians, camera: Camera) -> AnyGaussians:
         """The model on the device, or on the host if a frame of this size leaves too little room for it."""
-        count, coefficients = len(gaussians), gaussians.sh.shape[1]
-        asked = (count, coefficients, camera.width, camera.height)
+        if self._sh is None or self._sh[0] is not gaussians:
+            self._sh = self._held = None
+            self._sh = (gaussians, held_sh(gaussians, self._rasterizer.config))
+        sh = self._sh[1]
+        asked = (len(gaussians), sh.floats, camera.width, camera.height)
         if self._planned != asked:
-            plan = plan_frame(self.device, count, coefficients, camera, self._rasterizer.config)
+            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, self._rasterizer.config)
             self._rasterizer.follow(plan)
-            if plan.streamed or (self._held is not None and isinstance(self._held[1], HostGaussians)):
+            if plan.streamed or isinstance(self._held, HostGaussians):
                 self._held = None
             self._planned, self._rows = asked, plan.rows if plan.streamed else 0
-        if self._held is None or self._held[0] is not gaussians:
-            self._held = None
+        if self._held is None:
             rows = self._rows
-            held = host_gaussians(gaussians, rows) if rows else upload_gaussians(self.device, gaussians)
-            self._held = (gaussians, held)
-        return self._held[1]
+            self._held = host_gaussians(gaussians, rows, sh) if rows else upload_gaussians(self.device, gaussians, sh)
+        return self._held
 
 
 def render(

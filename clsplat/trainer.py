@@ -107,7 +107,8 @@ class Trainer:
         """How so many Gaussians go through the device's memory, with all of their SH coefficients in the end."""
         coefficients, absolute = (self.config.sh_degree + 1) ** 2, self.config.density.absolute_gradients
         cameras = [view.camera for view in self.scene.views]
-        self.plan = plan_step(self.device, count, coefficients, cameras, self.config.rasterizer, absolute=absolute)
+        rasterizer = self.config.rasterizer
+        self.plan = plan_step(self.device, count, coefficients, cameras, rasterizer, absolute=absolute)
         self.rasterizer.follow(self.plan)
 
     def _set_parameters(

@@ -17,7 +17,6 @@ from clsplat.memory import Plan, parse_bytes
 
 if TYPE_CHECKING:
     from clsplat.camera import Camera
-    from clsplat.config import RasterizerConfig
     from clsplat.device.context import Device
     from clsplat.gaussians import Gaussians
     from clsplat.runs import Run
@@ -241,6 +240,7 @@ def render(verb: Render) -> int:
     if verb.alpha and verb.background is not None:
         raise InputError("--alpha and --background exclude each other: with alpha there is no background")
     background = parse_colour(verb.background or "black")
+    verb.rasterizer.check()
     limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
     if not verb.cameras.is_dir():
@@ -250,7 +250,7 @@ def render(verb: Render) -> int:
         raise InputError(f"{verb.cameras}: has no images, expected at least one")
     paths = output_paths(verb.output, list(cameras))
     gaussians = _load_model(verb.model)
-    renderer = Renderer(open_device(verb.device, limit), config=_rasterizer(verb))
+    renderer = Renderer(open_device(verb.device, limit), config=verb.rasterizer)
 
     written = []
     for name, camera in cameras.items():
@@ -270,18 +270,10 @@ def render(verb: Render) -> int:
     return 0
 
 
-def _rasterizer(verb: Render) -> RasterizerConfig:
-    from clsplat.config import PRESETS
-    from clsplat.runs import Run
-
-    if verb.preset is None and verb.model.is_dir():
-        return Run.open(verb.model).config.rasterizer
-    return PRESETS[verb.preset or "default"]
-
-
 def bench(verb: Bench) -> int:
     """Measure. What can be wrong with the call is found before anything is."""
     from clsplat import bench as measure
+    from clsplat import tradeoff
     from clsplat.device.context import Device, select
     from clsplat.plots import check_plot, plot_settings
     from clsplat.progress import StageProgress
@@ -305,7 +297,7 @@ def bench(verb: Bench) -> int:
         subject = measure.load_subject(verb.source, size, progress)
     result = measure.bench(subject, device, verb.rasterizer, repeat=verb.repeat, progress=progress)
     if verb.plot is not None:
-        result["settings"] = measure.compare(subject, device, repeat=verb.repeat, progress=progress)
+        result["settings"] = tradeoff.compare(subject, device, repeat=verb.repeat, progress=progress)
         size_text = f"{result['width']}x{result['height']}, {result['gaussians']:,} Gaussians"
         title = f"{subject.name}, {size_text}\n{device.name}, {device.driver.split('  ')[0]}"
         plot_settings(verb.plot, result["settings"], title)
@@ -315,7 +307,7 @@ def bench(verb: Bench) -> int:
         return 0
     print(measure.table(result))
     if "settings" in result:
-        print("\n" + measure.settings_table(result["settings"]))
+        print("\n" + tradeoff.settings_table(result["settings"]))
     return 0
 
 

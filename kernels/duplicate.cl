@@ -12,10 +12,10 @@ static inline void band_span(const Ellipse *e, int ty, int tiles_x, int first_ti
   *x1 = max(*x0, min(*x1, end_tile - ty * tiles_x));
 }
 
-// tile_counts (n), ranks (n): scan of the visible, visible and pairs (1): totals -> gaussian_from_visible, depth_keys
+// shown (n), ranks (n): scan of the visible, visible and pairs (1): totals -> gaussian_from_visible, depth_keys
 // (visible); found (4), zeroed before: both totals, the complement of the smallest key, the largest. A positive
 // float's bits sort as it does. A group owns a chunk.
-GROUP __kernel void compact_visible(const uint n, const uint chunk, __global const uint *tile_counts,
+GROUP __kernel void compact_visible(const uint n, const uint chunk, __global const uint *shown,
                                     __global const uint *ranks, __global const float *splats,
                                     __global const uint *visible, __global const uint *pairs,
                                     __global uint *gaussian_from_visible, __global uint *depth_keys,
@@ -26,7 +26,7 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
   uint turned = 0, largest = 0;
   for (uint i = begin + get_local_id(0); i < end; i += ITEMS) {
-    if (tile_counts[i] == 0) continue;
+    if (shown[i] == 0) continue;
     const uint key = as_uint(splats[(size_t)SPLAT_SIZE * i + SPLAT_DEPTH]);
     gaussian_from_visible[ranks[i]] = i;
     depth_keys[ranks[i]] = key;

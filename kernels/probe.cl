@@ -2,6 +2,7 @@
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
+#include "shared/sh.h"
 
 // out[LANES], out[LANES..2 LANES): what fma1 and fmaL make of factor * factor + addend.
 __kernel void probe_fma(__global float *out, const float factor, const float addend) {
@@ -18,4 +19,14 @@ __kernel void probe_elementary(__global const float *x, __global float *out, con
   values[2].all = sigmoidL((floatL)(x[i]));
   values[3].all = exp2L((floatL)(x[i]));
   for (uint k = 0; k < 4; ++k) out[k * n + i] = values[k].lane[0];
+}
+
+// bits (n) of halves -> out (n, 4): as floats, in every lane.
+__kernel void probe_half(__global const ushort *bits, __global float *out) {
+  const uint i = get_global_id(0);
+  const float4 value = float_from_half((int4)(bits[i]));
+  out[4 * i] = value.x;
+  out[4 * i + 1] = value.y;
+  out[4 * i + 2] = value.z;
+  out[4 * i + 3] = value.w;
 }

@@ -9,23 +9,54 @@
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 
+// Whether a Gaussian goes on that reaches no tile (RasterizerConfig.frustum_cull, opacity_cull).
+#if defined(NO_FRUSTUM_CULL)
+#define KEEP_CULLED 1
+#elif defined(NO_OPACITY_CULL)
+#define KEEP_CULLED !opaque.lane[lane]
+#endif
+
 // means (n, 3), quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n, 3),
 // sh_rest (n, coefficients - 1, 3); splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.
+// With KEEP_CULLED shown (n): 1 where a splat is written, also of those that have no tile. Of a model that is held:
+// with SH_DEGREES sh_degrees (n): the highest that is looked at; with SH_CACHE sh_cache (n, 6): the direction that a
+// Gaussian's colour was last worked out for, and the colour.
 __kernel void project(const uint n, const int coefficients, const int tiles_x, const int tiles_y,
                       __constant float *camera, __global const float *means, __global const float *quaternions,
                       __global const float *log_scales, __global const float *opacity_logits,
-                      __global const float *sh_dc, __global const float *sh_rest, __global float *splats,
-                      __global uint *tile_counts) {
+                      __global const float *sh_dc, __global const shT *sh_rest, __global float *splats,
+                      __global uint *tile_counts
+#ifdef KEEP_CULLED
+                      ,
+                      __global uint *shown
+#endif
+#ifdef SH_DEGREES
+                      ,
+                      __global const uchar *sh_degrees
+#endif
+#ifdef SH_CACHE
+                      ,
+                      __global float *sh_cache
+#endif
+) {
   ROWS_OF_ITEM(n)
   for (uint lane = 0; lane < lanes_used; ++lane) tile_counts[first_row + lane] = 0;
+#ifdef KEEP_CULLED
+  for (uint lane = 0; lane < lanes_used; ++lane) shown[first_row + lane] = 0;
+#endif
   Projection p;
   if (!project_gaussians(row, means, quaternions, log_scales, camera, &p)) return;
   const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
   floatL dx = GATHER(means, 3, 0) - camera[CAMERA_PX], dy = GATHER(means, 3, 1) - camera[CAMERA_PY];
   floatL dz = GATHER(means, 3, 2) - camera[CAMERA_PZ];
   const floatL length = sqrt(fmaL(dx, dx, fmaL(dy, dy, dz * dz)));
-  IntLanes valid;
-  valid.all = p.valid & (opacity > ALPHA_MIN) & (length > 0.0f);
+  IntLanes opaque, valid;
+  opaque.all = opacity > ALPHA_MIN;
+#ifdef NO_OPACITY_CULL
+  valid.all = p.valid & (length > 0.0f);
+#else
+  valid.all = p.valid & opaque.all & (length > 0.0f);
+#endif
   if (!ANYL(valid.all)) return;
 
   Lanes field[SPLAT_SIZE];
@@ -45,8 +76,25 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   field[SPLAT_HALF_H].all = sqrt(budget * p.syy) / WHITEN;
   field[SPLAT_DEPTH].all = p.z;
   field[SPLAT_INVERSE_L11].all = 1.0f / l11;
+#ifdef NO_OPACITY_CULL // an extent of less than nothing: no tile, whatever the setting of `extent`
+  field[SPLAT_HALF_W].all = opacity > ALPHA_MIN ? field[SPLAT_HALF_W].all : (floatL)(-1e30f);
+  field[SPLAT_HALF_H].all = opacity > ALPHA_MIN ? field[SPLAT_HALF_H].all : (floatL)(-1e30f);
+#endif
+  dx = dx / length;
+  dy = dy / length;
+  dz = dz / length;
   Lanes basis[16];
-  sh_basis(SH_USED(coefficients), dx / length, dy / length, dz / length, &basis[0].all);
+#ifdef SH_CACHE
+  const floatL cx = dx - GATHER(sh_cache, 6, 0), cy = dy - GATHER(sh_cache, 6, 1), cz = dz - GATHER(sh_cache, 6, 2);
+  Lanes direction[3];
+  direction[0].all = dx;
+  direction[1].all = dy;
+  direction[2].all = dz;
+  IntLanes fresh; // not where nothing is kept yet: that is NaN
+  fresh.all = fmaL(cx, cx, fmaL(cy, cy, cz * cz)) <= SH_CHORD2;
+  if (ANYL(valid.all & !fresh.all))
+#endif
+    sh_basis(SH_USED(coefficients), dx, dy, dz, &basis[0].all);
 
   for (uint lane = 0; lane < lanes_used; ++lane) {
     if (!valid.lane[lane]) continue;
@@ -62,14 +110,39 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
       tile_span(&e, ty, tiles_x, &x0, &x1);
       count += x1 - x0;
     }
+#ifdef KEEP_CULLED
+    if (count == 0 && !(KEEP_CULLED)) continue;
+    shown[i] = 1;
+#else
     if (count == 0) continue;
+#endif
     tile_counts[i] = count;
+#ifdef SH_CACHE
+    __global float *cached = sh_cache + (size_t)6 * i;
+    if (fresh.lane[lane]) {
+      splat[SPLAT_RED] = cached[3];
+      splat[SPLAT_GREEN] = cached[4];
+      splat[SPLAT_BLUE] = cached[5];
+      continue;
+    }
+#endif
+#ifdef SH_DEGREES
+    const int bands = sh_degrees[i] + 1, used = min(SH_USED(coefficients), bands * bands);
+#else
+    const int used = SH_USED(coefficients);
+#endif
     float4 colour = sh_fma(SH_CONSTANT, (float4)(sh_dc[3 * i], sh_dc[3 * i + 1], sh_dc[3 * i + 2], 0.0f), (float4)(0.5f));
-    __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
-    for (int k = 1; k < SH_USED(coefficients); ++k, f += 3)
+    __global const shT *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
+    for (int k = 1; k < used; ++k, f += 3)
       colour = sh_fma(basis[k].lane[lane], sh_channels(f, k + 1 == coefficients), colour);
     splat[SPLAT_RED] = colour.x > 0.0f ? colour.x : 0.0f;
     splat[SPLAT_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
     splat[SPLAT_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
+#ifdef SH_CACHE
+    for (int k = 0; k < 3; ++k) {
+      cached[k] = direction[k].lane[lane];
+      cached[3 + k] = splat[SPLAT_RED + k];
+    }
+#endif
   }
 }

@@ -18,7 +18,7 @@ from pipeline import BACKGROUND, Pipeline, shaped
 from tiny import write_scene
 
 from clsplat import bench as measure
-from clsplat import plots
+from clsplat import plots, tradeoff
 from clsplat.cli import main
 from clsplat.config import PRESETS, RasterizerConfig
 from clsplat.device.context import Device
@@ -213,7 +213,7 @@ def test_nothing_is_recorded_unless_asked(profiled: Device) -> None:
 
 def test_measuring_leaves_the_model_as_it_is(profiled: Device) -> None:
     subject = measure.synthetic(200, 40, 30)
-    trainer = measure._trainer(subject, profiled, RasterizerConfig())
+    trainer = measure.trainer_of(subject, profiled, RasterizerConfig())
     for _ in range(3):
         trainer.train_step()
     after = trainer.gaussians()
@@ -283,12 +283,12 @@ def test_crop_of_the_reference_is_part_of_it(crop: tuple[int, int, int, int]) ->
     gaussians, camera = scenes.NAMED["random_cloud"]()
     whole, _ = reference.render(gaussians, camera)
     x, y, width, height = crop
-    part = measure.reference_crop(gaussians, camera, crop)
+    part = tradeoff.reference_crop(gaussians, camera, crop)
     np.testing.assert_allclose(part, whole[y : y + height, x : x + width], atol=1e-12)
 
 
 def test_settings_hold_every_switch_and_preset() -> None:
-    named = measure.settings()
+    named = tradeoff.settings()
     assert "preset exact = default" in named
     assert set(PRESETS.values()) <= set(named.values())
     for field in RasterizerConfig.__dataclass_fields__:
@@ -302,12 +302,12 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
         "no row-skip": RasterizerConfig(row_skip=False),
         "coarse": RasterizerConfig(alpha_min=8 / 255),
     }
-    result = measure.compare(measure.synthetic(300, 70, 50), profiled, candidates, repeat=1)
+    result = tradeoff.compare(measure.synthetic(300, 70, 50), profiled, candidates, repeat=1)
     exact, rows, coarse = result["points"]
     assert result["error_is_against"] == "the exact preset's frame"
     assert result["crop"] == [11, 1, 48, 48]
     assert exact["max_abs"] == rows["max_abs"] == 0.0
-    assert exact["psnr"] == measure.PSNR_MAX
+    assert exact["psnr"] == tradeoff.PSNR_MAX
     assert 0 < coarse["max_abs"] < 0.3
     assert 20 < coarse["psnr"] < 80
     assert result["exact_against_float64"]["max_abs"] < 2e-5
@@ -318,33 +318,63 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
 
 def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measure, "CROP", 48)
-    every = measure.settings()
-    off = every[measure.ALL_OFF]
+    every = tradeoff.settings()
+    off = every[tradeoff.ALL_OFF]
     for field, value in asdict(off).items():
         if isinstance(value, bool | str):  # the numbers are approximations
             assert value != getattr(RasterizerConfig(), field), field
     assert (off.tile_test, off.alpha_min) == ("square", RasterizerConfig().alpha_min)
     times = iter([50.0, 100.0, 150.0, 210.0])  # of a frame and of a step, on and off
     monkeypatch.setattr(measure, "wall_ms", lambda _device, work: (work(), next(times))[1])
-    candidates = {"preset exact = default": PRESETS["exact"], measure.ALL_OFF: off}
-    result = measure.compare(measure.synthetic(300, 70, 50), profiled, candidates, repeat=1)
+    candidates = {"preset exact = default": PRESETS["exact"], tradeoff.ALL_OFF: off}
+    result = tradeoff.compare(measure.synthetic(300, 70, 50), profiled, candidates, repeat=1)
     assert [(point["frame_ms"], point["iteration_ms"]) for point in result["points"]] == [(50, 100), (150, 210)]
     assert result["points"][1]["max_abs"] == 0.0
     assert result["exact_switches_faster"] == {"frame": 3.0, "iteration": 2.1}
-    text = measure.settings_table(result)
+    text = tradeoff.settings_table(result)
     assert "a frame 3.00 times faster, a training step 2.10 times" in text
     assert "step ms" in text
 
 
+def test_half_of_the_colours_are_kept_where_they_can_be(profiled: Device) -> None:
+    subject = measure.synthetic(300, 70, 50)
+    camera, moved = subject.camera, tradeoff.aside(subject.camera, subject.gaussians, 2.0)
+    ways = [subject.gaussians.means - each.position for each in (camera, moved)]
+    units = [way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways]
+    angles = np.degrees(np.arccos((units[0] * units[1]).sum(axis=1)))
+    assert np.median(angles) == pytest.approx(2.0, rel=0.2)  # less off the axis
+    configs = {
+        "exact": RasterizerConfig(),
+        "angle": RasterizerConfig(sh_angle=2.0),
+        "0.5": RasterizerConfig(sh_angle=0.5),
+    }
+    exact, angle, less = tradeoff.compare(subject, profiled, configs, repeat=2)["points"]
+    errors = [point["against_exact"]["max_abs"] for point in (exact, less, angle)]
+    assert errors[0] == 0
+    assert 0 < errors[1] < errors[2] < 0.1
+
+
+@pytest.mark.usefixtures("_quick")
+def test_a_held_model_is_what_frames_are_measured_of(profiled: Device) -> None:
+    subject = measure.synthetic(300, 50, 40)
+    limits = Limits(1e9, 1e10, 8, 1)
+    sizes = []
+    for storage in ("float", "half"):
+        config = RasterizerConfig(sh_storage=storage)
+        result = measure.bench(subject, profiled, config, repeat=1, limits=limits)
+        sizes.append(result["stages"]["project"]["bytes"])
+    assert sizes[0] - sizes[1] == 300 * 90
+
+
 def test_small_frames_are_compared_with_float64(profiled: Device) -> None:
-    result = measure.compare(measure.synthetic(200, 40, 30), profiled, {"exact": PRESETS["exact"]}, repeat=1)
+    result = tradeoff.compare(measure.synthetic(200, 40, 30), profiled, {"exact": PRESETS["exact"]}, repeat=1)
     assert result["error_is_against"] == "the float64 reference"
     assert result["crop"] == [0, 0, 40, 30]
-    assert 90 < result["points"][0]["psnr"] < measure.PSNR_MAX
+    assert 90 < result["points"][0]["psnr"] < tradeoff.PSNR_MAX
 
 
 def test_front() -> None:
-    assert measure.front([(1, 1), (2, 2), (3, 1), (1, 0), (2, 2)]) == [True, True, False, False, True]
+    assert tradeoff.front([(1, 1), (2, 2), (3, 1), (1, 0), (2, 2)]) == [True, True, False, False, True]
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,8 +18,8 @@ from models import random_gaussians
 
 from clsplat import verbs
 from clsplat.camera import Camera
-from clsplat.cli import Eval, Train, main, parse
-from clsplat.config import RasterizerConfig, TrainConfig
+from clsplat.cli import Eval, Render, Train, main, parse
+from clsplat.config import PRESETS, RasterizerConfig, TrainConfig
 from clsplat.errors import ClsplatError, DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.runs import Run
@@ -410,6 +410,32 @@ def test_render(model: str, scene: str, pipeline: Pipeline, tmp_path: Path, caps
     assert list(pipeline.written) == [record["path"] for record in records]
     assert pipeline.calls == [("render", 4, 32, 24, (0.5, 0, 1)), ("render", 4, 20, 40, (0.5, 0, 1))]
     assert pipeline.written[records[0]["path"]].shape == (24, 32, 3)
+
+
+def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture) -> None:
+    run = tmp_path / "run"
+    own = RasterizerConfig(alpha_min=3 / 255, sh_angle=0.5)
+    Run.create(run, TrainConfig(rasterizer=own))
+
+    def parsed(path: object, *flags: str) -> Render:
+        verb = parse(["render", str(path), "--cameras", "S", "-o", "{name}.png", "--alpha", "--json", *flags])
+        assert isinstance(verb, Render)
+        assert (verb.model, verb.output, verb.alpha, verb.json) == (Path(str(path)), "{name}.png", True, True)
+        return verb
+
+    half = ["--rasterizer.sh-storage", "half", "--rasterizer.no-frustum-cull"]
+    changes: dict[str, Any] = {"sh_storage": "half", "frustum_cull": False}
+    for path, bundle in ((model, RasterizerConfig()), (run, own)):
+        assert parsed(path).rasterizer == bundle
+        assert parsed(path, *half).rasterizer == replace(bundle, **changes)
+        for preset in ("exact", "default", "fast"):
+            assert parsed(path, "--preset", preset).rasterizer == PRESETS[preset]
+            assert parsed(path, *half, "--preset", preset).rasterizer == replace(PRESETS[preset], **changes)
+    assert parsed(run, "--rasterizer.sh-angle", "0").rasterizer == replace(own, sh_angle=0.0)
+    assert main(["render", model, "--cameras", "S", "-o", "{name}.png", "--rasterizer.sh-angle", "-1"]) == 2
+    assert "--rasterizer.sh-angle -1.0: expected 0 to 90 degrees" in error_line(capsys)
+    assert main(["render", str(tmp_path), "--cameras", "S", "-o", "{name}.png"]) == 2
+    assert "not a run" in error_line(capsys)
 
 
 @pytest.mark.parametrize("extension", ["exr", "png"])

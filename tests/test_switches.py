@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -37,6 +38,9 @@ EXACT_OFF = {
     "vectors": RasterizerConfig(vector_skip=False),
     "early stop": RasterizerConfig(early_stop=False),
     "last contributor": RasterizerConfig(last_contributor=False),
+    "record cells": RasterizerConfig(record_cells=False),
+    "frustum cull": RasterizerConfig(frustum_cull=False),
+    "opacity cull": RasterizerConfig(opacity_cull=False),
     "all": RasterizerConfig(
         extent="constant",
         tile_test="square",
@@ -47,6 +51,9 @@ EXACT_OFF = {
         vector_skip=False,
         early_stop=False,
         last_contributor=False,
+        record_cells=False,
+        frustum_cull=False,
+        opacity_cull=False,
     ),
 }
 """Every exact switch turned off, alone and together."""
@@ -78,7 +85,7 @@ def wall() -> scenes.Scene:
     return gaussians, camera
 
 
-NAMES = ("overlap", "saturating", "needles", "cloud", "sheaf", "wall")
+NAMES = ("overlap", "saturating", "needles", "cloud", "sheaf", "wall", "off_frustum")
 
 
 def scene(name: str) -> scenes.Scene:
@@ -152,6 +159,43 @@ def test_exact_switches_change_no_bit(default_device: Device, switch: str, name:
         assert_same_bits(got_gradients[array] + np.float32(0), values + np.float32(0), array)
 
 
+@pytest.mark.parametrize("extent", ["opacity", "constant", "3sigma"])
+@pytest.mark.parametrize("name", ["off_frustum", "sheaf", "cloud"])
+def test_culling_that_is_off_lists_more_gaussians(device: Device, name: str, extent: Literal["opacity"]) -> None:
+    config = RasterizerConfig(extent=extent)
+    default = run(device, name, config)
+    in_front = default.frame.part.counted.visible
+    for frustum, opacity in ((False, True), (True, False), (False, False)):
+        got = run(device, name, replace(config, frustum_cull=frustum, opacity_cull=opacity))
+        assert_same_bits(got.frame.blended.image.get(), default.frame.blended.image.get())
+        projected, counted = got.frame.projected, got.frame.part.counted
+        np.testing.assert_array_equal(projected.tile_counts.get(), default.frame.projected.tile_counts.get())
+        assert projected.shown is not None
+        shown = projected.shown.get() > 0
+        assert counted.visible == shown.sum() == len(got.frame.pairs.gaussian_from_rank.get())
+        gaussians, camera = scene(name)
+        depths = gaussians.means.astype(np.float64) @ camera.rotation[2] + camera.translation[2]
+        # alpha-min itself may fall either way in float32; no scene has an opacity or a depth so near
+        faint = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64))) <= config.alpha_min
+        before = depths > camera.near
+        wanted = default.visible | (before & ~faint & (not frustum)) | (before & faint & (not opacity))
+        np.testing.assert_array_equal(shown, wanted)
+        assert np.isfinite(got.splat("RED", "GREEN", "BLUE")[shown]).all()
+        assert counted.visible > in_front or (frustum and not faint.any()) or (opacity and name == "sheaf")
+
+
+def test_culling_that_is_off_in_bands(default_device: Device) -> None:
+    gaussians, camera = scene("sheaf")
+    frames = []
+    for config in (RasterizerConfig(), RasterizerConfig(frustum_cull=False, opacity_cull=False)):
+        rasterizer = Rasterizer(default_device, config)
+        rasterizer.capacity = 20_000
+        background = upload(default_device, np.array(BACKGROUND, np.float32))
+        frames.append(rasterizer.forward(upload_gaussians(default_device, gaussians), camera, background))
+        assert len(frames[-1].bands) > 1
+    assert_same_bits(frames[1].blended.image.get(), frames[0].blended.image.get())
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (1, 64), (4, 1), (8, 16)], ids=str)
 def test_exact_switches_in_every_shape(default_device: Device, shape: tuple[int, int]) -> None:
     wanted = run(shaped(default_device, *shape), "saturating", RasterizerConfig())
@@ -203,7 +247,16 @@ def test_gradient_of_bands_left_out_is_zero(default_device: Device) -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"sh_degree_limit": 4}, {"alpha_min": 0.0}, {"alpha_min": float("nan")}, {"transmittance_min": 1.0}]
+    "change",
+    [
+        {"sh_degree_limit": 4},
+        {"sh_tolerance": -0.1},
+        {"sh_tolerance": float("nan")},
+        {"sh_angle": 91.0},
+        {"alpha_min": 0.0},
+        {"alpha_min": float("nan")},
+        {"transmittance_min": 1.0},
+    ],
 )
 def test_values_that_make_no_sense(change: dict[str, float]) -> None:
     with pytest.raises(InputError, match="expected"):

@@ -122,6 +122,10 @@ class Device:
         device._switches = switches  # noqa: SLF001  # a copy of our own class
         return device
 
+    def switched(self, *names: str) -> bool:
+        """Whether kernels are built with any of these switches."""
+        return any(name in self._switches for name in names)
+
     def with_memory_limit(self, limit: int | None) -> Device:
         """The same device, queue and kernels, with an account of its own of at most `limit` bytes of buffers."""
         device = copy(self)

@@ -64,15 +64,25 @@ class Pairs:
 
 @stage("duplicate")
 def count(
-    device: Device, work: Workspace, splats: DeviceArray, tile_counts: DeviceArray, *, all_bits: bool = False
+    device: Device,
+    work: Workspace,
+    splats: DeviceArray,
+    tile_counts: DeviceArray,
+    shown: DeviceArray | None = None,
+    *,
+    all_bits: bool = False,
 ) -> Counted:
     """Which Gaussians are visible, how many pairs they make, and by which bits their depths differ, or with `all_bits`
-    32; waits for the device."""
+    32; waits for the device.
+
+    shown (n,): not 0 where a Gaussian is visible; its tile_counts if not given, unless culling is switched off.
+    """
     (n,) = tile_counts.shape
+    shown = shown or tile_counts
     ranks = work.array("visible_ranks", (n,), np.uint32)
     visible_total = work.array("visible_total", (1,), np.uint32)
     pairs_total = work.array("pairs_total", (1,), np.uint32)
-    scan(device, work, tile_counts, ranks, visible_total, as_flags=True)
+    scan(device, work, shown, ranks, visible_total, as_flags=True)
     first_slots = work.array("first_slots", (n,), np.uint32)
     scan(device, work, tile_counts, first_slots, pairs_total)
     gaussian_from_visible = work.array("gaussian_from_visible", (n,), np.uint32)
@@ -87,7 +97,7 @@ def count(
         device.shape.items,
         n,
         chunk,
-        tile_counts,
+        shown,
         ranks,
         splats,
         visible_total,
@@ -135,7 +145,7 @@ def count_band(
         projected.splats,
         band_counts,
     )
-    return count(device, work, projected.splats, band_counts, all_bits=all_bits)
+    return count(device, work, projected.splats, band_counts, projected.shown, all_bits=all_bits)
 
 
 @stage("duplicate")

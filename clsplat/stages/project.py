@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +21,38 @@ from clsplat.gaussians import Gaussians
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 """The parameter groups on the device: as in `Gaussians`, with SH split into its constant and the rest."""
 
+KEPT_COLOUR = 6
+"""Floats of a row of sh_cache: the direction that a colour was worked out for, and the colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShStorage:
+    """How a model that is only rendered keeps its SH.
+
+    coefficients: of each channel; degrees (n,) uint8: the highest of each Gaussian that is looked at, None for all;
+    half: the bands above 0 as float16; cache: colours are kept from frame to frame, as the device's switches say.
+    """
+
+    coefficients: int
+    degrees: NDArray[np.uint8] | None = None
+    half: bool = False
+    cache: bool = False
+
+    @property
+    def floats(self) -> int:
+        """Of one Gaussian's parameters and what is kept beside them, in what floats take, rounded up."""
+        rest = 3 * (self.coefficients - 1)
+        beside = (self.degrees is not None) + (KEPT_COLOUR if self.cache else 0)
+        return 14 + (-(-rest // 2) if self.half else rest) + beside
+
 
 @dataclass(frozen=True, eq=False)
 class DeviceGaussians:
-    """Parameters, or their gradients or moments: arrays by group name, the first axis of each being `count`."""
+    """Parameters, or their gradients or moments: arrays by group name, the first axis of each being `count`.
+
+    Of a model that is held to be rendered (`ShStorage`) sh_rest may be float16, and there may be sh_degrees (count)
+    uint8, and on the device alone sh_cache (count, KEPT_COLOUR), NaN where no colour is kept yet.
+    """
 
     count: int
     coefficients: int
@@ -37,17 +66,17 @@ class DeviceGaussians:
 class HostArray:
     """An array on the host that is used as a DeviceArray is."""
 
-    values: NDArray[np.float32]
+    values: NDArray[Any]
 
     @property
     def shape(self) -> tuple[int, ...]:
         return self.values.shape
 
-    def get(self) -> NDArray[np.float32]:
+    def get(self) -> NDArray[Any]:
         """A copy."""
         return self.values.copy()
 
-    def set(self, values: NDArray[np.float32]) -> None:
+    def set(self, values: NDArray[Any]) -> None:
         """Copy from another array."""
         self.values[...] = values
 
@@ -90,9 +119,10 @@ def parts(
         uploaded = []
         for index, model in enumerate(streamed):
             arrays = {}
-            for name, shape in group_shapes(stop - start, model.coefficients).items():
-                arrays[name] = work.array(f"part{index}_{name}", shape)
-                arrays[name].set(model[name].values[start:stop])
+            for name, whole in model.arrays.items():
+                values = whole.values[start:stop]
+                arrays[name] = work.array(f"part{index}_{name}", values.shape, values.dtype)
+                arrays[name].set(values)
             uploaded.append(DeviceGaussians(stop - start, model.coefficients, arrays))
         yield start, stop, tuple(uploaded)
         if keep:
@@ -122,28 +152,38 @@ def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: b
     return DeviceGaussians(count, coefficients, arrays)
 
 
-def _grouped(gaussians: Gaussians) -> dict[str, NDArray[np.float32]]:
+def _grouped(gaussians: Gaussians, sh: ShStorage) -> dict[str, NDArray[Any]]:
     host = {
         "means": gaussians.means,
         "quaternions": gaussians.quaternions,
         "log_scales": gaussians.log_scales,
         "opacity_logits": gaussians.opacity_logits,
         "sh_dc": gaussians.sh[:, 0],
-        "sh_rest": gaussians.sh[:, 1:],
+        "sh_rest": gaussians.sh[:, 1 : sh.coefficients],
     }
-    return {name: np.ascontiguousarray(values, np.float32) for name, values in host.items()}
+    kinds = {"sh_rest": np.float16 if sh.half else np.float32}
+    arrays = {name: np.ascontiguousarray(values, kinds.get(name, np.float32)) for name, values in host.items()}
+    return arrays if sh.degrees is None else {**arrays, "sh_degrees": sh.degrees}
 
 
-def upload_gaussians(device: Device, gaussians: Gaussians) -> DeviceGaussians:
-    """A copy on the device."""
-    arrays = {name: upload(device, values) for name, values in _grouped(gaussians).items()}
-    return DeviceGaussians(len(gaussians), gaussians.sh.shape[1], arrays)
+def upload_gaussians(device: Device, gaussians: Gaussians, sh: ShStorage | None = None) -> DeviceGaussians:
+    """A copy on the device; sh: to be rendered alone."""
+    sh = sh or ShStorage(gaussians.sh.shape[1])
+    arrays = {name: upload(device, values) for name, values in _grouped(gaussians, sh).items()}
+    if sh.cache:
+        arrays["sh_cache"] = allocate(device, (len(gaussians), KEPT_COLOUR), np.float32)
+        arrays["sh_cache"].fill(np.nan)
+    return DeviceGaussians(len(gaussians), sh.coefficients, arrays)
 
 
-def host_gaussians(gaussians: Gaussians, rows: int) -> HostGaussians:
-    """On the host, to go through the device `rows` at a time. Not a copy: to read, unless the caller may write."""
-    arrays = {name: HostArray(values) for name, values in _grouped(gaussians).items()}
-    return HostGaussians(len(gaussians), gaussians.sh.shape[1], arrays, rows)
+def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None) -> HostGaussians:
+    """On the host, to go through the device `rows` at a time. Not a copy: to read, unless the caller may write.
+
+    sh: to be rendered alone; colours are not kept, that would want a place on the device for all rows.
+    """
+    sh = sh or ShStorage(gaussians.sh.shape[1])
+    arrays = {name: HostArray(values) for name, values in _grouped(gaussians, sh).items()}
+    return HostGaussians(len(gaussians), sh.coefficients, arrays, rows)
 
 
 def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
@@ -210,14 +250,17 @@ def tiles_of(camera: Camera) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """splats (n, SPLAT), tile_counts (n): 0 where culled."""
+    """splats (n, SPLAT), tile_counts (n): 0 where culled; shown (n): 0 where there is no splat, if that is another
+    thing because culling is switched off."""
 
     splats: DeviceArray
     tile_counts: DeviceArray
+    shown: DeviceArray | None = None
 
     def rows(self, start: int, stop: int) -> Projected:
         """Of the Gaussians from start to before stop."""
-        return Projected(self.splats.rows(start, stop), self.tile_counts.rows(start, stop))
+        shown = None if self.shown is None else self.shown.rows(start, stop)
+        return Projected(self.splats.rows(start, stop), self.tile_counts.rows(start, stop), shown)
 
 
 @stage("project")
@@ -229,12 +272,17 @@ def project(
     splats = work.array("splats", (n, len(SPLAT)))
     tile_counts = work.array("tile_counts", (n,), np.uint32)
     tiles_x, tiles_y = tiles_of(camera)
-    projected = Projected(splats, tile_counts)
+    keeps_culled = device.switched("NO_FRUSTUM_CULL", "NO_OPACITY_CULL")
+    projected = Projected(splats, tile_counts, work.array("shown", (n,), np.uint32) if keeps_culled else None)
     for start, stop, (part,) in parts(work, gaussians):
         out = projected.rows(start, stop)
+        extras = [name for name in ("sh_degrees", "sh_cache") if name in part.arrays]
+        defines = {name.upper(): True for name in extras}
+        if part["sh_rest"].dtype == np.float16:
+            defines["SH_HALF"] = True
         launch_items(
             device,
-            device.kernels("project").project,
+            device.kernels("project", **defines).project,
             -(-part.count // device.shape.lanes),
             part.count,
             part.coefficients,
@@ -244,6 +292,8 @@ def project(
             *(part[group] for group in GROUPS),
             out.splats,
             out.tile_counts,
+            *(() if out.shown is None else (out.shown,)),
+            *(part[name] for name in extras),
         )
     return projected
 

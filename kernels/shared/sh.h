@@ -60,11 +60,29 @@ static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, f
           c14 * (xx - yy) * weight[14];
 }
 
-// The three channels of a coefficient; where it is the row's last, four would be too many.
+// Floats from the bits of finite halves, exactly, also where they are denormal; vload_half is slower.
+static inline float4 float_from_half(int4 bits) {
+  const int4 magnitude = bits & 0x7fff;
+  const float4 normal = as_float4((magnitude << 13) + (112 << 23));
+  const float4 tiny = as_float4(magnitude + 0x3f000000) - 0.5f; // steps of 2^-24, as the floats from 0.5 on have
+  const float4 positive = magnitude < 0x400 ? tiny : normal;
+  return as_float4(as_int4(positive) | (bits & 0x8000) << 16);
+}
+
+// The three channels of a coefficient; where it is the row's last, four would be too many. shT: how the bands above 0
+// are stored (RasterizerConfig.sh_storage).
+#ifdef SH_HALF
+typedef ushort shT;
+static inline float4 sh_channels(__global const shT *f, int last) {
+  return float_from_half((int4)(f[0], f[1], f[2], 0)); // a ushort4 takes PoCL 3.0 longer to convert
+}
+#else
+typedef float shT;
 typedef float4 sh4U __attribute__((aligned(4)));
-static inline float4 sh_channels(__global const float *f, int last) {
+static inline float4 sh_channels(__global const shT *f, int last) {
   return last ? (float4)(f[0], f[1], f[2], 0.0f) : *(__global const sh4U *)f;
 }
+#endif
 
 static inline float4 sh_fma(float a, float4 b, float4 c) {
 #ifdef FMA_BY_CONTRACTION
