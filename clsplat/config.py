@@ -34,10 +34,10 @@ def _check(config: object, prefix: str, rules: tuple[_Rule, ...]) -> None:
 class RasterizerConfig:
     """What the rasterizer skips. The error of each switch, and the time it buys, are in docs/performance.md.
 
-    `extent` "constant", `tile_test`, `depth_sort`, `key_bits`, `last_contributor`, `record_cells` and the `_skip`, `_stop`
-    and `_cull` switches change no bit of a frame; they are there to be measured. The others are approximate where they differ from
-    the default. `sh_tolerance`, `sh_angle` and `sh_storage` are of frames of a model that is held on the device
-    (`Renderer`), not of training.
+    `extent` "constant", `tile_test`, `depth_sort`, `key_bits`, `last_contributor`, `record_cells` and the `_skip`,
+    `_stop` and `_cull` switches change no bit of a frame; they are there to be measured. The others are approximate
+    where they differ from the default. `sh_tolerance`, `sh_angle` and `sh_storage` are of frames of a model that is
+    held on the device (`Renderer`), not of training.
     """
 
     extent: Literal["opacity", "constant", "3sigma"] = "opacity"

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -161,7 +161,7 @@ def test_exact_switches_change_no_bit(default_device: Device, switch: str, name:
 
 @pytest.mark.parametrize("extent", ["opacity", "constant", "3sigma"])
 @pytest.mark.parametrize("name", ["off_frustum", "sheaf", "cloud"])
-def test_culling_that_is_off_lists_more_gaussians(device: Device, name: str, extent: Literal["opacity"]) -> None:
+def test_culling_that_is_off_lists_more_gaussians(device: Device, name: str, extent: Any) -> None:
     config = RasterizerConfig(extent=extent)
     default = run(device, name, config)
     in_front = default.frame.part.counted.visible
@@ -172,7 +172,7 @@ def test_culling_that_is_off_lists_more_gaussians(device: Device, name: str, ext
         np.testing.assert_array_equal(projected.tile_counts.get(), default.frame.projected.tile_counts.get())
         assert projected.shown is not None
         shown = projected.shown.get() > 0
-        assert counted.visible == shown.sum() == len(got.frame.pairs.gaussian_from_rank.get())
+        assert counted.visible == shown.sum() == len(counted.gaussian_from_visible.get())
         gaussians, camera = scene(name)
         depths = gaussians.means.astype(np.float64) @ camera.rotation[2] + camera.translation[2]
         # alpha-min itself may fall either way in float32; no scene has an opacity or a depth so near
@@ -181,7 +181,7 @@ def test_culling_that_is_off_lists_more_gaussians(device: Device, name: str, ext
         wanted = default.visible | (before & ~faint & (not frustum)) | (before & faint & (not opacity))
         np.testing.assert_array_equal(shown, wanted)
         assert np.isfinite(got.splat("RED", "GREEN", "BLUE")[shown]).all()
-        assert counted.visible > in_front or (frustum and not faint.any()) or (opacity and name == "sheaf")
+    assert counted.visible > in_front, "with both off"
 
 
 def test_culling_that_is_off_in_bands(default_device: Device) -> None:
