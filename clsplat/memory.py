@@ -34,7 +34,7 @@ class Need:
 
     gaussians: how many; floats: parameters of one; models: arrays of so many parameters, 1 for a frame and 4 for a
     step; slot: floats of a pair's slot, 0 for a frame; planes: all that is as large as the image; loss: of which the
-    loss's scratch memory; scratch: whatever is left over.
+    loss's scratch memory; scratch: whatever is left over; statistics: of each Gaussian, beside the plain ones.
     """
 
     gaussians: int
@@ -44,11 +44,12 @@ class Need:
     planes: int
     loss: int
     scratch: int
+    statistics: int = 0
 
     @property
     def row(self) -> int:
         """Of each Gaussian, beside its parameters: splat, counts, scans, sort by depth; screen and statistics."""
-        return 64 + 12 + 36 + (20 if self.slot else 0)
+        return 64 + 12 + 36 + (20 if self.slot else 0) + self.statistics
 
     @property
     def banded_row(self) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from clsplat.camera import Camera
 from clsplat.device.context import Device
-from clsplat.device.layout import PAD, SLOT_ABSOLUTE, SLOT_PLAIN, TILE
+from clsplat.device.layout import PAD, TILE, SlotFields
 from clsplat.memory import Need, Plan, plan
 from clsplat.stages.loss import strips
 from clsplat.stages.project import tiles_of
@@ -21,17 +21,33 @@ _SMALL = 4096
 
 def plan_frame(device: Device, gaussians: int, coefficients: int, camera: Camera) -> Plan:
     """Of rendering alone. Raises CapacityError."""
-    return _plan(device, gaussians, coefficients, [camera], training=False, slot=0)
+    return _plan(device, gaussians, coefficients, [camera], training=False, slot=0, statistics=0)
 
 
-def plan_step(device: Device, gaussians: int, coefficients: int, cameras: Iterable[Camera], *, absolute: bool) -> Plan:
-    """Of a training step, from any of the cameras. Raises CapacityError."""
-    slot = SLOT_ABSOLUTE if absolute else SLOT_PLAIN
-    return _plan(device, gaussians, coefficients, cameras, training=True, slot=slot)
+def plan_step(
+    device: Device,
+    gaussians: int,
+    coefficients: int,
+    cameras: Iterable[Camera],
+    *,
+    fields: SlotFields,
+    agreement: bool,
+) -> Plan:
+    """Of a training step, from any of the cameras. agreement: whether agreeing views are counted. Raises
+    CapacityError."""
+    statistics = 4 * (5 * fields.contributions + agreement)  # contributions and two epochs of two statistics each
+    return _plan(device, gaussians, coefficients, cameras, training=True, slot=fields.floats, statistics=statistics)
 
 
 def _plan(
-    device: Device, gaussians: int, coefficients: int, cameras: Iterable[Camera], *, training: bool, slot: int
+    device: Device,
+    gaussians: int,
+    coefficients: int,
+    cameras: Iterable[Camera],
+    *,
+    training: bool,
+    slot: int,
+    statistics: int,
 ) -> Plan:
     planes = loss = 0
     for camera in cameras:
@@ -50,6 +66,7 @@ def _plan(
         floats=floats,
         models=4 if training else 1,
         slot=slot,
+        statistics=statistics,
         planes=planes + loss,
         loss=loss,
         scratch=scratch_bytes(device, longest) + _SMALL,
