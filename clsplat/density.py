@@ -91,7 +91,7 @@ def plan(
     """
     n = len(seen)
     useless = _useless(config, step, contributions, n)
-    gradients: Float32 = gradient_sums / np.maximum(seen, np.float32(1))
+    gradients = np.asarray(gradient_sums / np.maximum(seen, 1), np.float32)
     wanted = _wanted(config, step, gradients, agreeing, useless)
     sizes = np.exp(log_scales.max(axis=1))
     large = sizes > config.dense_fraction * extent

@@ -300,8 +300,8 @@ class Trainer:
         config, device = self.config.density, self.device
         if len(plan.rows) == 0:
             raise ClsplatError(
-                f"step {self.step}: every Gaussian was pruned; lower --density.min-opacity, or --density.min-contribution"
-                " if it is set"
+                f"step {self.step}: every Gaussian was pruned; lower --density.min-opacity"
+                + (" or --density.min-contribution" if config.min_contribution > 0 else "")
             )
         gathers = self.plan.gathers
         self._make_plan(len(plan.rows))

@@ -250,8 +250,8 @@ def project(
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """values (pairs, SlotFields.floats), where those of Gaussian i begin at first_slots[i]; without first_slots they are
-    added up already: (n, SlotFields.floats)."""
+    """values (pairs, SlotFields.floats), where those of Gaussian i begin at first_slots[i]; without first_slots they
+    are added up already: (n, SlotFields.floats)."""
 
     values: DeviceArray
     first_slots: DeviceArray | None = None
