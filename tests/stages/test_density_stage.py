@@ -135,3 +135,22 @@ def test_gradients_in_ndc_do_not_depend_on_the_resolution(device: Device) -> Non
     # the low-pass of 0.3 square pixels and the pixel grid weigh more at half the size
     assert sums[0] > 0
     assert sums[1] == pytest.approx(sums[0], rel=0.1)
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_views_over_the_threshold_are_counted(device: Device, count: int) -> None:
+    rng = np.random.default_rng(count)
+    camera = scenes.straight_camera(60, 40)
+    statistics, agreeing = new_statistics(device, count, agreement=True), np.zeros(count)
+    splats = upload(device, np.ones((count, len(SPLAT)), np.float32))
+    for _ in range(3):
+        tiles = rng.integers(0, 2, count).astype(np.uint32)
+        screen = rng.normal(size=(count, 2)).astype(np.float32)
+        norms = np.hypot(30 * screen[:, 0].astype(float), 20 * screen[:, 1].astype(float))
+        assert np.all(np.abs(norms / 25 - 1) > 1e-6), "none is so near that rounding decides"
+        projected = Projected(splats, upload(device, tiles))
+        add_statistics(device, statistics, camera, projected, Screen(upload(device, screen)), 25.0)
+        agreeing += (tiles > 0) & (norms >= 25)
+    assert statistics.agreeing is not None
+    np.testing.assert_array_equal(statistics.agreeing.get(), agreeing)
+    assert new_statistics(device, count).agreeing is None, "not counted unless asked for"
