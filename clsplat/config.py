@@ -177,7 +177,7 @@ class DensityConfig:
     """Steps after which the least contributing are pruned, by prune-fraction."""
     prune_fraction: float = 0.0
     """Share of the Gaussians, those with the smallest sums of blending weights over an epoch, that goes at each of
-    prune-at (Speedy-Splat)."""
+    prune-at (Speedy-Splat): of those whose sums are known, which none are for two epochs after an opacity reset."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
