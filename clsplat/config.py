@@ -16,6 +16,7 @@ from clsplat.errors import InputError
 Background = Literal["black", "white", "random"]
 Preset = Literal["exact", "default", "fast"]
 Schedule = Literal["paper", "short"]
+Growth = Literal["paper", "budget"]
 
 _Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
 """Names of settings, whether a value makes sense (which NaN must not), and what is expected."""
@@ -28,6 +29,12 @@ def _check(config: object, prefix: str, rules: tuple[_Rule, ...]) -> None:
             value = getattr(config, name)
             if not makes_sense(value):
                 raise InputError(f"{prefix}{name.replace('_', '-')} {value}: expected {expected}")
+
+
+def _check_steps(flag: str, steps: tuple[int, ...]) -> None:
+    """Raise InputError unless the steps are from 1 up and in order."""
+    if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
+        raise InputError(f"{flag} {','.join(map(str, steps))}: expected steps from 1 up, in order")
 
 
 @dataclass(frozen=True)
@@ -190,6 +197,22 @@ class DensityConfig:
     """Opacity is lowered to at most this at a reset."""
     max_gaussians: int = 10_000_000
     """Clones and splits stop at this number of Gaussians; where room is short, the largest gradients go first."""
+    views_agree: int = 1
+    """Densify only where the gradient was over the threshold in this many views since the last densification, beside
+    its mean; 1 asks for the mean alone, as the paper. A view that came again counts again."""
+    growth: Growth = "paper"
+    """paper: densify what is over the threshold; budget: the number of Gaussians rises along a parabola to
+    max-gaussians at `stop`, the largest gradients first, whatever the threshold (Taming 3DGS)."""
+    min_contribution: float = 0.0
+    """Gaussians whose blending weights came to less than so many pixels in every view of an epoch are pruned; 0 prunes
+    none."""
+    prune_every: int = 0
+    """Steps between prunings by opacity and contribution alone, which go on after `stop`; 0 for none."""
+    prune_at: tuple[int, ...] = ()
+    """Steps after which the least contributing are pruned, by prune-fraction."""
+    prune_fraction: float = 0.0
+    """Share of the Gaussians, those with the smallest sums of blending weights over an epoch, that goes at each of
+    prune-at (Speedy-Splat): of those whose sums are known, which none are for two epochs after an opacity reset."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
@@ -204,9 +227,24 @@ class DensityConfig:
             (("split_factor",), lambda value: 1 < value < inf, "a finite number, more than 1"),
             (("min_opacity", "opacity_reset_to"), lambda value: 0 < value < 1, "more than 0, less than 1"),
             (("max_screen_radius",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
-            (("max_gaussians",), lambda value: value >= 1, "at least 1"),
+            (("max_gaussians", "views_agree"), lambda value: value >= 1, "at least 1"),
+            (("min_contribution",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
+            (("prune_every",), lambda value: value >= 0, "at least 0"),
+            (("prune_fraction",), lambda value: 0 <= value < 1, "at least 0, less than 1"),
         )
         _check(self, "--density.", rules)
+        _check_steps("--density.prune-at", self.prune_at)
+        if self.prune_fraction > 0 and not self.prune_at:
+            raise InputError(
+                f"--density.prune-fraction {self.prune_fraction}: never used, expected steps in --density.prune-at too"
+            )
+        if self.prune_at and self.prune_fraction == 0:
+            steps = ",".join(map(str, self.prune_at))
+            raise InputError(f"--density.prune-at {steps}: prunes nothing, expected --density.prune-fraction too")
+        if self.growth == "budget" and self.max_gaussians == DensityConfig.max_gaussians:
+            raise InputError(
+                "--density.growth budget: expected --density.max-gaussians too, the number of Gaussians to grow to"
+            )
 
 
 @dataclass(frozen=True)
@@ -258,8 +296,7 @@ class TrainConfig:
         )
         _check(self, "--", rules)
         for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):
-            if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
-                raise InputError(f"--{name} {','.join(map(str, steps))}: expected steps from 1 up, in order")
+            _check_steps(f"--{name}", steps)
         if self.eval_at and self.eval_at[-1] > self.iterations:
             late = next(step for step in self.eval_at if step > self.iterations)
             raise InputError(

@@ -31,6 +31,12 @@ def is_due(config: DensityConfig, step: int) -> bool:
     return config.every > 0 and config.start < step < config.stop and step % config.every == 0
 
 
+def is_pruning_due(config: DensityConfig, step: int) -> bool:
+    """Whether Gaussians are pruned by opacity and contribution after this step, densified or not."""
+    regular = config.prune_every > 0 and step > config.start and step % config.prune_every == 0
+    return regular or step in config.prune_at
+
+
 def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
     """Whether opacities are reset after this step; once early before a white background, as the authors' code."""
     if config.every <= 0 or step >= config.stop:
@@ -38,6 +44,30 @@ def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
     return (config.opacity_reset_every > 0 and step % config.opacity_reset_every == 0) or (
         white and step == config.start
     )
+
+
+def wants_contributions(config: DensityConfig, step: int = 0) -> bool:
+    """Whether what Gaussians contribute is to be known in this step: some pruning at its end or later goes by it."""
+    last_fraction = max(config.prune_at) if config.prune_fraction > 0 and config.prune_at else -1
+    if step <= last_fraction:
+        return True
+    return config.min_contribution > 0 and (config.prune_every > 0 or (config.every > 0 and step < config.stop))
+
+
+def wants_agreement(config: DensityConfig) -> bool:
+    """Whether the views over the threshold are to be counted."""
+    return config.every > 0 and config.views_agree > 1
+
+
+@dataclass(frozen=True, eq=False)
+class Contributions:
+    """What each Gaussian added to the pictures, in pixels; (n,), infinite where it is not known yet.
+
+    totals: over the views of the last whole epoch; largest: of any view in that epoch and the one under way.
+    """
+
+    totals: Float32
+    largest: Float32
 
 
 def plan(
@@ -50,21 +80,20 @@ def plan(
     radii: Float32,
     log_scales: Float32,
     opacity_logits: Float32,
+    agreeing: Float32 | None = None,
+    contributions: Contributions | None = None,
 ) -> Plan:
-    """Clone the small and split the large among those with a large mean gradient; prune the transparent and oversized.
+    """Clone the small and split the large among those with a large mean gradient; prune the transparent, the oversized
+    and what hardly contributes.
 
-    gradient_sums, seen, radii, opacity_logits (n,); log_scales (n, 3); extent: the scene's, in world units.
+    gradient_sums, seen, radii, opacity_logits (n,); log_scales (n, 3); extent: the scene's, in world units; agreeing
+    (n,): views over the threshold, where the settings ask for it; contributions: likewise.
     """
     n = len(seen)
-    gradients = gradient_sums / np.maximum(seen, 1)
+    useless = _useless(config, step, contributions, n)
+    gradients = np.asarray(gradient_sums / np.maximum(seen, 1), np.float32)
+    wanted = _wanted(config, step, gradients, agreeing, useless)
     sizes = np.exp(log_scales.max(axis=1))
-    wanted = gradients >= config.gradient_threshold
-    room = config.max_gaussians - n
-    if wanted.sum() > room:
-        strongest = np.argsort(-gradients, kind="stable")[: max(room, 0)]
-        allowed = np.zeros(n, bool)
-        allowed[strongest] = True
-        wanted &= allowed
     large = sizes > config.dense_fraction * extent
     to_clone, to_split = np.flatnonzero(wanted & ~large), np.flatnonzero(wanted & large)
     kept = np.flatnonzero(~(wanted & large))
@@ -72,14 +101,80 @@ def plan(
     rows = np.concatenate([kept, to_clone, to_split, to_split])
     origin = np.repeat([0, 1, 2], [len(kept), len(to_clone), 2 * len(to_split)])
     sizes_after = np.where(origin == 2, sizes[rows] / config.split_factor, sizes[rows])
-    logit_floor = np.log(config.min_opacity / (1 - config.min_opacity))
-    prune = opacity_logits[rows] < logit_floor
+    prune = _transparent(config, opacity_logits)[rows] | useless[rows]
     if config.opacity_reset_every > 0 and step > config.opacity_reset_every:
         prune |= sizes_after > config.max_world_fraction * extent
         if config.max_screen_radius > 0:
             prune |= (radii[rows] > config.max_screen_radius) & (origin == 0)
     rows, origin = rows[~prune], origin[~prune]
     return Plan(rows.astype(np.uint32), origin > 0, origin == 2)
+
+
+def plan_pruning(
+    config: DensityConfig, step: int, *, opacity_logits: Float32, contributions: Contributions | None = None
+) -> Plan:
+    """Prune the transparent and what hardly contributes, and nothing else; arguments as of `plan`."""
+    gone = _transparent(config, opacity_logits) | _useless(config, step, contributions, len(opacity_logits))
+    rows = np.flatnonzero(~gone).astype(np.uint32)
+    none = np.zeros(len(rows), bool)
+    return Plan(rows, none, none)
+
+
+def _transparent(config: DensityConfig, opacity_logits: Float32) -> NDArray[np.bool_]:
+    transparent: NDArray[np.bool_] = opacity_logits < np.log(config.min_opacity / (1 - config.min_opacity))
+    return transparent
+
+
+def _useless(config: DensityConfig, step: int, contributions: Contributions | None, count: int) -> NDArray[np.bool_]:
+    """Those that no view needs, and at the steps of `prune_at` a fraction of those whose use is known."""
+    useless = np.zeros(count, bool)
+    if contributions is None:
+        return useless
+    if config.min_contribution > 0:
+        useless |= contributions.largest < config.min_contribution
+    if step in config.prune_at:
+        known = np.flatnonzero(np.isfinite(contributions.totals))
+        least = np.argsort(contributions.totals[known], kind="stable")[: int(config.prune_fraction * len(known))]
+        useless[known[least]] = True
+    return useless
+
+
+def _wanted(
+    config: DensityConfig,
+    step: int,
+    gradients: Float32,
+    agreeing: Float32 | None,
+    useless: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Whom to clone or split, by mean gradients (n,)."""
+    n = len(gradients)
+    room = config.max_gaussians - n
+    if config.growth == "budget":
+        wanted = (gradients > 0) & ~useless
+        room = budget(config, step, n) - n
+    else:
+        wanted = (gradients >= config.gradient_threshold) & ~useless
+    if config.views_agree > 1 and agreeing is not None:
+        wanted &= agreeing >= config.views_agree
+    if wanted.sum() > room:
+        strongest = np.argsort(-np.where(wanted, gradients, -1), kind="stable")[: max(room, 0)]
+        allowed = np.zeros(n, bool)
+        allowed[strongest] = True
+        wanted &= allowed
+    return wanted
+
+
+def budget(config: DensityConfig, step: int, count: int) -> int:
+    """How many Gaussians there are to be after this step's densification, when there are `count` before it.
+
+    Taming 3DGS (Mallick et al. 2024): A(x) = (B - S - k N)/N^2 x^2 + k x + S with k = 2 (B - S)/N, from S to B in N
+    densifications. That is B - (B - S)(1 - x/N)^2, so that each brings what is still missing down by a known ratio:
+    what was pruned in between is made up for on the way. The last densification reaches B.
+    """
+    last = (config.stop - 1) // config.every * config.every
+    before = max(step - config.every, config.start)
+    left = ((last - step) / (last - before)) ** 2 if step < last else 0.0
+    return config.max_gaussians - round((config.max_gaussians - count) * left)
 
 
 def split_halves(

@@ -35,7 +35,7 @@ class Need:
     gaussians: how many; floats: parameters of one; models: arrays of so many parameters, 1 for a frame and 4 for a
     step; slot: floats of a pair's slot, 0 for a frame; planes: all that is as large as the image; loss: of which the
     loss's scratch memory; scratch: whatever is left over; sorts_pairs: whether all pairs are sorted by depth; extra: of
-    each Gaussian, what switches add.
+    each Gaussian, what switches and statistics add.
     """
 
     gaussians: int

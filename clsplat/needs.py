@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.context import Device
-from clsplat.device.layout import PAD, SLOT_ABSOLUTE, SLOT_PLAIN, TILE
+from clsplat.device.layout import PAD, TILE, SlotFields
 from clsplat.memory import Need, Plan, plan
 from clsplat.stages.loss import strips
 from clsplat.stages.project import tiles_of
@@ -22,7 +22,7 @@ _SMALL = 4096
 
 def plan_frame(device: Device, gaussians: int, floats: int, camera: Camera, config: RasterizerConfig) -> Plan:
     """Of rendering alone; floats: parameters of a Gaussian (`ShStorage.floats`). Raises CapacityError."""
-    return _plan(device, gaussians, floats, [camera], config, training=False, slot=0)
+    return _plan(device, gaussians, floats, [camera], config, training=False, slot=0, statistics=0)
 
 
 def plan_step(
@@ -32,11 +32,14 @@ def plan_step(
     cameras: Iterable[Camera],
     config: RasterizerConfig,
     *,
-    absolute: bool,
+    fields: SlotFields,
+    agreement: bool,
 ) -> Plan:
-    """Of a training step, from any of the cameras. Raises CapacityError."""
-    slot, floats = SLOT_ABSOLUTE if absolute else SLOT_PLAIN, 11 + 3 * coefficients
-    return _plan(device, gaussians, floats, cameras, config, training=True, slot=slot)
+    """Of a training step, from any of the cameras. agreement: whether agreeing views are counted. Raises
+    CapacityError."""
+    floats = 11 + 3 * coefficients
+    statistics = 4 * (5 * fields.contributions + agreement)  # contributions and two epochs of two statistics each
+    return _plan(device, gaussians, floats, cameras, config, training=True, slot=fields.floats, statistics=statistics)
 
 
 def _plan(
@@ -48,6 +51,7 @@ def _plan(
     *,
     training: bool,
     slot: int,
+    statistics: int,
 ) -> Plan:
     planes = loss = 0
     for camera in cameras:
@@ -69,6 +73,6 @@ def _plan(
         loss=loss,
         scratch=scratch_bytes(device, longest) + _SMALL,
         sorts_pairs=config.depth_sort == "pairs",
-        extra=0 if config.frustum_cull and config.opacity_cull else 4,
+        extra=statistics + (0 if config.frustum_cull and config.opacity_cull else 4),
     )
     return plan(need, device.budget, device.max_allocation, device.row_alignment)

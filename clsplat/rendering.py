@@ -13,7 +13,7 @@ from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device, open_device
-from clsplat.device.layout import SLOT_ABSOLUTE
+from clsplat.device.layout import PLAIN_SLOTS, WIDEST_SLOTS, SlotFields
 from clsplat.device.switches import kernel_defines
 from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
@@ -36,6 +36,7 @@ from clsplat.stages.project import (
     DeviceGaussians,
     HostGaussians,
     Projected,
+    Screen,
     ShStorage,
     Slots,
     add_slots,
@@ -98,7 +99,7 @@ class Rasterizer:
         self.device = device.with_switches(kernel_defines(self.config))
         self.work = work or Workspace(device)
         self._all_bits = self.config.key_bits == "all"
-        self.capacity = min(device.max_allocation // (4 * SLOT_ABSOLUTE), MAX_PAIRS)
+        self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS)
 
     def follow(self, plan: Plan) -> None:
         """Work in as much memory as the plan has for it. Where that is tight, what an earlier plan left goes."""
@@ -155,11 +156,11 @@ class Rasterizer:
         image_gradient: DeviceArray,
         gradients: DeviceGaussians,
         *,
-        absolute: bool = False,
-    ) -> DeviceArray:
-        """Fill the visible rows of `gradients`; returns the gradient of the means on the image, (n, 2), in pixels."""
-        slots = self.pair_gradients(frame, image_gradient, absolute=absolute)
-        return self.row_gradients(gaussians, frame, frame.projected, slots, gradients, absolute=absolute)
+        fields: SlotFields = PLAIN_SLOTS,
+    ) -> Screen:
+        """Fill the visible rows of `gradients`; returns what density control has of the view, as `fields` wants it."""
+        slots = self.pair_gradients(frame, image_gradient, fields=fields)
+        return self.row_gradients(gaussians, frame, frame.projected, slots, gradients, fields=fields)
 
     def row_gradients(
         self,
@@ -169,17 +170,19 @@ class Rasterizer:
         slots: Slots,
         gradients: DeviceGaussians,
         *,
-        absolute: bool = False,
+        fields: SlotFields = PLAIN_SLOTS,
         sh_rest: bool = True,
-    ) -> DeviceArray:
+    ) -> Screen:
         """The gradient of projection, for some rows or all: as `backward`, from what blending's gradient is; that of
         the higher SH bands if asked for."""
-        device, screen = self.device, self.work.array("screen", (gaussians.count, 2))
+        device, n, work = self.device, gaussians.count, self.work
+        contributions = work.array("contributions", (n,)) if fields.contributions else None
+        screen = Screen(work.array("screen", (n, 2)), contributions)
         of = (gaussians, frame.camera_array, projected, slots, gradients, screen)
-        project_grad(device, *of, absolute=absolute, sh_rest=sh_rest)
+        project_grad(device, *of, fields=fields, sh_rest=sh_rest)
         return screen
 
-    def pair_gradients(self, frame: Frame, image_gradient: DeviceArray, *, absolute: bool = False) -> Slots:
+    def pair_gradients(self, frame: Frame, image_gradient: DeviceArray, *, fields: SlotFields = PLAIN_SLOTS) -> Slots:
         """The gradient of blending: of every pair, or with several bands their sums by Gaussian."""
         device, work, projected = self.device, self.work, frame.projected
         sums = None
@@ -194,12 +197,12 @@ class Rasterizer:
                 frame.blended,
                 image_gradient,
                 band,
-                absolute=absolute,
+                fields=fields,
             )
             slots = Slots(values, part.counted.first_slots)
             if len(frame.bands) == 1:
                 return slots
-            sums = add_slots(device, work, part.counted.tile_counts, slots, sums, absolute=absolute)
+            sums = add_slots(device, work, part.counted.tile_counts, slots, sums, fields=fields)
             del part, values, slots  # as in `forward`
         assert sums is not None
         return Slots(sums)

@@ -17,6 +17,7 @@ from clsplat.camera import Camera
 from clsplat.config import PRESETS, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
+from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.gaussians import Gaussians
 from clsplat.needs import plan_step
 from clsplat.rendering import Frame, Rasterizer, held_sh
@@ -138,7 +139,9 @@ def compare(
     rasterizers = {name: Rasterizer(device, config, work) for name, config in candidates.items()}
     for rasterizer in rasterizers.values():
         config = rasterizer.config
-        rasterizer.follow(plan_step(device, model.count, model.coefficients, [camera], config, absolute=False))
+        rasterizer.follow(
+            plan_step(device, model.count, model.coefficients, [camera], config, fields=PLAIN_SLOTS, agreement=False)
+        )
     found = {}
     for done, (name, rasterizer) in enumerate(rasterizers.items()):
         say("settings", done / len(rasterizers))

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat import density
+from clsplat.camera import Camera
 from clsplat.config import TrainConfig
-from clsplat.device.buffers import allocate, upload
+from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
+from clsplat.device.layout import SlotFields
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluate import background_colour
 from clsplat.gaussians import Gaussians
@@ -23,7 +25,15 @@ from clsplat.rendering import Rasterizer
 from clsplat.resolution import sizes_of
 from clsplat.runs import Checkpoint
 from clsplat.stages.adam import adam, updates_sh_rest
-from clsplat.stages.density import NO_ROW, DensityStatistics, add_statistics, gather, new_statistics, widen
+from clsplat.stages.density import (
+    NO_ROW,
+    DensityStatistics,
+    add_contributions,
+    add_statistics,
+    gather,
+    new_statistics,
+    widen,
+)
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.project import (
     GROUPS,
@@ -31,6 +41,8 @@ from clsplat.stages.project import (
     DeviceGaussians,
     HostArray,
     HostGaussians,
+    Projected,
+    Screen,
     allocate_gaussians,
     download_gaussians,
     group_shapes,
@@ -105,10 +117,19 @@ class Trainer:
 
     def _make_plan(self, count: int) -> None:
         """How so many Gaussians go through the device's memory, with all of their SH coefficients in the end."""
-        coefficients, absolute = (self.config.sh_degree + 1) ** 2, self.config.density.absolute_gradients
+        settings = self.config.density
+        coefficients = (self.config.sh_degree + 1) ** 2
         cameras = [view.camera for view in self.scene.views]
-        rasterizer = self.config.rasterizer
-        self.plan = plan_step(self.device, count, coefficients, cameras, rasterizer, absolute=absolute)
+        fields = SlotFields(settings.absolute_gradients, density.wants_contributions(settings))
+        self.plan = plan_step(
+            self.device,
+            count,
+            coefficients,
+            cameras,
+            self.config.rasterizer,
+            fields=fields,
+            agreement=density.wants_agreement(settings),
+        )
         self.rasterizer.follow(self.plan)
 
     def _set_parameters(
@@ -120,7 +141,13 @@ class Trainer:
         self.first = first or self._zeros(count, coefficients)
         self.second = second or self._zeros(count, coefficients)
         self.gradients = self._new_gradients()
-        self.statistics = new_statistics(self.device, count)
+        settings = self.config.density
+        self.statistics = new_statistics(
+            self.device,
+            count,
+            agreement=density.wants_agreement(settings),
+            contributions=density.wants_contributions(settings),
+        )
 
     def _zeros(self, count: int, coefficients: int) -> AnyGaussians:
         if isinstance(self.parameters, HostGaussians):
@@ -162,11 +189,12 @@ class Trainer:
 
         planes = target(device, work, image, self.background)
         frame = self.rasterizer.forward(self.parameters, camera, self.background)
-        channels, absolute = self.plan.channels, config.density.absolute_gradients
+        channels, settings = self.plan.channels, config.density
+        fields = SlotFields(settings.absolute_gradients, density.wants_contributions(settings, self.step))
         result = loss(
             device, work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight, channels
         )
-        slots = self.rasterizer.pair_gradients(frame, result.gradient, absolute=absolute)
+        slots = self.rasterizer.pair_gradients(frame, result.gradient, fields=fields)
         model = (self.parameters, self.first, self.second)
         for start, stop, (parameters, first, second) in parts(work, *model, keep=True):  # one, if the model fits
             projected = frame.projected.rows(start, stop)
@@ -176,14 +204,25 @@ class Trainer:
                 projected,
                 slots.rows(start, stop),
                 self.gradients,
-                absolute=absolute,
+                fields=fields,
                 sh_rest=updates_sh_rest(config.optimiser, self.step),
             )
-            if self.step < config.density.stop:
-                add_statistics(device, self.statistics.rows(start, stop), camera, projected, screen)
+            self._add_statistics(self.statistics.rows(start, stop), view, camera, projected, screen)
             moved = (parameters, self.gradients, first, second)
             adam(device, self.step, self.rates(), config.optimiser, *moved, projected.tile_counts)
         return result
+
+    def _add_statistics(
+        self, statistics: DensityStatistics, view: int, camera: Camera, projected: Projected, screen: Screen
+    ) -> None:
+        """What density control will ask of this step, as long as it will."""
+        settings = self.config.density
+        if self.step < settings.stop:
+            add_statistics(self.device, statistics, camera, projected, screen, settings.gradient_threshold)
+        if screen.contributions is not None and statistics.current is not None:
+            full = self.views[view].camera
+            area = full.width * full.height / (camera.width * camera.height)
+            add_contributions(self.device, statistics.current, projected, screen.contributions, area)
 
     def rates(self) -> dict[str, float]:
         """Learning rate of each group at this step; the means' falls exponentially, all of them in the cooldown."""
@@ -205,6 +244,7 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.queue:
             self.queue = [int(index) for index in self.rng.permutation(len(self.views))]
+            self.statistics = self.statistics.next_epoch()
         return self.queue.pop()
 
     def _background_colour(self) -> NDArray[np.float32]:
@@ -230,14 +270,32 @@ class Trainer:
             return
         if density.is_due(config, self.step):
             self._densify()
+        elif density.is_pruning_due(config, self.step):
+            self._prune()
         if density.is_reset_due(config, self.step, white=self.config.background == "white"):
             logits = self.parameters["opacity_logits"]
             logits.set(density.reset_opacities(config, logits.get()))
             self.first["opacity_logits"].fill(0.0)
             self.second["opacity_logits"].fill(0.0)
+            self.statistics.forget_contributions()
+
+    def _contributions(self) -> density.Contributions | None:
+        current, whole = self.statistics.current, self.statistics.whole
+        if current is None or whole is None:
+            return None
+        return density.Contributions(whole.totals.get(), np.maximum(current.largest.get(), whole.largest.get()))
+
+    def _prune(self) -> None:
+        plan = density.plan_pruning(
+            self.config.density,
+            self.step,
+            opacity_logits=self.parameters["opacity_logits"].get(),
+            contributions=self._contributions(),
+        )
+        self._rearrange(plan, densified=False)
 
     def _densify(self) -> None:
-        config, device = self.config.density, self.device
+        config, agreeing = self.config.density, self.statistics.agreeing
         plan = density.plan(
             config,
             self.step,
@@ -247,12 +305,23 @@ class Trainer:
             radii=self.statistics.radii.get(),
             log_scales=self.parameters["log_scales"].get(),
             opacity_logits=self.parameters["opacity_logits"].get(),
+            agreeing=agreeing.get() if agreeing is not None else None,
+            contributions=self._contributions(),
         )
+        self._rearrange(plan, densified=True)
+
+    def _rearrange(self, plan: density.Plan, *, densified: bool) -> None:
+        """Move the rows of everything as the plan has them."""
+        config, device = self.config.density, self.device
         if len(plan.rows) == 0:
-            raise ClsplatError(f"step {self.step}: every Gaussian was pruned; lower --density.min-opacity")
+            raise ClsplatError(
+                f"step {self.step}: every Gaussian was pruned; lower --density.min-opacity"
+                + (" or --density.min-contribution" if config.min_contribution > 0 else "")
+            )
         gathers = self.plan.gathers
         self._make_plan(len(plan.rows))
         models = [self.parameters, self.first, self.second] if gathers and self.plan.gathers else self._take_down()
+        statistics = self.statistics.moved(plan.rows, plan.fresh, densified=densified)
         del self.statistics
         moment_rows = np.where(plan.fresh, NO_ROW, plan.rows)
         rows_of = (plan.rows, moment_rows, moment_rows)
@@ -266,6 +335,7 @@ class Trainer:
             parameters["means"].set(host["means"])
             parameters["log_scales"].set(host["log_scales"])
         self._set_parameters(*(self._placed(model) for model in (parameters, first, second)))
+        self.statistics.load(statistics)
 
     def gaussians(self) -> Gaussians:
         """The model so far, on the host, with room for the SH degree it is trained to."""
@@ -277,7 +347,7 @@ class Trainer:
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Everything that the steps to come depend on: arrays and JSON state."""
-        arrays = {f"statistics/{name}": getattr(self.statistics, name).get() for name in _STATISTICS}
+        arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         for kind, source in (("parameters", self.parameters), ("first", self.first), ("second", self.second)):
             arrays.update({f"{kind}/{group}": source[group].get() for group in GROUPS})
         return arrays, {"rng": self.rng.bit_generator.state, "queue": self.queue}
@@ -291,9 +361,9 @@ class Trainer:
         del self.parameters, self.first, self.second, self.gradients, self.statistics
         self._make_plan(loaded[0].count)
         self._set_parameters(*(self._placed(model) for model in loaded))
-        self.statistics = DensityStatistics(
-            *(upload(self.device, checkpoint.arrays[f"statistics/{name}"]) for name in _STATISTICS)
-        )
+        prefix = "statistics/"
+        found = {name[len(prefix) :]: each for name, each in checkpoint.arrays.items() if name.startswith(prefix)}
+        self.statistics.load(found)  # what the settings did not ask for before the checkpoint is not known
 
     def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
         host = {group: checkpoint.arrays[f"{kind}/{group}"] for group in GROUPS}
@@ -303,6 +373,3 @@ class Trainer:
                 raise InputError(f"checkpoint of step {checkpoint.step}: {kind}/{group} has shape {host[group].shape}")
         arrays = {group: HostArray(values) for group, values in host.items()}
         return HostGaussians(count, coefficients, arrays, count)
-
-
-_STATISTICS = ("gradient_sums", "seen", "radii")

@@ -3,7 +3,7 @@
 //
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
-// moments of g = alpha * dL/dalpha in (u, v).
+// moments of g = alpha * dL/dalpha in (u, v); with CONTRIBUTIONS there is the sum of the weights too (55).
 #include "shared/math.h"
 #include "shared/splat.h"
 #include "shared/lanes.h"
@@ -113,6 +113,9 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 #ifdef ABSOLUTE_GRADIENTS
     floatL abs_x = zero, abs_y = zero;
 #endif
+#ifdef CONTRIBUTIONS
+    floatL sum_weight = zero;
+#endif
     FOR_CELLS(cell, reach) {
       const int k = cell / ITEMS;
       const floatL dy = my - AT_Y(cell);
@@ -144,6 +147,9 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
         abs_x += fabs(g * (l11 * u));
         abs_y += fabs(g * fmaL((floatL)(l12), u, l22 * v));
 #endif
+#ifdef CONTRIBUTIONS
+        sum_weight += weight;
+#endif
       }
     }
 
@@ -155,6 +161,9 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 #ifdef ABSOLUTE_GRADIENTS
     slot[SLOT_ABSX] = sumL(abs_x);
     slot[SLOT_ABSY] = sumL(abs_y);
+#endif
+#ifdef CONTRIBUTIONS
+    slot[SLOT_WEIGHT] = sumL(sum_weight);
 #endif
 #else
     float values[SLOT_STRIDE];
@@ -170,6 +179,9 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 #ifdef ABSOLUTE_GRADIENTS
     values[SLOT_ABSX] = sumL(abs_x);
     values[SLOT_ABSY] = sumL(abs_y);
+#endif
+#ifdef CONTRIBUTIONS
+    values[SLOT_WEIGHT] = sumL(sum_weight);
 #endif
 #if ITEMS == 1
     for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = values[field];

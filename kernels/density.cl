@@ -2,17 +2,22 @@
 #include "shared/math.h"
 #include "shared/splat.h"
 
+// Norm of the gradient of mean i on the image, (n, 2) in pixels, brought to NDC (docs/gradients.md, equation 43).
+static inline float ndc_norm(__global const float *screen, const size_t i, const float x_scale, const float y_scale) {
+  const float gx = x_scale * screen[2 * i], gy = y_scale * screen[2 * i + 1];
+  return sqrt(fma1(gx, gx, gy * gy));
+}
+
 // One work-item a Gaussian; those with tiles are seen. screen (n, 2): gradient of the mean on the image in pixels;
-// x_scale, y_scale to NDC -> gradient_sums (n): norms added up (docs/gradients.md, equation 43); seen (n): views;
-// radii (n): largest radius in pixels at 3 sigma.
+// x_scale, y_scale to NDC -> gradient_sums (n): norms added up; seen (n): views; radii (n): largest radius in pixels
+// at 3 sigma.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
                                  __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums,
                                  __global float *seen, __global float *radii) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
-  const float gx = x_scale * screen[2 * i], gy = y_scale * screen[2 * i + 1];
-  gradient_sums[i] += sqrt(fma1(gx, gx, gy * gy));
+  gradient_sums[i] += ndc_norm(screen, i, x_scale, y_scale);
   seen[i] += 1.0f;
   __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
   const float l11 = splat[SPLAT_L11] / WHITEN, l12 = splat[SPLAT_L12] / WHITEN, l22 = splat[SPLAT_L22] / WHITEN;
@@ -22,6 +27,27 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   const float middle = 0.5f * (sxx + syy), half_difference = 0.5f * (sxx - syy);
   const float radius = ceil(3.0f * sqrt(middle + sqrt(fma1(half_difference, half_difference, sxy * sxy))));
   radii[i] = radii[i] > radius ? radii[i] : radius;
+}
+
+// As density_statistics -> agreeing (n): views in which the norm is at least the threshold.
+__kernel void view_agreement(const uint n, const float x_scale, const float y_scale, const float threshold,
+                             __global const uint *tile_counts, __global const float *screen,
+                             __global float *agreeing) {
+  const size_t i = get_global_id(0);
+  if (i >= n || tile_counts[i] == 0) return;
+  if (ndc_norm(screen, i, x_scale, y_scale) >= threshold) agreeing[i] += 1.0f;
+}
+
+// contributions (n): of the Gaussians with tiles, in pixels; area: what a pixel counts -> totals, largest (n), over
+// views.
+__kernel void contribution_statistics(const uint n, const float area, __global const uint *tile_counts,
+                                      __global const float *contributions, __global float *totals,
+                                      __global float *largest) {
+  const size_t i = get_global_id(0);
+  if (i >= n || tile_counts[i] == 0) return;
+  const float contribution = area * contributions[i];
+  totals[i] += contribution;
+  largest[i] = largest[i] > contribution ? largest[i] : contribution;
 }
 
 // rows (count): which row of `from` each row of `to` is; 0xffffffff for a row of zeros.

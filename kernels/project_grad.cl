@@ -27,7 +27,8 @@ __kernel void add_slots(const uint n, __global const uint *tile_counts, __global
 // slots (pairs, SLOT_STRIDE), or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE).
 // tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project
 // -> gradients of the parameters (same shapes; rows of Gaussians that are not visible are left as they are) and of
-// the mean on the image: screen (n, 2) in pixels, plain or absolute.
+// the mean on the image: screen (n, 2) in pixels, plain or absolute; with CONTRIBUTIONS what each adds to the image:
+// contributions (n), sums of its blending weights over all pixels (55).
 __kernel void project_grad(const uint n, const int coefficients, __constant float *camera,
                            __global const uint *tile_counts, __global const uint *first_slots,
                            __global const float *slots, __global const float *splats, __global const float *means,
@@ -37,7 +38,11 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
                            __global float *d_means,
                            __global float *d_quaternions, __global float *d_log_scales,
                            __global float *d_opacity_logits, __global float *d_sh_dc, __global float *d_sh_rest,
-                           __global float *screen) {
+                           __global float *screen
+#ifdef CONTRIBUTIONS
+                           , __global float *contributions
+#endif
+) {
   ROWS_OF_ITEM(n)
   Lanes m[SLOT_STRIDE];
   int any = 0;
@@ -179,5 +184,8 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
     for (int k = 0; k < 3; ++k) d_log_scales[3 * i + k] = d_scale[k].lane[lane];
     d_opacity_logits[i] = d_opacity.lane[lane];
     for (int k = 0; k < 2; ++k) screen[2 * i + k] = d_screen[k].lane[lane];
+#ifdef CONTRIBUTIONS
+    contributions[i] = m[SLOT_WEIGHT].lane[lane];
+#endif
   }
 }

@@ -42,6 +42,12 @@ OUT_OF_RANGE = {
     "--density.opacity-reset-every": ("-1",),
     "--density.opacity-reset-to": ("0", "1", "nan"),
     "--density.max-gaussians": ("0", "-1"),
+    "--density.views-agree": ("0", "-1"),
+    "--density.min-contribution": ("-1", "nan", "inf"),
+    "--density.prune-every": ("-1",),
+    "--density.prune-at": ("0", "-5", "9,5", "5,5", "3000"),
+    "--density.prune-fraction": ("-0.1", "1", "nan", "0.5"),
+    "--density.growth": ("budget",),
 }
 
 
@@ -64,7 +70,9 @@ def test_a_value_out_of_range(flag: str, value: str, tmp_path: Path, capsys: Cap
 
 def test_no_number_of_the_optimiser_or_density_control_is_left_out() -> None:
     for config, prefix in ((OptimiserConfig(), "--optimiser."), (DensityConfig(), "--density.")):
-        numbers = [each.name for each in fields(config) if not isinstance(getattr(config, each.name), bool)]
+        numbers = [
+            each.name for each in fields(config) if not isinstance(getattr(config, each.name), bool)
+        ]  # and steps
         flags = {prefix + name.replace("_", "-") for name in numbers}
         assert flags == {flag for flag in OUT_OF_RANGE if flag.startswith(prefix)}
 
@@ -77,6 +85,7 @@ def test_defaults_presets_and_the_ends_of_ranges_make_sense() -> None:
     OptimiserConfig(**still, means_rate_steps=1, beta1=0, beta2=0, cooldown_to=1).check()  # type: ignore[arg-type]
     DensityConfig(every=0, start=0, stop=0, opacity_reset_every=0, dense_fraction=1, max_gaussians=1).check()
     DensityConfig(max_world_fraction=1e9).check()  # prunes none
+    DensityConfig(prune_at=(1, 2), prune_fraction=0.99, growth="budget", max_gaussians=1, views_agree=1).check()
 
 
 def test_an_evaluation_after_the_last_step(tmp_path: Path, capsys: Capture) -> None:

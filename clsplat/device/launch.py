@@ -28,7 +28,13 @@ def _arguments(arguments: tuple[Any, ...]) -> list[Any]:
     return values
 
 
-_UPDATED = {"adam": 4, "density_statistics": 3, "add_slots": 1}
+_UPDATED = {
+    "adam": 4,
+    "density_statistics": 3,
+    "view_agreement": 1,
+    "contribution_statistics": 2,
+    "add_slots": 1,
+}
 """Kernels that read and write some arrays in place: so many of their last ones."""
 
 

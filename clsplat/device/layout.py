@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 TILE = 16
 """Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
@@ -35,10 +37,33 @@ docs/gradients.md times sqrt(log2(e) / 2), so that log2(alpha) = LOG2O - u^2 - v
 in pixels of the ellipse where alpha is 1/255."""
 
 SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
-"""Partial gradients of one (tile, Gaussian) pair; the last two only where absolute gradients are kept."""
+"""Partial gradients of one (tile, Gaussian) pair; the last two only where absolute gradients are kept. Where
+contributions are kept, the sum of the blending weights is behind them all (`kernels/shared/splat.h`: SLOT_WEIGHT)."""
 
 SLOT_PLAIN = SLOT.index("ABSX")
-SLOT_ABSOLUTE = len(SLOT)
+
+
+@dataclass(frozen=True)
+class SlotFields:
+    """What a slot has beside the plain gradients: absolute ones (AbsGS), the contribution to the image."""
+
+    absolute: bool = False
+    contributions: bool = False
+
+    @property
+    def floats(self) -> int:
+        """From one slot to the next."""
+        return (len(SLOT) if self.absolute else SLOT_PLAIN) + self.contributions
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """For the kernels that write and read slots; none for the plain ones."""
+        wanted = {"ABSOLUTE_GRADIENTS": self.absolute, "CONTRIBUTIONS": self.contributions}
+        return {name: True for name, on in wanted.items() if on}
+
+
+PLAIN_SLOTS = SlotFields()
+WIDEST_SLOTS = SlotFields(absolute=True, contributions=True)
 
 
 def header() -> str:

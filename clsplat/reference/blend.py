@@ -44,13 +44,15 @@ class Blended:
 @dataclass(frozen=True, eq=False)
 class BlendGradients:
     """means2d (N, 2), abs_means2d (N, 2): per pixel of displacement, the latter the sum of the absolute values of
-    every image pixel's part; conics (N, 3): by a, b, c; opacities (N,); colors (N, 3)."""
+    every image pixel's part; conics (N, 3): by a, b, c; opacities (N,); colors (N, 3); and contributions (N,), what
+    each adds to the image: eq. (55)."""
 
     means2d: Float64
     abs_means2d: Float64
     conics: Float64
     opacities: Float64
     colors: Float64
+    contributions: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +136,7 @@ def blend_grad(
     background: Sequence[float] | Float64,
     d_image: Float64,
 ) -> BlendGradients:
-    """Eqs. (22) to (29), back to front: d_image (H, W, 3) is dL/dC."""
+    """Eqs. (22) to (29) and (55), back to front: d_image (H, W, 3) is dL/dC."""
     forward = blend(projected, order, width, height, background)
     transmittance = forward.transmittance.copy()
     behind = np.broadcast_to(np.asarray(background, np.float64), (height, width, 3)).copy()
@@ -145,6 +147,7 @@ def blend_grad(
         conics=np.zeros((number, 3)),
         opacities=np.zeros(number),
         colors=np.zeros((number, 3)),
+        contributions=np.zeros(number),
     )
     for position in range(len(order) - 1, -1, -1):
         gaussian = int(order[position])
@@ -160,6 +163,7 @@ def blend_grad(
         color = projected.colors[gaussian]
         transmittance[box] /= 1 - alpha  # now the transmittance in front of this Gaussian
         weight = transmittance[box] * alpha
+        gradients.contributions[gaussian] = weight.sum()
         d_alpha = transmittance[box] * (d_image[box] * (color - behind[box])).sum(axis=2)
         gradients.colors[gaussian] = (weight[:, :, None] * d_image[box]).sum(axis=(0, 1))
         behind[box] += alpha[:, :, None] * (color - behind[box])

@@ -31,11 +31,12 @@ class Forward:
 @dataclass(frozen=True, eq=False)
 class Gradients:
     """parameters: by the name of the array in `Gaussians`, same shapes; means2d and abs_means2d (N, 2): by the
-    mean on the image, in pixels, for density control; visible (N,)."""
+    mean on the image, in pixels, and contributions (N,), also in pixels, for density control; visible (N,)."""
 
     parameters: dict[str, Float64]
     means2d: Float64
     abs_means2d: Float64
+    contributions: Float64
     visible: NDArray[np.bool_]
 
 
@@ -92,4 +93,4 @@ def render_grad(
         d_opacities=screen.opacities,
         d_colors=screen.colors,
     )
-    return Gradients(by_parameter, screen.means2d, screen.abs_means2d, projected.visible)
+    return Gradients(by_parameter, screen.means2d, screen.abs_means2d, screen.contributions, projected.visible)

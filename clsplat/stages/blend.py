@@ -11,7 +11,7 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
-from clsplat.device.layout import SLOT_ABSOLUTE, SLOT_PLAIN, TILE
+from clsplat.device.layout import PLAIN_SLOTS, TILE, SlotFields
 from clsplat.device.profile import stage
 from clsplat.stages.duplicate import Band
 from clsplat.stages.ranges import TileLists
@@ -138,16 +138,16 @@ def blend_grad(
     image_gradient: DeviceArray,
     band: Band | None = None,
     *,
-    absolute: bool = False,
+    fields: SlotFields = PLAIN_SLOTS,
 ) -> DeviceArray:
-    """Partial gradients of every pair of the band at its slot, (pairs, SLOT), from image_gradient (3, rows, stride)."""
+    """Partial gradients of every pair of the band at its slot, (pairs, fields.floats), from image_gradient (3, rows,
+    stride)."""
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]
-    slots = work.array("slots", (pairs, SLOT_ABSOLUTE if absolute else SLOT_PLAIN))
+    slots = work.array("slots", (pairs, fields.floats))
     items = tile_items(device)
     cells = blended.cells_from_sorted
-    wanted = {"ABSOLUTE_GRADIENTS": absolute, "RECORD_CELLS": cells is not None}
-    defines = {name: True for name, needed in wanted.items() if needed}
+    defines = {**fields.defines, **({"RECORD_CELLS": True} if cells else {})}
     launch_groups(
         device,
         device.kernels("blend_grad", ITEMS=items, **defines).blend_grad,

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,31 +14,119 @@ from clsplat.device.buffers import DeviceArray, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.stages.project import AnyGaussians, DeviceGaussians, HostArray, HostGaussians, Projected, group_shapes
+from clsplat.stages.project import (
+    AnyGaussians,
+    DeviceGaussians,
+    HostArray,
+    HostGaussians,
+    Projected,
+    Screen,
+    group_shapes,
+)
+
+Float32 = NDArray[np.float32]
 
 NO_ROW = np.uint32(0xFFFFFFFF)
 """In a list of rows: a row of zeros."""
 
 
 @dataclass(frozen=True, eq=False)
+class EpochContributions:
+    """What each Gaussian added to the pictures of an epoch, in pixels: totals (n,), over its views; largest (n,), of
+    one of them. Infinite for Gaussians that were not there, or not looked at, from its first view on."""
+
+    totals: DeviceArray
+    largest: DeviceArray
+
+    def rows(self, start: int, stop: int) -> EpochContributions:
+        """Of the Gaussians from start to before stop."""
+        return EpochContributions(self.totals.rows(start, stop), self.largest.rows(start, stop))
+
+
+@dataclass(frozen=True, eq=False)
 class DensityStatistics:
-    """Since the last densification, per Gaussian: gradient_sums, seen (views), radii (largest, in pixels); (n,)."""
+    """Since the last densification, per Gaussian: gradient_sums, seen (views), radii (largest, in pixels), agreeing
+    (views with a gradient over the threshold; None where they are not counted); (n,).
+
+    Contributions are of epochs of the training views, whenever Gaussians were densified: of the one under way and of
+    the last whole one; None where nothing goes by them.
+    """
 
     gradient_sums: DeviceArray
     seen: DeviceArray
     radii: DeviceArray
+    agreeing: DeviceArray | None = None
+    current: EpochContributions | None = None
+    whole: EpochContributions | None = None
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
         """Of the Gaussians from start to before stop."""
-        return DensityStatistics(*(a.rows(start, stop) for a in (self.gradient_sums, self.seen, self.radii)))
+        parts = {
+            each.name: array.rows(start, stop)
+            for each in fields(self)
+            if (array := getattr(self, each.name)) is not None
+        }
+        return DensityStatistics(**parts)
+
+    def named(self) -> dict[str, DeviceArray]:
+        """Every array by its name in a checkpoint."""
+        found = {}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, EpochContributions):
+                found.update({f"{each.name}_totals": value.totals, f"{each.name}_largest": value.largest})
+            elif value is not None:
+                found[each.name] = value
+        return found
+
+    def moved(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_], *, densified: bool) -> dict[str, Float32]:
+        """What goes on, on the host by `named`, when row j becomes what row rows[j] was: contributions, of fresh rows
+        not known; and everything else if nothing was densified."""
+        going_on = self.named()
+        if densified:
+            going_on = {name: array for name, array in going_on.items() if name.startswith(("current_", "whole_"))}
+        values = {name: array.get()[rows] for name, array in going_on.items()}
+        for each in values.values():
+            each[fresh] = np.inf
+        return values
+
+    def load(self, values: Mapping[str, Float32]) -> None:
+        """Take what there is of `named` from the host."""
+        for name, array in self.named().items():
+            if name in values:
+                array.set(values[name])
+
+    def forget_contributions(self) -> None:
+        """Nothing is known of what Gaussians contribute, until the next epoch is over."""
+        for epoch in (self.current, self.whole):
+            if epoch is not None:
+                epoch.totals.fill(np.inf)
+                epoch.largest.fill(np.inf)
+
+    def next_epoch(self) -> DensityStatistics:
+        """The same with the epoch under way as the last whole one, and a new one that begins."""
+        if self.current is None or self.whole is None:
+            return self
+        self.whole.totals.fill(0.0)
+        self.whole.largest.fill(0.0)
+        return replace(self, current=self.whole, whole=self.current)
 
 
-def new_statistics(device: Device, count: int) -> DensityStatistics:
-    """Zeros for `count` Gaussians."""
-    arrays = [allocate(device, (count,), np.float32) for _ in range(3)]
-    for array in arrays:
-        array.fill(0.0)
-    return DensityStatistics(*arrays)
+def new_statistics(
+    device: Device, count: int, *, agreement: bool = False, contributions: bool = False
+) -> DensityStatistics:
+    """For `count` Gaussians of which nothing is known yet: zeros, contributions infinite."""
+
+    def filled(value: float) -> DeviceArray:
+        array = allocate(device, (count,), np.float32)
+        array.fill(value)
+        return array
+
+    def unknown() -> EpochContributions | None:
+        return EpochContributions(filled(np.inf), filled(np.inf)) if contributions else None
+
+    agreeing = filled(0.0) if agreement else None
+    return DensityStatistics(filled(0.0), filled(0.0), filled(0.0), agreeing, unknown(), unknown())
 
 
 @stage("statistics")
@@ -46,23 +135,58 @@ def add_statistics(
     statistics: DensityStatistics,
     camera: Camera,
     projected: Projected,
-    screen: DeviceArray,
+    screen: Screen,
+    threshold: float = 0.0,
 ) -> None:
-    """Add one view: the norm of each visible mean's gradient, from pixels to NDC, as the paper's threshold wants."""
+    """Add one view: the norm of each visible mean's gradient, from pixels to NDC, as the paper's threshold wants; where
+    agreeing views are counted, whether that is at least the threshold."""
     n = projected.tile_counts.shape[0]
+    kernels = device.kernels("density")
+    to_ndc = (0.5 * camera.width, 0.5 * camera.height)
     launch_items(
         device,
-        device.kernels("density").density_statistics,
+        kernels.density_statistics,
         n,
         n,
-        0.5 * camera.width,
-        0.5 * camera.height,
+        *to_ndc,
         projected.tile_counts,
-        screen,
+        screen.gradients,
         projected.splats,
         statistics.gradient_sums,
         statistics.seen,
         statistics.radii,
+    )
+    if statistics.agreeing is not None:
+        launch_items(
+            device,
+            kernels.view_agreement,
+            n,
+            n,
+            *to_ndc,
+            threshold,
+            projected.tile_counts,
+            screen.gradients,
+            statistics.agreeing,
+        )
+
+
+@stage("statistics")
+def add_contributions(
+    device: Device, epoch: EpochContributions, projected: Projected, contributions: DeviceArray, area: float
+) -> None:
+    """Add what one view's Gaussians contributed, (n,), to the epoch under way. area: what a pixel counts, as with less
+    than the full resolution it is several."""
+    n = projected.tile_counts.shape[0]
+    launch_items(
+        device,
+        device.kernels("density").contribution_statistics,
+        n,
+        n,
+        area,
+        projected.tile_counts,
+        contributions,
+        epoch.totals,
+        epoch.largest,
     )
 
 

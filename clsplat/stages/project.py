@@ -14,7 +14,7 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
-from clsplat.device.layout import CAMERA, SPLAT, TILE
+from clsplat.device.layout import CAMERA, PLAIN_SLOTS, SPLAT, TILE, SlotFields
 from clsplat.device.profile import stage
 from clsplat.gaussians import Gaussians
 
@@ -300,8 +300,8 @@ def project(
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """values (pairs, SLOT), where those of Gaussian i begin at first_slots[i]; without first_slots they are added up
-    already: (n, SLOT)."""
+    """values (pairs, SlotFields.floats), where those of Gaussian i begin at first_slots[i]; without first_slots they
+    are added up already: (n, SlotFields.floats)."""
 
     values: DeviceArray
     first_slots: DeviceArray | None = None
@@ -313,6 +313,15 @@ class Slots:
         return Slots(self.values, self.first_slots.rows(start, stop))
 
 
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """Of one view, in rows of the visible: gradients (n, 2) of the means on the image, in pixels; contributions (n,),
+    the sums of blending weights over the image's pixels, or None."""
+
+    gradients: DeviceArray
+    contributions: DeviceArray | None = None
+
+
 @stage("project_grad")
 def add_slots(
     device: Device,
@@ -321,17 +330,16 @@ def add_slots(
     slots: Slots,
     sums: DeviceArray | None,
     *,
-    absolute: bool = False,
+    fields: SlotFields = PLAIN_SLOTS,
 ) -> DeviceArray:
-    """Add one band's slots to the sums by Gaussian (n, SLOT), which begin as None; bands have to come in order."""
+    """Add one band's slots to the sums by Gaussian (n, floats), which begin as None; bands have to come in order."""
     (n,) = tile_counts.shape
     if sums is None:
         sums = work.array("slot_sums", (n, slots.values.shape[1]))
         sums.fill(0.0)
-    defines = {"ABSOLUTE_GRADIENTS": True} if absolute else {}
     launch_items(
         device,
-        device.kernels("project_grad", **defines).add_slots,
+        device.kernels("project_grad", **fields.defines).add_slots,
         n if slots.values.shape[0] else 0,
         n,
         tile_counts,
@@ -350,19 +358,15 @@ def project_grad(
     projected: Projected,
     slots: Slots,
     gradients: DeviceGaussians,
-    screen: DeviceArray,
+    screen: Screen,
     *,
-    absolute: bool = False,
+    fields: SlotFields = PLAIN_SLOTS,
     sh_rest: bool = True,
 ) -> None:
-    """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` (n, 2) from the pairs'
-    slots."""
-    defines = {
-        "ABSOLUTE_GRADIENTS": absolute,
-        "ADDED_UP": slots.first_slots is None,
-        "NO_SH_REST": not sh_rest and gaussians.coefficients > 1,
-    }
-    defines = {name: True for name, wanted in defines.items() if wanted}
+    """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` from the pairs' slots,
+    which have `fields`."""
+    wanted = {"ADDED_UP": slots.first_slots is None, "NO_SH_REST": not sh_rest and gaussians.coefficients > 1}
+    defines = {**fields.defines, **{name: True for name, needed in wanted.items() if needed}}
     n = gaussians.count
     launch_items(
         device,
@@ -377,5 +381,6 @@ def project_grad(
         projected.splats,
         *(gaussians[group] for group in GROUPS),
         *(gradients[group] for group in GROUPS),
-        screen,
+        screen.gradients,
+        *([screen.contributions] if fields.contributions else []),
     )

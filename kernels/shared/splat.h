@@ -4,9 +4,15 @@
 #define WHITEN 0.84932180028801904f
 #define INVERSE_WHITEN2 1.38629436111989062f // 1 / WHITEN^2 = 2 ln 2
 
-// Floats from one pair's slot to the next.
+// Floats from one pair's slot to the next. The contribution, where it is kept, is behind the gradients.
 #ifdef ABSOLUTE_GRADIENTS
-#define SLOT_STRIDE SLOT_SIZE
+#define SLOT_GRADIENTS SLOT_SIZE
 #else
-#define SLOT_STRIDE SLOT_PLAIN
+#define SLOT_GRADIENTS SLOT_PLAIN
+#endif
+#ifdef CONTRIBUTIONS
+#define SLOT_WEIGHT SLOT_GRADIENTS
+#define SLOT_STRIDE (SLOT_GRADIENTS + 1)
+#else
+#define SLOT_STRIDE SLOT_GRADIENTS
 #endif

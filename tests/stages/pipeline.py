@@ -14,10 +14,16 @@ from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
-from clsplat.device.layout import SPLAT, TILE
+from clsplat.device.layout import SPLAT, TILE, SlotFields
 from clsplat.gaussians import Gaussians
 from clsplat.rendering import Frame, Rasterizer
-from clsplat.stages.project import DeviceGaussians, allocate_gaussians, download_gaussians, upload_gaussians
+from clsplat.stages.project import (
+    DeviceGaussians,
+    Screen,
+    allocate_gaussians,
+    download_gaussians,
+    upload_gaussians,
+)
 
 BACKGROUND = (0.1, 0.2, 0.3)
 
@@ -85,12 +91,15 @@ class Pipeline:
         self, d_image: NDArray[np.float64], *, absolute: bool = False
     ) -> tuple[Gaussians, NDArray[np.float32]]:
         """Gradients of the parameters and of the means on the image from dL/dimage (H, W, 3)."""
+        gradients, screen = self.screened(d_image, SlotFields(absolute=absolute))
+        return gradients, screen.gradients.get()
+
+    def screened(self, d_image: NDArray[np.float64], fields: SlotFields) -> tuple[Gaussians, Screen]:
+        """As `backward`, with all that density control has of a view."""
         device = self.rasterizer.device
         height, width, _ = d_image.shape
         planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
         planes[:, :height, :width] = d_image.transpose(2, 0, 1)
         gradients = allocate_gaussians(device, self.gaussians.count, self.gaussians.coefficients, zero=True)
-        screen = self.rasterizer.backward(
-            self.gaussians, self.frame, upload(device, planes), gradients, absolute=absolute
-        )
-        return download_gaussians(gradients), screen.get()
+        screen = self.rasterizer.backward(self.gaussians, self.frame, upload(device, planes), gradients, fields=fields)
+        return download_gaussians(gradients), screen

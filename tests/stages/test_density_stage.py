@@ -16,7 +16,7 @@ from clsplat.device.layout import SPLAT
 from clsplat.gaussians import Gaussians
 from clsplat.reference import render as reference
 from clsplat.stages.density import NO_ROW, add_statistics, gather, new_statistics, widen
-from clsplat.stages.project import GROUPS, DeviceGaussians, Projected, group_shapes
+from clsplat.stages.project import GROUPS, DeviceGaussians, Projected, Screen, group_shapes
 
 SIZES = (1, 2, 63, 64, 65, 127, 129, 1025)
 """A launch is rounded up to groups of 64."""
@@ -83,7 +83,7 @@ def test_statistics_at_the_seams(device: Device, count: int) -> None:
         splats[:, SPLAT.index("L12")] = 0
         splats[:, SPLAT.index("L22")] = whiten * factor / 1.9
         projected = Projected(upload(device, splats), upload(device, tiles))
-        add_statistics(device, statistics, camera, projected, upload(device, screen))
+        add_statistics(device, statistics, camera, projected, Screen(upload(device, screen)))
         shown = tiles > 0
         sums += np.where(shown, np.hypot(30 * screen[:, 0].astype(float), 20 * screen[:, 1].astype(float)), 0)
         seen += shown
@@ -99,7 +99,7 @@ def statistics_of(device: Device, scene: tuple[Gaussians, Camera]) -> tuple[Pipe
     run = Pipeline.run(device, scene)
     _, screen = run.backward(np.ones((run.camera.height, run.camera.width, 3)))
     statistics = new_statistics(device, run.gaussians.count)
-    add_statistics(device, statistics, run.camera, run.frame.projected, upload(device, screen))
+    add_statistics(device, statistics, run.camera, run.frame.projected, Screen(upload(device, screen)))
     return run, screen, statistics.radii.get()
 
 
@@ -130,8 +130,27 @@ def test_gradients_in_ndc_do_not_depend_on_the_resolution(device: Device) -> Non
         pixels = view.width * view.height
         _, screen = run.backward(np.tile(np.linspace(0, 1, view.width)[None, :, None], (view.height, 1, 3)) / pixels)
         statistics = new_statistics(device, 1)
-        add_statistics(device, statistics, view, run.frame.projected, upload(device, screen))
+        add_statistics(device, statistics, view, run.frame.projected, Screen(upload(device, screen)))
         sums.append(float(statistics.gradient_sums.get()[0]))
     # the low-pass of 0.3 square pixels and the pixel grid weigh more at half the size
     assert sums[0] > 0
     assert sums[1] == pytest.approx(sums[0], rel=0.1)
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_views_over_the_threshold_are_counted(device: Device, count: int) -> None:
+    rng = np.random.default_rng(count)
+    camera = scenes.straight_camera(60, 40)
+    statistics, agreeing = new_statistics(device, count, agreement=True), np.zeros(count)
+    splats = upload(device, np.ones((count, len(SPLAT)), np.float32))
+    for _ in range(3):
+        tiles = rng.integers(0, 2, count).astype(np.uint32)
+        screen = rng.normal(size=(count, 2)).astype(np.float32)
+        norms = np.hypot(30 * screen[:, 0].astype(float), 20 * screen[:, 1].astype(float))
+        assert np.all(np.abs(norms / 25 - 1) > 1e-6), "none is so near that rounding decides"
+        projected = Projected(splats, upload(device, tiles))
+        add_statistics(device, statistics, camera, projected, Screen(upload(device, screen)), 25.0)
+        agreeing += (tiles > 0) & (norms >= 25)
+    assert statistics.agreeing is not None
+    np.testing.assert_array_equal(statistics.agreeing.get(), agreeing)
+    assert new_statistics(device, count).agreeing is None, "not counted unless asked for"

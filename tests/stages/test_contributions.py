@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each Gaussian contributes to an image, from the slots of blend_grad.cl: against the float64 twin, a closed form,
+and itself in bands and other shapes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+from compare import assert_close, assert_same_bits
+from pipeline import BACKGROUND, Pipeline
+from test_bands import in_bands, most_in_a_tile
+
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device
+from clsplat.device.layout import SLOT, SlotFields
+from clsplat.reference import render as reference
+from clsplat.stages.density import add_contributions, new_statistics
+from clsplat.stages.project import Projected
+
+WITH = SlotFields(contributions=True)
+GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+def noise(run: Pipeline) -> np.ndarray:
+    return np.random.default_rng(2).standard_normal((run.camera.height, run.camera.width, 3))
+
+
+def contributions(run: Pipeline, fields: SlotFields = WITH) -> np.ndarray:
+    """(n,), 0 where not visible."""
+    _, screen = run.screened(noise(run), fields)
+    assert screen.contributions is not None
+    return np.where(run.visible, screen.contributions.get(), np.float32(0))
+
+
+def assert_as_reference(device: Device, name: str) -> None:
+    scene = scenes.NAMED[name]()
+    run = Pipeline.run(device, scene)
+    wanted = reference.render_grad(*scene, noise(run), BACKGROUND).contributions
+    assert wanted.any()
+    # Weights are as good as frames are, 2e-5 a pixel at most; 1e-4 of a Gaussian's own sum, and a few pixels at the
+    # edge of an ellipse, of a weight of 1/255, that are decided the other way.
+    assert_close(contributions(run), wanted, relative=1e-4, absolute=4 / 255)
+
+
+@pytest.mark.parametrize("name", ["overlap", "random_cloud", "off_frustum", "needles"])
+def test_against_the_reference(device: Device, name: str) -> None:
+    assert_as_reference(device, name)
+
+
+@pytest.mark.parametrize("name", scenes.SHAPE_MATTERS)
+def test_in_every_shape(shaped_device: Device, name: str) -> None:
+    assert_as_reference(shaped_device, name)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 15), (33, 1), (64, 48)], ids=str)
+def test_they_add_up_to_what_is_opaque(shaped_device: Device, size: tuple[int, int]) -> None:
+    """Weights and what is left add up to 1 in every pixel: no pixel outside the image counts, none counts twice."""
+    run = Pipeline.run(shaped_device, scenes.random_cloud(200, 3, *size))
+    opaque = (1 - run.crop(run.frame.blended.transmittance.get()).astype(np.float64)).sum()
+    assert opaque > 0
+    # a rounding per Gaussian and pixel, in transmittance recovered by division
+    assert_close(contributions(run).astype(np.float64).sum(), opaque, relative=1e-5)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_gradients_keep_their_bits(shaped_device: Device, absolute: bool) -> None:
+    run = Pipeline.run(shaped_device, scenes.overlap())
+    plain, screen = run.screened(noise(run), SlotFields(absolute))
+    both, screen_of_both = run.screened(noise(run), SlotFields(absolute, contributions=True))
+    assert screen.contributions is None
+    for name in GROUPS:
+        assert_same_bits(getattr(both, name), getattr(plain, name), name)
+    shown = run.visible
+    assert_same_bits(screen_of_both.gradients.get()[shown], screen.gradients.get()[shown])
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_bands_change_no_bit(default_device: Device, absolute: bool) -> None:
+    whole = Pipeline.run(default_device, scenes.overlap())
+    banded = in_bands(default_device, "overlap", most_in_a_tile(whole))
+    assert len(banded.frame.bands) > 1
+    fields = SlotFields(absolute, contributions=True)
+    assert_same_bits(contributions(banded, fields), contributions(whole, fields))
+
+
+def test_the_place_in_a_slot() -> None:
+    assert SlotFields().floats == 9
+    assert SlotFields(absolute=True).floats == len(SLOT) == 11
+    assert SlotFields(contributions=True).floats == 10
+    assert SlotFields(absolute=True, contributions=True).floats == 12
+
+
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 1025])
+def test_epochs(device: Device, count: int) -> None:
+    """Nothing is known before an epoch begins; then totals and the largest of its views, and those of the last one."""
+    rng = np.random.default_rng(count)
+    statistics = new_statistics(device, count, contributions=True)
+
+    def view(area: float) -> np.ndarray:
+        tiles = rng.integers(0, 2, count).astype(np.uint32)
+        values = rng.uniform(0.1, 5, count).astype(np.float32)
+        assert statistics.current is not None
+        splats = upload(device, np.zeros((count, 16), np.float32))
+        add_contributions(
+            device, statistics.current, Projected(splats, upload(device, tiles)), upload(device, values), area
+        )
+        return np.where(tiles > 0, np.float32(area) * values, np.float32(0))
+
+    view(1.0)
+    assert statistics.current is not None
+    assert np.isinf(statistics.current.totals.get()).all(), "the epoch had begun before"
+    for _ in range(3):
+        statistics = statistics.next_epoch()
+        views = [view(area) for area in (1.0, 4.0, 1.0)]
+        assert statistics.current is not None
+        assert_same_bits(statistics.current.totals.get(), views[0] + views[1] + views[2])
+        assert_same_bits(statistics.current.largest.get(), np.maximum.reduce(views))
+        before = statistics
+    statistics = statistics.next_epoch()
+    assert statistics.whole is before.current
+    assert statistics.current is not None
+    assert not statistics.current.totals.get().any()
+    assert not statistics.current.largest.get().any()
+    statistics.forget_contributions()
+    for epoch in (statistics.current, statistics.whole):
+        assert epoch is not None
+        assert np.isinf(epoch.totals.get()).all()
+        assert np.isinf(epoch.largest.get()).all()
+
+
+def test_what_goes_on_when_rows_move(device: Device) -> None:
+    statistics = new_statistics(device, 4, agreement=True, contributions=True)
+    for index, array in enumerate(statistics.named().values()):
+        array.set(np.arange(4, dtype=np.float32) + 10 * index)
+    names = list(statistics.named())
+    assert names == [
+        *("gradient_sums", "seen", "radii", "agreeing"),
+        *("current_totals", "current_largest", "whole_totals", "whole_largest"),
+    ]
+    rows = np.array([0, 2, 3, 2], np.uint32)
+    densified = statistics.moved(rows, np.array([False, False, False, True]), densified=True)
+    assert list(densified) == names[4:], "the rest starts again"
+    for index, values in enumerate(densified.values(), 4):
+        np.testing.assert_array_equal(values, np.array([0, 2, 3, np.inf]) + 10 * index)
+    pruned = statistics.moved(rows[:3], np.zeros(3, bool), densified=False)
+    for index, name in enumerate(names):
+        np.testing.assert_array_equal(pruned[name], np.array([0, 2, 3]) + 10 * index)
+    after = new_statistics(device, 3, agreement=True, contributions=True)
+    after.load(pruned)
+    for name, array in after.named().items():
+        np.testing.assert_array_equal(array.get(), pruned[name])
