@@ -65,6 +65,7 @@ def settings() -> dict[str, RasterizerConfig]:
         "no early-stop": {"early_stop": False},
         "no last-contributor": {"last_contributor": False},
         "no record-cells": {"record_cells": False},
+        "no gradient-skip": {"gradient_skip": False},
         "no frustum-cull": {"frustum_cull": False},
         "no opacity-cull": {"opacity_cull": False},
     }

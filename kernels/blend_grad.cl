@@ -13,6 +13,11 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
+#if defined(NO_GRADIENT_SKIP) || defined(CONTRIBUTIONS) // RasterizerConfig.gradient_skip; contributions are of all cells
+#define LIVE(cells, live) (cells)
+#else
+#define LIVE(cells, live) ((cells) & (live))
+#endif
 #ifdef RECORD_CELLS // by blend: each cell that is visited has a pixel that takes the Gaussian
 #define CONTRIBUTES(mask) 1
 #else
@@ -62,6 +67,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
   floatL t[OWNED], behind[OWNED], g_red[OWNED], g_green[OWNED], g_blue[OWNED];
   intL stop[OWNED];
   int last = begin;
+  Open live = 0; // cells with a pixel that has a gradient
   for (int k = 0; k < OWNED; ++k) {
     const int cell = get_local_id(0) + k * ITEMS;
     const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
@@ -72,6 +78,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     behind[k] = t[k] * (g_red[k] * background[0] + g_green[k] * background[1] + g_blue[k] * background[2]);
     stop[k] = LOAD_CELL(int, stops + pixel, stride);
     last = max(last, maxL(stop[k]));
+    if (ANYL((g_red[k] != 0.0f) | (g_green[k] != 0.0f) | (g_blue[k] != 0.0f))) OPEN_CELL(live, cell);
   }
 #if ITEMS > 1
   if (get_local_id(0) == 0) group_last = begin;
@@ -99,7 +106,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
     const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
 #ifdef RECORD_CELLS
-    const uint reach = cells_from_sorted[i];
+    const uint reach = LIVE(cells_from_sorted[i], live);
     if (reach == 0) {
       for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = 0.0f;
       continue;

@@ -10,7 +10,7 @@ import pytest
 from tiny import write_scene
 
 from clsplat.cli import main
-from clsplat.config import PRESETS, DensityConfig, OptimiserConfig, TrainConfig, scheduled
+from clsplat.config import PRESETS, DensityConfig, OptimiserConfig, TrainConfig, bundled, scheduled
 from clsplat.runs import Run
 
 Capture = pytest.CaptureFixture[str]
@@ -107,13 +107,26 @@ def test_the_short_schedule_makes_sense_for_any_number_of_steps(iterations: int)
     assert config.density.stop + config.optimiser.cooldown <= iterations
 
 
+@pytest.mark.parametrize("iterations", [1, 2, 3, 13, 7000, 30_000])
+def test_presets_make_sense_for_any_number_of_steps(iterations: int) -> None:
+    for preset, rasterizer in PRESETS.items():
+        for schedule in (None, "paper", "short"):
+            config = bundled(preset, schedule, iterations)
+            config.check()
+            assert config.iterations == iterations
+            assert config.rasterizer == rasterizer
+    assert bundled("default", None, iterations) == bundled("exact", None, iterations) == scheduled("paper", iterations)
+    assert bundled("fast", None, iterations) == bundled("fast", "short", iterations)
+    assert bundled("fast", "paper", iterations) != bundled("fast", "short", iterations)
+
+
 def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> None:
     scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
     short = ["--schedule", "short"]
     flags = ["--iterations", "14", "--preset", "fast", "--optimiser.opacities-rate", "0.04"]
     assert main(["train", str(scene), "-o", str(run), *short, *flags]) == 0
-    wanted = scheduled("short", 14)
-    wanted = replace(wanted, optimiser=replace(wanted.optimiser, opacities_rate=0.04), rasterizer=PRESETS["fast"])
+    wanted = bundled("fast", "short", 14)
+    wanted = replace(wanted, optimiser=replace(wanted.optimiser, opacities_rate=0.04))
     assert Run.open(run).config == wanted, "flags go before the bundles, which go together"
     assert main(["train", "-o", str(run), "--resume", *short]) == 2
     assert "--schedule short and --resume" in capsys.readouterr().err

@@ -39,6 +39,7 @@ EXACT_OFF = {
     "early stop": RasterizerConfig(early_stop=False),
     "last contributor": RasterizerConfig(last_contributor=False),
     "record cells": RasterizerConfig(record_cells=False),
+    "gradient skip": RasterizerConfig(gradient_skip=False),
     "frustum cull": RasterizerConfig(frustum_cull=False),
     "opacity cull": RasterizerConfig(opacity_cull=False),
     "all": RasterizerConfig(
@@ -52,6 +53,7 @@ EXACT_OFF = {
         early_stop=False,
         last_contributor=False,
         record_cells=False,
+        gradient_skip=False,
         frustum_cull=False,
         opacity_cull=False,
     ),

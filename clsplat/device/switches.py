@@ -29,6 +29,7 @@ def kernel_defines(config: RasterizerConfig) -> dict[str, object]:
         "NO_VECTOR_SKIP": not config.vector_skip,
         "NO_EARLY_STOP": not config.early_stop,
         "NO_LAST_CONTRIBUTOR": not config.last_contributor,
+        "NO_GRADIENT_SKIP": not config.gradient_skip,
         "NO_FRUSTUM_CULL": not config.frustum_cull,
         "NO_OPACITY_CULL": not config.opacity_cull,
     }

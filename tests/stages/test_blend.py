@@ -11,8 +11,10 @@ import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
 from pipeline import BACKGROUND, Pipeline, shaped
 
+from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
+from clsplat.device.switches import kernel_defines
 from clsplat.reference import render as reference
 from clsplat.rendering import Rasterizer
 from clsplat.stages.blend import blend_grad
@@ -139,6 +141,26 @@ def test_recorded_cells_are_those_that_contribute(device: Device, name: str, lan
     empty = blended.cells_from_sorted.get() == 0
     assert not recorded[frame.lists.slot_from_sorted.get()[empty]].any()
     assert recorded.any()
+
+
+@pytest.mark.parametrize("name", scenes.SHAPE_MATTERS)
+@pytest.mark.parametrize("lanes", [8, 16])
+def test_cells_without_a_gradient_are_left_out(device: Device, name: str, lanes: int) -> None:
+    """As good as visiting them, but for the sign of zeros; some pairs lie in such cells alone."""
+    runs = [
+        Pipeline.run(shaped(device, lanes, 1).with_switches(kernel_defines(config)), scenes.NAMED[name]())
+        for config in (RasterizerConfig(), RasterizerConfig(gradient_skip=False))
+    ]
+    values = np.random.default_rng(0).standard_normal(runs[0].frame.blended.image.shape).astype(np.float32)
+    values[:, :, : values.shape[2] // 2] = 0.0
+    values[:, 5] = 0.0
+    slots = []
+    for run in runs:
+        frame, device_of = run.frame, run.rasterizer.device
+        of = (device_of, run.rasterizer.work, frame.lists, frame.projected.splats, frame.background, frame.blended)
+        slots.append(blend_grad(*of, upload(device_of, values)).get() + np.float32(0))
+    assert_same_bits(slots[0], slots[1])
+    assert slots[0].any()
 
 
 def test_without_a_gradient_nothing_is_recorded(default_device: Device) -> None:
