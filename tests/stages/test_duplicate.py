@@ -15,6 +15,7 @@ from clsplat.device.layout import SPLAT
 from clsplat.reference import render as reference
 from clsplat.reference.tiles import square_tiles, touched_tiles
 from clsplat.stages.duplicate import count
+from clsplat.stages.sort import BITONIC_WINS
 
 NAMES = [*scenes.NAMED, "cloud"]
 IN_EVERY_SHAPE = ["off_frustum", "equal_depth", "cloud"]
@@ -134,10 +135,17 @@ def test_key_bits_of_no_gaussian_and_of_equal_ones(shaped_device: Device) -> Non
 
 
 def test_fewer_bits_are_fewer_launches(default_device: Device) -> None:
+    gaussians, camera = make("cloud")
+    # Depths from 2 to 3 differ in 22 bits: two digits of 11 rather than three.
+    camera = scenes.straight_camera(camera.width, camera.height)
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(0, 1, (len(gaussians), 2)) * (camera.width, camera.height)
+    gaussians.means[:] = scenes.world_from_pixels(camera, pixels, rng.uniform(2, 3, len(gaussians)))
     launches = {}
     for key_bits in ("needed", "all"):
         config = RasterizerConfig(key_bits=key_bits)  # type: ignore[arg-type]  # one of them
-        run = Pipeline.run(default_device, make("cloud"), config=config)
+        run = Pipeline.run(default_device, (gaussians, camera), config=config)
+        assert run.visible.sum() > BITONIC_WINS["cpu"]
         with default_device.recorder.recording(default_device, wait=False) as stages:
             run.rasterizer.forward(run.gaussians, run.camera, run.frame.background)
         launches[key_bits] = {name: stages[name].launches for name in ("duplicate", "ranges")}
