@@ -296,7 +296,7 @@ def test_settings_hold_every_switch_and_preset() -> None:
 
 
 def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measure, "CROP", 48)
+    monkeypatch.setattr(tradeoff, "CROP", 48)
     candidates = {
         "exact": PRESETS["exact"],
         "no row-skip": RasterizerConfig(row_skip=False),
@@ -317,15 +317,15 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measure, "CROP", 48)
+    monkeypatch.setattr(tradeoff, "CROP", 48)
     every = tradeoff.settings()
     off = every[tradeoff.ALL_OFF]
     for field, value in asdict(off).items():
-        if isinstance(value, bool | str):  # the numbers are approximations
+        if isinstance(value, bool | str) and field != "sh_storage":  # it and the numbers are approximations
             assert value != getattr(RasterizerConfig(), field), field
     assert (off.tile_test, off.alpha_min) == ("square", RasterizerConfig().alpha_min)
     times = iter([50.0, 100.0, 150.0, 210.0])  # of a frame and of a step, on and off
-    monkeypatch.setattr(measure, "wall_ms", lambda _device, work: (work(), next(times))[1])
+    monkeypatch.setattr(tradeoff, "wall_ms", lambda _device, work: (work(), next(times))[1])
     candidates = {"preset exact = default": PRESETS["exact"], tradeoff.ALL_OFF: off}
     result = tradeoff.compare(measure.synthetic(300, 70, 50), profiled, candidates, repeat=1)
     assert [(point["frame_ms"], point["iteration_ms"]) for point in result["points"]] == [(50, 100), (150, 210)]
@@ -357,7 +357,7 @@ def test_half_of_the_colours_are_kept_where_they_can_be(profiled: Device) -> Non
 @pytest.mark.usefixtures("_quick")
 def test_a_held_model_is_what_frames_are_measured_of(profiled: Device) -> None:
     subject = measure.synthetic(300, 50, 40)
-    limits = Limits(1e9, 1e10, 8, 1)
+    limits = Limits(1e9, 5e8, 1e10, 8, 1)
     sizes = []
     for storage in ("float", "half"):
         config = RasterizerConfig(sh_storage=storage)
@@ -411,7 +411,7 @@ def test_plot_is_written(tmp_path: Path, result: dict[str, object], name: str) -
 def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     some = {"exact": PRESETS["exact"], "fast": PRESETS["fast"]}
-    monkeypatch.setattr(measure, "settings", lambda: some)
+    monkeypatch.setattr(tradeoff, "settings", lambda: some)
     path = tmp_path / "plot.svg"
     assert main(["bench", *SMALL, "--plot", str(path), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
