@@ -66,20 +66,19 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   }
 
   int i = begin;
-  Reach reaches[BATCH]; // together, ahead of their use: else each waits for the end of the last one's cells
+  Reach reach, second; // two at a time, ahead of their use: else each waits for the end of the last one's cells
   for (; i < end && GOES_ON(open); ++i) {
-    if ((i - begin) % BATCH == 0)
-      for (int j = 0; j < BATCH; ++j) {
-        const uint next = gaussian_from_sorted[min(i + j, end - 1)];
-        reaches[j] = reach_of(splats + (size_t)SPLAT_SIZE * next, tile_x, tile_y);
-      }
+    const int turn = (i - begin) & 1;
+    if (!turn) {
+      reach = reach_of(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i], tile_x, tile_y);
+      second = reach_of(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[min(i + 1, end - 1)], tile_x, tile_y);
+    } else reach = second;
     PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i + AHEAD < end ? i + AHEAD : end - 1]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     const float log2o = splat[SPLAT_LOG2O];
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
     const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
-    const Reach reach = reaches[(i - begin) % BATCH];
     RECORD(uint cells = 0;)
     FOR_CELLS(cell, IN_OPEN(reach, open)) {
       const int k = cell / ITEMS;

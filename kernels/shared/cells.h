@@ -53,7 +53,6 @@ typedef int4 int4U __attribute__((aligned(4)));
 // a tile of at most 32; else those that its box reaches.
 #if LANES >= 8 && ITEMS == 1
 typedef uint Reach;
-#define BATCH 4 // of Gaussians whose bits are found together
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_ctz)
 #define LOWEST(bits) __builtin_ctz(bits)
@@ -154,7 +153,6 @@ typedef uint Open;
 typedef struct {
   int x0, x1, y0, y1;
 } Reach;
-#define BATCH 1
 
 static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) {
   Reach reach = {0, COLUMNS, 0, ROWS};
