@@ -63,7 +63,8 @@ class RasterizerConfig:
     column_skip: bool = True
     """Visit only the vectors of a row that the bounding box reaches."""
     vector_skip: bool = True
-    """Leave a vector of pixels when the Gaussian contributes to none of them."""
+    """Leave a vector of pixels when the Gaussian contributes to none of them. Frames on a CPU have no use for it: their
+    vectors are found by the ellipse, so that few are visited in vain."""
     early_stop: bool = True
     """Leave a tile when all its pixels are opaque; else go on to its last Gaussian, to no effect."""
     last_contributor: bool = True

@@ -22,6 +22,11 @@
 #else
 #define RECORD(statements)
 #endif
+#if defined(CELLS_BY_ELLIPSE) && !defined(RECORD_CELLS) // few vectors are visited in vain: the test costs more than they
+#define CONTRIBUTES(mask) 1
+#else
+#define CONTRIBUTES(mask) REACHES(mask)
+#endif
 #ifdef COUNT_PAIRS // a build for `clsplat bench`
 #define COUNT(statements) statements
 #else
@@ -87,7 +92,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
       const floatL power = log2_alpha(u, l22 * dy, log2o);
       COUNT(evaluated += LANES;)
       const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
-      if (REACHES(reached)) {
+      if (CONTRIBUTES(reached)) {
         RECORD(cells |= 1u << cell;)
         const floatL before = t[k];
         floatL alpha = exp2L(power);

@@ -52,6 +52,7 @@ typedef int4 int4U __attribute__((aligned(4)));
 // The cells that a Gaussian reaches: those that have a pixel in its ellipse, as bits, where one work-item walks
 // a tile of at most 32; else those that its box reaches.
 #if LANES >= 8 && ITEMS == 1
+#define CELLS_BY_ELLIPSE
 typedef uint Reach;
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_ctz)
