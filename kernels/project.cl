@@ -104,12 +104,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
                           SPLAT_L22,     SPLAT_LOG2O,   SPLAT_DEPTH, SPLAT_HALF_W, SPLAT_HALF_H, SPLAT_INVERSE_L11};
     for (uint k = 0; k < sizeof(fields) / sizeof(fields[0]); ++k) splat[fields[k]] = field[fields[k]].lane[lane];
     const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
-    uint count = 0;
-    for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
-      int x0, x1;
-      tile_span(&e, ty, tiles_x, &x0, &x1);
-      count += x1 - x0;
-    }
+    const uint count = tile_count(&e, tiles_x);
 #ifdef KEEP_CULLED
     if (count == 0 && !(KEEP_CULLED)) continue;
     shown[i] = 1;

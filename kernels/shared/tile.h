@@ -28,11 +28,20 @@ static inline int end_cell(float high, float size, int count) {
   return (int)(cell < (float)count ? cell : (float)count);
 }
 
+// Up to how many tiles a box is listed whole: finding out which of them the ellipse reaches takes longer than blending
+// finds that it reaches none of a tile's pixels.
+#ifdef BOX_TILE_TEST // RasterizerConfig.tile_test
+#define SMALL_BOX 0x7fffffff
+#elif !defined(SMALL_BOX)
+#define SMALL_BOX 16
+#endif
+
 typedef struct {
   float mx, my, l11, l12, l22, half_w, half_h;
   float budget;  // u^2 + v^2 at its edge
   float tangent; // dy / dx from the mean to the ellipse's rightmost point, times half_w
   int tile_x0, tile_x1, tile_y0, tile_y1; // tiles that its box reaches
+  int box; // how many
 } Ellipse;
 
 #ifdef SQUARE_TILE_TEST
@@ -63,7 +72,8 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
   e.tile_x1 = end_cell(e.mx + e.half_w, (float)TILE, tiles_x);
   e.tile_y0 = first_cell(e.my - e.half_h, (float)TILE, tiles_y);
   e.tile_y1 = end_cell(e.my + e.half_h, (float)TILE, tiles_y);
-  if (e.tile_x1 - e.tile_x0 > 1) {
+  e.box = max(e.tile_x1 - e.tile_x0, 0) * max(e.tile_y1 - e.tile_y0, 0);
+  if (e.box > SMALL_BOX) {
     e.l11 = splat[SPLAT_L11];
     e.l12 = splat[SPLAT_L12];
     e.l22 = splat[SPLAT_L22];
@@ -82,12 +92,11 @@ static inline float right_edge(const Ellipse *e, float d0, float d1) {
   return (-e->l12 * dy + sqrt(rest > 0.0f ? rest : 0.0f)) / e->l11;
 }
 
-// The tiles [*x0, *x1) that the ellipse reaches in tile row ty. In a box one tile wide there is nothing to cut.
+// The tiles [*x0, *x1) that the ellipse reaches in tile row ty, or those of its box if they are few.
 static inline void tile_span(const Ellipse *e, int ty, int tiles_x, int *x0, int *x1) {
   *x0 = e->tile_x0;
   *x1 = e->tile_x1 > e->tile_x0 ? e->tile_x1 : e->tile_x0;
-#ifndef BOX_TILE_TEST // RasterizerConfig.tile_test
-  if (*x1 - *x0 <= 1) return;
+  if (e->box <= SMALL_BOX) return;
   float d0 = (float)(ty * TILE) + 0.5f - TILE_SLACK - e->my;
   float d1 = (float)(ty * TILE + TILE) - 0.5f + TILE_SLACK - e->my;
   d0 = d0 > -e->half_h ? d0 : -e->half_h;
@@ -98,5 +107,16 @@ static inline void tile_span(const Ellipse *e, int ty, int tiles_x, int *x0, int
   *x0 = first_cell(e->mx - left, (float)TILE, tiles_x);
   *x1 = end_cell(e->mx + right, (float)TILE, tiles_x);
   if (*x1 < *x0) *x1 = *x0;
-#endif
+}
+
+// How many tiles those of all rows are.
+static inline uint tile_count(const Ellipse *e, int tiles_x) {
+  if (e->box <= SMALL_BOX) return e->box;
+  uint count = 0;
+  for (int ty = e->tile_y0; ty < e->tile_y1; ++ty) {
+    int x0, x1;
+    tile_span(e, ty, tiles_x, &x0, &x1);
+    count += x1 - x0;
+  }
+  return count;
 }
