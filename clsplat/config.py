@@ -51,8 +51,9 @@ class RasterizerConfig:
     """How far a Gaussian reaches: to where its alpha is alpha-min; as far as an opaque one would, whatever its
     opacity; or three standard deviations, which cuts what is visible of opaque ones (approximate)."""
     tile_test: Literal["ellipse", "box", "square"] = "ellipse"
-    """A Gaussian is listed in the tiles that its ellipse reaches, where its box has more than 16; that the ellipse's bounding box does; or that the
-    square of its longest half axis does, as in the code of Kerbl et al."""
+    """A Gaussian is listed in the tiles that its ellipse reaches, or in all of its bounding box's where those are at
+    most 16; in those of its bounding box; or in those that the square of its longest half axis reaches, as in the code
+    of Kerbl et al."""
     depth_sort: Literal["visible", "pairs"] = "visible"
     """The visible Gaussians are sorted by depth, and their pairs with tiles, stably, by tile; or all pairs are sorted
     by tile and depth, as in the code of Kerbl et al."""
