@@ -67,7 +67,7 @@ class Need:
     def pair(self) -> int:
         """Of each pair: keys, sort, lists; slot and cells where there is a gradient."""
         gradient = 4 * self.slot + 4 if self.slot else 0
-        return 36 + (20 if self.sorts_pairs else 0) + gradient
+        return 36 + (24 if self.sorts_pairs else 0) + gradient
 
     @property
     def pairs(self) -> int:

@@ -89,15 +89,15 @@ __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, co
   band_counts[i] = count;
 }
 
-// offsets (visible): scan of the counts by rank; slots (n): scan of the counts by Gaussian -> tile_keys,
-// slot_from_pair (pairs): pairs in order of depth; gaussian_from_slot (pairs): a Gaussian's slots follow each other,
-// and Gaussians' slots the Gaussians, so that what is summed over slots streams through memory.
+// offsets (visible): scan of the counts by rank; slots (n): scan of the counts by Gaussian -> tile_keys (pairs) and
+// pair_ids (pairs): slot and Gaussian; pairs in order of depth. A Gaussian's slots follow each other, and Gaussians'
+// slots the Gaussians, so that what is summed over slots streams through memory.
 // Only tiles from first_tile to before end_tile, from which keys count.
 __kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y, const int first_tile,
                         const int end_tile,
                         __global const uint *gaussian_from_rank, __global const uint *offsets,
                         __global const uint *slots, __global const float *splats, __global uint *tile_keys,
-                        __global uint *slot_from_pair, __global uint *gaussian_from_slot) {
+                        __global uint2 *pair_ids) {
   const uint rank = get_global_id(0);
   if (rank >= visible) return;
   const uint ahead = gaussian_from_rank[min(rank + AHEAD, visible - 1)];
@@ -112,8 +112,7 @@ __kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y
     band_span(&e, ty, tiles_x, first_tile, end_tile, &x0, &x1);
     for (int tx = x0; tx < x1; ++tx, ++pair, ++slot) {
       tile_keys[pair] = ty * tiles_x + tx - first_tile;
-      slot_from_pair[pair] = slot;
-      gaussian_from_slot[slot] = i;
+      pair_ids[pair] = (uint2)(slot, i);
     }
   }
 }
@@ -143,9 +142,13 @@ __kernel void duplicate_slots(const uint visible, const int tiles_x, const int t
   }
 }
 
-// slot_from_pair (pairs): by depth, tiles (pairs): by slot -> tile_keys (pairs): by depth
-__kernel void order_tiles(const uint pairs, __global const uint *slot_from_pair, __global const uint *tiles,
-                          __global uint *tile_keys) {
+// slot_from_pair (pairs): by depth; tiles, gaussian_from_slot (pairs): by slot -> tile_keys, pair_ids (pairs): by depth
+__kernel void order_pairs(const uint pairs, __global const uint *slot_from_pair, __global const uint *tiles,
+                          __global const uint *gaussian_from_slot, __global uint *tile_keys,
+                          __global uint2 *pair_ids) {
   const uint pair = get_global_id(0);
-  if (pair < pairs) tile_keys[pair] = tiles[slot_from_pair[pair]];
+  if (pair >= pairs) return;
+  const uint slot = slot_from_pair[pair];
+  tile_keys[pair] = tiles[slot];
+  pair_ids[pair] = (uint2)(slot, gaussian_from_slot[slot]);
 }

@@ -1,17 +1,17 @@
 // Where each tile's pairs begin and end in the sorted list.
 #include "shared/math.h"
 
-// tile_keys, pair_from_sorted (pairs), sorted -> ranges (tiles, 2), zeroed before; slot_from_sorted,
+// tile_keys, pair_from_sorted (pairs), sorted; pair_ids (pairs): slot and Gaussian, by depth -> ranges (tiles, 2), zeroed before; slot_from_sorted,
 // gaussian_from_sorted (pairs)
 __kernel void ranges(const uint pairs, __global const uint *tile_keys, __global const uint *pair_from_sorted,
-                     __global const uint *slot_from_pair, __global const uint *gaussian_from_slot,
-                     __global uint *ranges, __global uint *slot_from_sorted, __global uint *gaussian_from_sorted) {
+                     __global const uint2 *pair_ids, __global uint *ranges, __global uint *slot_from_sorted,
+                     __global uint *gaussian_from_sorted) {
   const uint i = get_global_id(0);
   if (i >= pairs) return;
   const uint tile = tile_keys[i];
   if (i == 0 || tile_keys[i - 1] != tile) ranges[2 * tile] = i;
   if (i + 1 == pairs || tile_keys[i + 1] != tile) ranges[2 * tile + 1] = i + 1;
-  const uint slot = slot_from_pair[pair_from_sorted[i]];
-  slot_from_sorted[i] = slot;
-  gaussian_from_sorted[i] = gaussian_from_slot[slot];
+  const uint2 id = pair_ids[pair_from_sorted[i]];
+  slot_from_sorted[i] = id.x;
+  gaussian_from_sorted[i] = id.y;
 }

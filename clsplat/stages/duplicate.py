@@ -53,13 +53,12 @@ class Counted:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """tile_keys, slot_from_pair (pairs): by depth, ties by index of the Gaussian; first_slots (n): where a Gaussian's
-    slots begin; gaussian_from_slot (pairs)."""
+    """tile_keys (pairs), pair_ids (pairs, 2): the slot and the Gaussian, both by depth, ties by index of the Gaussian;
+    first_slots (n): where a Gaussian's slots begin."""
 
     tile_keys: DeviceArray
-    slot_from_pair: DeviceArray
+    pair_ids: DeviceArray
     first_slots: DeviceArray
-    gaussian_from_slot: DeviceArray
 
 
 @stage("duplicate")
@@ -205,8 +204,7 @@ def duplicate(
     offsets = work.array("offsets", (visible,), np.uint32)
     scan(device, work, counts, offsets, work.array("pairs_total", (1,), np.uint32))
     tile_keys = work.array("tile_keys", (pairs,), np.uint32)
-    slot_from_pair = work.array("slot_from_pair", (pairs,), np.uint32)
-    gaussian_from_slot = work.array("gaussian_from_slot", (pairs,), np.uint32)
+    pair_ids = work.array("pair_ids", (pairs, 2), np.uint32)
     launch_items(
         device,
         kernels.duplicate,
@@ -220,10 +218,9 @@ def duplicate(
         first_slots,
         splats,
         tile_keys,
-        slot_from_pair,
-        gaussian_from_slot,
+        pair_ids,
     )
-    return Pairs(tile_keys, slot_from_pair, first_slots, gaussian_from_slot)
+    return Pairs(tile_keys, pair_ids, first_slots)
 
 
 @stage("duplicate")
@@ -254,5 +251,7 @@ def duplicate_and_sort(
     )
     _, slot_from_pair = sort(device, work, "pair_depth", pair_depths, counted.key_bits, counted.least_key)
     tile_keys = work.array("tile_keys", (pairs,), np.uint32)
-    launch_items(device, kernels.order_tiles, pairs, pairs, slot_from_pair, tile_from_slot, tile_keys)
-    return Pairs(tile_keys, slot_from_pair, counted.first_slots, gaussian_from_slot)
+    pair_ids = work.array("pair_ids", (pairs, 2), np.uint32)
+    by_slot = (tile_from_slot, gaussian_from_slot)
+    launch_items(device, kernels.order_pairs, pairs, pairs, slot_from_pair, *by_slot, tile_keys, pair_ids)
+    return Pairs(tile_keys, pair_ids, counted.first_slots)

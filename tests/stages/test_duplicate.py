@@ -78,7 +78,7 @@ def test_lists_are_front_to_back(shaped_device: Device, name: str) -> None:
 def test_equal_depths_go_by_index(device: Device) -> None:
     run = Pipeline.run(device, scenes.equal_depth())
     pairs = run.frame.pairs
-    gaussians = pairs.gaussian_from_slot.get()[pairs.slot_from_pair.get()]
+    gaussians = pairs.pair_ids.get()[:, 1]
     assert len(np.unique(gaussians)) > 1
     np.testing.assert_array_equal(gaussians, np.sort(gaussians))
 
