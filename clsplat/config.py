@@ -342,7 +342,7 @@ def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> Train
 
     fast trains less: on pictures of a quarter of the size for a fourteenth of the steps and of half the size until two
     sevenths, with fewer Gaussians, those dropped that add less than a tenth of a pixel to every view, the rates of the
-    short schedule with those of means and scales doubled, and the higher SH bands in every second step
+    short schedule with those of means, scales and rotations up to four times higher, and the higher SH bands in every second step
     (docs/decisions/0015-the-fast-preset.md).
     """
     config = scheduled(schedule or ("short" if preset == "fast" else "paper"), iterations)
@@ -354,7 +354,11 @@ def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> Train
         config,
         warmup=tuple(sorted({max(iterations // 14, 1), max(2 * iterations // 7, 1)})),
         optimiser=replace(
-            optimiser, means_rate=2 * optimiser.means_rate, scales_rate=2 * optimiser.scales_rate, sh_rest_every=2
+            optimiser,
+            means_rate=2 * optimiser.means_rate,
+            scales_rate=4 * optimiser.scales_rate,
+            quaternions_rate=2 * optimiser.quaternions_rate,
+            sh_rest_every=2,
         ),
         density=replace(config.density, gradient_threshold=3e-4, min_contribution=0.1),
     )
