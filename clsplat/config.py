@@ -342,8 +342,8 @@ def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> Train
 
     fast trains less: on pictures of a quarter of the size for a fourteenth of the steps and of half the size until two
     sevenths, with fewer Gaussians, those dropped that add less than a tenth of a pixel to every view, the rates of the
-    short schedule with those of means, scales and rotations up to four times higher, and the higher SH bands in every second step
-    (docs/decisions/0015-the-fast-preset.md).
+    short schedule with those of means, scales and rotations up to four times higher, and the higher SH bands in every
+    second step (docs/decisions/0015-the-fast-preset.md).
     """
     config = scheduled(schedule or ("short" if preset == "fast" else "paper"), iterations)
     config = replace(config, rasterizer=PRESETS[preset])
