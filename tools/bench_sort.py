@@ -34,6 +34,8 @@ from clsplat.plots import Panel, check_plot, plot_growth
 from clsplat.stages.sort import sort
 
 SMALLEST, LINEAR_FROM = 10_000, 100_000
+TARGET = 4_000_000
+"""Measured too: pairs of a large frame."""
 DEPTH_BITS = 31
 """Bits of a positive float32."""
 TILES_X, TILES_Y = 50, 30
@@ -159,7 +161,7 @@ def run(arguments: list[str]) -> int:
         check_plot(options.plot)
     device = open_device(options.device)
     rows = []
-    for n in sizes(SMALLEST, options.max):
+    for n in sorted({*sizes(SMALLEST, options.max), *([TARGET] if options.max >= TARGET else [])}):
         print(f"{n:,} keys", file=sys.stderr, flush=True)
         rows += [measure(device, name, n, options.repeat) for name in CASES]
     found = {name: deviation([row for row in rows if row["sort"] == name]) for name in CASES}
