@@ -72,11 +72,12 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     const int cell = get_local_id(0) + k * ITEMS;
     const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
     t[k] = LOAD_CELL(float, transmittance + pixel, stride);
-    g_red[k] = LOAD_CELL(float, image_gradient + pixel, stride);
-    g_green[k] = LOAD_CELL(float, image_gradient + plane + pixel, stride);
-    g_blue[k] = LOAD_CELL(float, image_gradient + 2 * plane + pixel, stride);
-    behind[k] = t[k] * (g_red[k] * background[0] + g_green[k] * background[1] + g_blue[k] * background[2]);
     stop[k] = LOAD_CELL(int, stops + pixel, stride);
+    const intL inside = MASKL(stop[k] >= 0); // in padding nobody has written a gradient, and 0 * NaN is not 0
+    g_red[k] = AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + pixel, stride) & inside);
+    g_green[k] = AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + plane + pixel, stride) & inside);
+    g_blue[k] = AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + 2 * plane + pixel, stride) & inside);
+    behind[k] = t[k] * (g_red[k] * background[0] + g_green[k] * background[1] + g_blue[k] * background[2]);
     last = max(last, maxL(stop[k]));
     if (ANYL((g_red[k] != 0.0f) | (g_green[k] != 0.0f) | (g_blue[k] != 0.0f))) OPEN_CELL(live, cell);
   }

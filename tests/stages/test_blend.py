@@ -163,6 +163,20 @@ def test_cells_without_a_gradient_are_left_out(device: Device, name: str, lanes:
     assert slots[0].any()
 
 
+@pytest.mark.parametrize("rubbish", [np.nan, np.inf, 1e30])
+def test_gradients_in_padding_are_not_looked_at(shaped_device: Device, rubbish: float) -> None:
+    """Nobody writes them: memory that was something else's lies there."""
+    run = Pipeline.run(shaped_device, scenes.random_cloud(200, 3, 33, 19))
+    frame, rasterizer = run.frame, run.rasterizer
+    values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
+    of = (rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background, frame.blended)
+    slots = []
+    for padding in (0.0, rubbish):
+        values[:, 19:], values[:, :, 33:] = padding, padding
+        slots.append(blend_grad(*of, upload(rasterizer.device, values)).get())
+    assert_same_bits(slots[0] + np.float32(0), slots[1] + np.float32(0))
+
+
 def test_without_a_gradient_nothing_is_recorded(default_device: Device) -> None:
     gaussians, camera = scenes.NAMED["overlap"]()
     rasterizer = Rasterizer(default_device)
