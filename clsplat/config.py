@@ -117,7 +117,7 @@ PRESETS: dict[Preset, RasterizerConfig] = {
     "fast": RasterizerConfig(alpha_min=2 / 255, transmittance_min=1e-3),
 }
 """exact: nothing approximate; default: what is on unless asked for, equal to exact as long as every default has an
-error of zero; fast: approximations that are worth their error (a first guess until docs/performance.md has figures)."""
+error of zero; fast: approximations that are worth their error (docs/performance.md)."""
 
 
 @dataclass(frozen=True)

@@ -144,13 +144,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
         d_red = fmaL(weight, g_red[k], d_red);
         d_green = fmaL(weight, g_green[k], d_green);
         d_blue = fmaL(weight, g_blue[k], d_blue);
-        const floatL gu = g * u, gv = g * v;
-        sum_g += g;
-        sum_gu += gu;
-        sum_gv += gv;
-        sum_guu = fmaL(gu, u, sum_guu);
-        sum_guv = fmaL(gu, v, sum_guv);
-        sum_gvv = fmaL(gv, v, sum_gvv);
+        ADD_MOMENTS(g, u, v);
 #ifdef ABSOLUTE_GRADIENTS
         abs_x += fabs(g * (l11 * u));
         abs_y += fabs(g * fmaL((floatL)(l12), u, l22 * v));

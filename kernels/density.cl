@@ -21,11 +21,7 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   seen[i] += 1.0f;
   __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
   const float l11 = splat[SPLAT_L11] / WHITEN, l12 = splat[SPLAT_L12] / WHITEN, l22 = splat[SPLAT_L22] / WHITEN;
-  const float syy = 1.0f / (l22 * l22);
-  const float sxy = -(l12 / l11) * syy;
-  const float sxx = 1.0f / (l11 * l11) + sxy * sxy / syy;
-  const float middle = 0.5f * (sxx + syy), half_difference = 0.5f * (sxx - syy);
-  const float radius = ceil(3.0f * sqrt(middle + sqrt(fma1(half_difference, half_difference, sxy * sxy))));
+  const float radius = ceil(3.0f * sqrt(larger_eigenvalue(l11, l12, l22)));
   radii[i] = radii[i] > radius ? radii[i] : radius;
 }
 

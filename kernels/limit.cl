@@ -65,13 +65,7 @@ GROUP __kernel void limit_blend_grad(const int rounds, __global const float *spl
       d_red = fmaL(weight, g_red, d_red);
       d_green = fmaL(weight, g_green, d_green);
       d_blue = fmaL(weight, g_blue, d_blue);
-      const floatL gu = g * u, gv = g * v;
-      sum_g += g;
-      sum_gu += gu;
-      sum_gv += gv;
-      sum_guu = fmaL(gu, u, sum_guu);
-      sum_guv = fmaL(gu, v, sum_guv);
-      sum_gvv = fmaL(gv, v, sum_gvv);
+      ADD_MOMENTS(g, u, v);
     }
     sum += sumL(sum_g + sum_gu + sum_gv + sum_guu + sum_guv + sum_gvv + d_red + d_green + d_blue + t);
   }

@@ -1,8 +1,8 @@
 // Where each tile's pairs begin and end in the sorted list.
 #include "shared/math.h"
 
-// tile_keys, pair_from_sorted (pairs), sorted; pair_ids (pairs): slot and Gaussian, by depth -> ranges (tiles, 2), zeroed before; slot_from_sorted,
-// gaussian_from_sorted (pairs)
+// tile_keys, pair_from_sorted (pairs), sorted; pair_ids (pairs): slot and Gaussian, by depth -> ranges (tiles, 2), zeroed
+// before; slot_from_sorted, gaussian_from_sorted (pairs)
 __kernel void ranges(const uint pairs, __global const uint *tile_keys, __global const uint *pair_from_sorted,
                      __global const uint2 *pair_ids, __global uint *ranges, __global uint *slot_from_sorted,
                      __global uint *gaussian_from_sorted) {

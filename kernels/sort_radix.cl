@@ -25,7 +25,8 @@ static inline void count_digits(uint begin, uint end, uint base, uint shift, uin
 
 // keys (n) -> histograms (digits, groups)
 GROUP __kernel void radix_histogram(const uint n, const uint chunk, const uint base, const uint shift,
-                                    const uint digits, __global const uint *keys, __global uint *histograms, __local uint *counters) {
+                                    const uint digits, __global const uint *keys, __global uint *histograms,
+                                    __local uint *counters) {
   RUN(begin, end)
   count_digits(begin, end, base, shift, digits, keys, counters);
   for (uint digit = get_local_id(0); digit < digits; digit += ITEMS) {

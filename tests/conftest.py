@@ -15,6 +15,7 @@ from opencl_drivers import use_every_driver
 use_every_driver()
 
 from calls import train
+from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from pipeline import shaped
 from tiny import CONFIG, write_scene
 

@@ -6,158 +6,19 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
 from calls import Capture, command, error_line
-from models import random_gaussians
+from fakes import Pipeline
 
 from clsplat import verbs
-from clsplat.camera import Camera
-from clsplat.cli import Eval, Render, Train, main, parse
-from clsplat.config import PRESETS, RasterizerConfig, TrainConfig
-from clsplat.errors import ClsplatError, DeviceError, InputError
-from clsplat.gaussians import Gaussians
+from clsplat.cli import Eval, Train, main, parse
+from clsplat.config import TrainConfig
+from clsplat.errors import ClsplatError, InputError
 from clsplat.runs import Run
-
-
-def camera(width: int = 32, height: int = 24) -> Camera:
-    return Camera(width, height, 30.0, 31.0, width / 2, height / 2, np.eye(3), np.zeros(3))
-
-
-@dataclass
-class FakeView:
-    name: str
-    split: str
-    camera: Camera = field(default_factory=camera)
-
-    def load(self) -> np.ndarray:
-        return np.full((self.camera.height, self.camera.width, 3), 0.5, np.float32)
-
-
-@dataclass
-class FakeDevice:
-    name: str = "processor"
-    driver: str = "OpenCL 3.0 driver 1.0"
-
-
-@dataclass
-class Pipeline:
-    """What the fakes were asked for, and what they are to do."""
-
-    calls: list[tuple[Any, ...]] = field(default_factory=list)
-    written: dict[str, np.ndarray] = field(default_factory=dict)
-    cameras: dict[str, Camera] = field(default_factory=lambda: {"a.jpg": camera(), "sub/b.c.jpg": camera(20, 40)})
-    training: Callable[..., None] = lambda *_: None
-
-
-@pytest.fixture
-def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
-    """Stands in for scene, device, trainer, renderer and image files."""
-    pipe = Pipeline()
-
-    @dataclass
-    class Scene:
-        views: list[FakeView]
-        warnings: list[str]
-        name: str = "photos"
-        points: tuple[float, ...] = ()
-
-        @property
-        def train_views(self) -> list[FakeView]:
-            return [view for view in self.views if view.split == "train"]
-
-        @property
-        def test_views(self) -> list[FakeView]:
-            return [view for view in self.views if view.split == "test"]
-
-        def require_training_views(self) -> list[FakeView]:
-            return self.train_views
-
-        def check_pictures(self) -> None:
-            """Real pictures are cut in test_scene.py."""
-
-    @dataclass
-    class Result:
-        image: np.ndarray
-        alpha: np.ndarray
-
-    @dataclass
-    class Report:
-        step: int
-        loss: float = 0.1
-        psnr: float = 20.0
-        gaussians: int = 4
-        seconds: float = 1.0
-
-    class Renderer:
-        def __init__(self, device: object, config: object = None) -> None:
-            assert isinstance(device, FakeDevice)
-            assert config == RasterizerConfig()
-
-        def render(self, gaussians: Gaussians, camera: Camera, background: tuple[float, ...] = (0, 0, 0)) -> Result:
-            pipe.calls.append(("render", len(gaussians), camera.width, camera.height, tuple(background)))
-            size = (camera.height, camera.width)
-            return Result(np.full((*size, 3), 0.25, np.float32), np.full(size, 0.5, np.float32))
-
-    def load_scene(path: Path, *, resolution: int, test_every: int, progress: Callable[..., None]) -> Scene:
-        if not Path(path).is_dir():
-            raise InputError(f"{path}: no such folder")
-        pipe.calls.append(("load_scene", str(path), resolution, test_every))
-        views = [FakeView("0.jpg", "test"), FakeView("1.jpg", "train")]
-        return Scene(views if test_every else views[1:], ["one photo is dark"])
-
-    def train(
-        scene: Scene, config: TrainConfig, *, device: FakeDevice, run: Run, resume: bool, on_step: Any, on_plan: Any
-    ) -> Gaussians:
-        pipe.calls.append(("train", config.iterations, config.seed, resume))
-        on_step(Report(1))
-        pipe.training(run, on_step)
-        gaussians = random_gaussians(4)
-        run.save_model(gaussians)
-        run.append_metrics({"step": config.iterations, "loss": 0.1, "gaussians": 4, "seconds": 2.5})
-        run.write_eval({"step": 1, "gaussians": 4, "seconds": 2.5, "mean": {"psnr": 20.0, "ssim": 0.5}, "views": [{}]})
-        return gaussians
-
-    def open_device(selector: str | None, memory_limit: int | None = None) -> FakeDevice:
-        if selector == "nosuch":
-            raise DeviceError("--device nosuch: no such device")
-        return FakeDevice()
-
-    def write_image(path: Path, image: np.ndarray, *, alpha: str = "straight") -> None:
-        assert image.shape[2] == 3 or alpha == "associated"
-        pipe.written[str(path)] = image
-
-    fakes: dict[str, dict[str, Any]] = {
-        "scene": {"load_scene": load_scene},
-        "training": {"train": train},
-        "rendering": {"Renderer": Renderer},
-        "device.context": {"open_device": open_device},
-        "colmap": {"read_cameras": lambda _: pipe.cameras},
-        "images": {"write_image": write_image},
-    }
-    for name, members in fakes.items():
-        module = ModuleType(f"clsplat.{name}")
-        vars(module).update(members)
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-    return pipe
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> str:
-    (tmp_path / "scene").mkdir()
-    return str(tmp_path / "scene")
-
-
-@pytest.fixture
-def model(tmp_path: Path) -> str:
-    path = tmp_path / "some.ply"
-    random_gaussians(4).save(path)
-    return str(path)
 
 
 @pytest.mark.parametrize("verb", ["devices", "demo", "sfm", "train", "eval", "render"])
@@ -212,8 +73,8 @@ def test_flags_become_the_config() -> None:
         ("--test-every -1", "--test-every -1"),
     ],
 )
-def test_settings_without_sense(flags: str, message: str, scene: str, tmp_path: Path, capsys: Capture) -> None:
-    assert main(["train", scene, "-o", str(tmp_path / "run"), *flags.split()]) == 2
+def test_settings_without_sense(flags: str, message: str, folder: str, tmp_path: Path, capsys: Capture) -> None:
+    assert main(["train", folder, "-o", str(tmp_path / "run"), *flags.split()]) == 2
     assert message in error_line(capsys)
     assert not (tmp_path / "run").exists()
 
@@ -249,14 +110,14 @@ def test_interrupted_anywhere(monkeypatch: pytest.MonkeyPatch, capsys: Capture) 
     assert capsys.readouterr().err == "clsplat: interrupted\n"
 
 
-def test_warnings_are_lines(model: str, scene: str, pipeline: Pipeline, capsys: Capture) -> None:
+def test_warnings_are_lines(model: str, folder: str, pipeline: Pipeline, capsys: Capture) -> None:
     with open(model, "ab") as file:
         file.write(b"more")
-    assert main(["eval", model, "--scene", scene]) == 0
+    assert main(["eval", model, "--scene", folder]) == 0
     assert f"clsplat: warning: {model}: 4 bytes after the last Gaussian ignored\n" in capsys.readouterr().err
 
 
-def test_sfm(scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+def test_sfm(folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     calls = []
 
     def reconstruct(photos: Path, output: Path, *, progress: Callable[..., None], **options: object) -> Path:
@@ -269,56 +130,56 @@ def test_sfm(scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
     fake = ModuleType("clsplat.sfm")
     vars(fake).update(reconstruct=reconstruct, RECORD="sfm.json")
     monkeypatch.setitem(sys.modules, "clsplat.sfm", fake)
-    assert main(["sfm", scene, "-o", str(tmp_path / "out"), "--matching", "sequential", "--json"]) == 0
+    assert main(["sfm", folder, "-o", str(tmp_path / "out"), "--matching", "sequential", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out) == {"photos": 3}
     assert captured.err.splitlines()[0] == "matching photos 50 %"
     options = {"matching": "sequential", "camera_model": "auto", "threads": None, "seed": 0, "overwrite": False}
-    assert calls == [(scene, options)]
+    assert calls == [(folder, options)]
     assert main(["sfm", str(tmp_path / "none"), "-o", str(tmp_path / "out")]) == 2
     assert "none: no such folder" in error_line(capsys)
 
 
-def test_train(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+def test_train(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
     run = tmp_path / "runs" / "a"
-    assert main(["train", scene, "-o", str(run), "--iterations", "9", "--json"]) == 0
+    assert main(["train", folder, "-o", str(run), "--iterations", "9", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["mean"]["psnr"] == 20
     assert "clsplat: warning: one photo is dark" in captured.err
     assert "step 1/9  loss 0.1000" in captured.err
-    assert pipeline.calls == [("load_scene", scene, 0, 8), ("train", 9, 0, False)]
-    assert Run.open(run).scene == Path(scene)
+    assert pipeline.calls == [("load_scene", folder, 0, 8), ("train", 9, 0, False)]
+    assert Run.open(run).scene == Path(folder)
 
 
-def test_an_output_that_is_a_run(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+def test_an_output_that_is_a_run(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
     run = tmp_path / "run"
-    assert main(["train", scene, "-o", str(run), "--iterations", "9", "--seed", "3"]) == 0
+    assert main(["train", folder, "-o", str(run), "--iterations", "9", "--seed", "3"]) == 0
     before = (run / "model.ply").read_bytes()
     capsys.readouterr()
     pipeline.calls.clear()
-    assert main(["train", scene, "-o", str(run)]) == 2
+    assert main(["train", folder, "-o", str(run)]) == 2
     assert "already a run, use --resume" in error_line(capsys)
-    assert main(["train", scene, "-o", str(run), "--resume", "--overwrite"]) == 2
+    assert main(["train", folder, "-o", str(run), "--resume", "--overwrite"]) == 2
     assert "exclude each other" in error_line(capsys)
-    assert main(["train", scene, "-o", scene, "--resume"]) == 2
+    assert main(["train", folder, "-o", folder, "--resume"]) == 2
     assert "no run to resume" in error_line(capsys)
-    for wrong in (["/no/such/scene"], [scene, "--device", "nosuch"], []):
+    for wrong in (["/no/such/scene"], [folder, "--device", "nosuch"], []):
         assert main(["train", *wrong, "-o", str(run), "--overwrite"]) == 2
         assert "expected" in error_line(capsys) or wrong
     assert (run / "model.ply").read_bytes() == before
     assert not any(call[0] == "train" for call in pipeline.calls)
 
-    assert main(["train", scene, "-o", str(run), "--overwrite", "--iterations", "5"]) == 0
+    assert main(["train", folder, "-o", str(run), "--overwrite", "--iterations", "5"]) == 0
     assert pipeline.calls[-1] == ("train", 5, 0, False)
 
 
-def test_resume_takes_the_runs_settings(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+def test_resume_takes_the_runs_settings(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
     run = str(tmp_path / "run")
     flags = ["--iterations", "9", "--seed", "3", "--density.absolute-gradients", "--warmup", "2,4"]
-    assert main(["train", scene, "-o", run, *flags]) == 0
+    assert main(["train", folder, "-o", run, *flags]) == 0
     assert main(["train", "--resume", "-o", run, "--iterations", "20"]) == 0
-    assert pipeline.calls[-2:] == [("load_scene", scene, 0, 8), ("train", 20, 3, True)]
-    assert main(["train", scene, "-o", run, *flags, "--resume"]) == 0  # the first call again, with one flag more
+    assert pipeline.calls[-2:] == [("load_scene", folder, 0, 8), ("train", 20, 3, True)]
+    assert main(["train", folder, "-o", run, *flags, "--resume"]) == 0  # the first call again, with one flag more
     assert pipeline.calls[-1] == ("train", 9, 3, True)
     config = Run.open(run).config
     assert config.density.absolute_gradients
@@ -328,23 +189,23 @@ def test_resume_takes_the_runs_settings(scene: str, tmp_path: Path, pipeline: Pi
     assert "seed is 3 there" in error_line(capsys)
 
 
-def test_ctrl_c_leaves_a_resumable_run(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+def test_ctrl_c_leaves_a_resumable_run(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
     def interrupt(run: Run, on_step: object) -> None:
         run.save_checkpoint(4, {}, {})
         raise KeyboardInterrupt
 
     pipeline.training = interrupt
     run = str(tmp_path / "run")
-    assert main(["train", scene, "-o", run]) == 130
+    assert main(["train", folder, "-o", run]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == f"clsplat: interrupted at step 4; go on with: clsplat train -o {run} --resume"
     pipeline.training = lambda *_: None
     assert main(["train", "-o", run, "--resume"]) == 0
 
 
-def test_eval_of_a_run(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
+def test_eval_of_a_run(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
     run = tmp_path / "run"
-    assert main(["train", scene, "-o", str(run), "--background", "white", "--iterations", "9"]) == 0
+    assert main(["train", folder, "-o", str(run), "--background", "white", "--iterations", "9"]) == 0
     (run / "eval.json").unlink()
     capsys.readouterr()
     assert main(["eval", str(run), "--json"]) == 0
@@ -357,29 +218,29 @@ def test_eval_of_a_run(scene: str, tmp_path: Path, pipeline: Pipeline, capsys: C
     assert list(pipeline.written) == [str(run / "test" / "0.png")]
 
     assert main(["eval", str(run / "model.ply"), "--background", "black", "--resolution", "99"]) == 0
-    assert pipeline.calls[-2:] == [("load_scene", scene, 99, 8), ("render", 4, 32, 24, (0, 0, 0))]
+    assert pipeline.calls[-2:] == [("load_scene", folder, 99, 8), ("render", 4, 32, 24, (0, 0, 0))]
     assert "1 held-out views  PSNR 12.04 dB" in capsys.readouterr().out
 
 
-def test_eval_that_cannot_be(scene: str, model: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
+def test_eval_that_cannot_be(folder: str, model: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
     cases = [
         ([model], "expected --scene SCENE"),
-        ([model, "--scene", scene, "--test-every", "0"], "no view is held out"),
-        ([model, "--scene", scene, "--device", "nosuch"], "no such device"),
-        ([str(tmp_path / "none.ply"), "--scene", scene], "no such file"),
-        ([scene], "not a run"),
+        ([model, "--scene", folder, "--test-every", "0"], "no view is held out"),
+        ([model, "--scene", folder, "--device", "nosuch"], "no such device"),
+        ([str(tmp_path / "none.ply"), "--scene", folder], "no such file"),
+        ([folder], "not a run"),
     ]
     for arguments, message in cases:
         assert main(["eval", *arguments]) == 2, arguments
         assert message in capsys.readouterr().err.splitlines()[-1]
-    Run.create(tmp_path / "new", TrainConfig(), scene=scene)
+    Run.create(tmp_path / "new", TrainConfig(), scene=folder)
     assert main(["eval", str(tmp_path / "new")]) == 2
     assert "has not written its model yet" in error_line(capsys)
 
 
 @pytest.mark.parametrize("verb", ["eval", "render"])
 @pytest.mark.parametrize("trouble", ["property", "nan", "none", "truncated", "text"])
-def test_bad_models(verb: str, trouble: str, model: str, scene: str, pipeline: Pipeline, capsys: Capture) -> None:
+def test_bad_models(verb: str, trouble: str, model: str, folder: str, pipeline: Pipeline, capsys: Capture) -> None:
     path = Path(model)
     head, data = path.read_bytes().split(b"end_header\n")
     content, message = {
@@ -390,103 +251,11 @@ def test_bad_models(verb: str, trouble: str, model: str, scene: str, pipeline: P
         "text": (b"hello", "not a PLY"),
     }[trouble]
     path.write_bytes(content)
-    rest = ["--scene", scene] if verb == "eval" else ["--cameras", scene, "-o", "{name}.png"]
+    rest = ["--scene", folder] if verb == "eval" else ["--cameras", folder, "-o", "{name}.png"]
     assert main([verb, model, *rest]) == 2
     line = error_line(capsys)
     assert message in line
     assert model in line
-    assert not pipeline.written
-
-
-def test_render(model: str, scene: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
-    pattern = str(tmp_path / "out" / "x_{name}_y.exr")
-    assert main(["render", model, "--cameras", scene, "-o", pattern, "--background", "0.5,0,1", "--json"]) == 0
-    records = json.loads(capsys.readouterr().out)
-    assert [record["name"] for record in records] == ["a.jpg", "sub/b.c.jpg"]
-    assert [Path(record["path"]) for record in records] == [
-        tmp_path / "out" / "x_a_y.exr",
-        tmp_path / "out" / "x_sub" / "b.c_y.exr",
-    ]
-    assert list(pipeline.written) == [record["path"] for record in records]
-    assert pipeline.calls == [("render", 4, 32, 24, (0.5, 0, 1)), ("render", 4, 20, 40, (0.5, 0, 1))]
-    assert pipeline.written[records[0]["path"]].shape == (24, 32, 3)
-
-
-def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture) -> None:
-    run = tmp_path / "run"
-    own = RasterizerConfig(alpha_min=3 / 255, sh_angle=0.5)
-    Run.create(run, TrainConfig(rasterizer=own))
-
-    def parsed(path: object, *flags: str) -> Render:
-        verb = parse(["render", str(path), "--cameras", "S", "-o", "{name}.png", "--alpha", "--json", *flags])
-        assert isinstance(verb, Render)
-        assert (verb.model, verb.output, verb.alpha, verb.json) == (Path(str(path)), "{name}.png", True, True)
-        return verb
-
-    half = ["--rasterizer.sh-storage", "half", "--rasterizer.no-frustum-cull"]
-    changes: dict[str, Any] = {"sh_storage": "half", "frustum_cull": False}
-    for path, bundle in ((model, RasterizerConfig()), (run, own)):
-        assert parsed(path).rasterizer == bundle
-        assert parsed(path, *half).rasterizer == replace(bundle, **changes)
-        for preset in ("exact", "default", "fast"):
-            assert parsed(path, "--preset", preset).rasterizer == PRESETS[preset]
-            assert parsed(path, *half, "--preset", preset).rasterizer == replace(PRESETS[preset], **changes)
-    assert parsed(run, "--rasterizer.sh-angle", "0").rasterizer == replace(own, sh_angle=0.0)
-    assert main(["render", model, "--cameras", "S", "-o", "{name}.png", "--rasterizer.sh-angle", "-1"]) == 2
-    assert "--rasterizer.sh-angle -1.0: expected 0 to 90 degrees" in error_line(capsys)
-    assert main(["render", str(tmp_path), "--cameras", "S", "-o", "{name}.png"]) == 2
-    assert "not a run" in error_line(capsys)
-
-
-@pytest.mark.parametrize("extension", ["exr", "png"])
-def test_render_with_alpha(extension: str, model: str, scene: str, pipeline: Pipeline, tmp_path: Path) -> None:
-    assert main(["render", model, "--cameras", scene, "-o", f"{tmp_path}/{{name}}.{extension}", "--alpha"]) == 0
-    image = pipeline.written[f"{tmp_path}/a.{extension}"]
-    np.testing.assert_allclose(image, np.broadcast_to([0.25] * 3 + [0.5], (24, 32, 4)))
-
-
-@pytest.mark.parametrize(
-    ("flags", "size"),
-    [
-        ("--width 64", (64, 48)),
-        ("--height 12", (16, 12)),
-        ("--scale 0.5", (16, 12)),
-        ("--width 10 --height 5", (10, 5)),
-    ],
-)
-def test_render_sizes(
-    flags: str, size: tuple[int, int], model: str, scene: str, pipeline: Pipeline, tmp_path: Path
-) -> None:
-    pipeline.cameras = {"a.jpg": camera()}
-    assert main(["render", model, "--cameras", scene, "-o", str(tmp_path / "one.png"), *flags.split()]) == 0
-    assert pipeline.calls == [("render", 4, *size, (0, 0, 0))]
-
-
-def test_render_that_cannot_be(model: str, scene: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
-    out = str(tmp_path / "{name}.png")
-    cases = [
-        (["--cameras", scene, "-o", str(tmp_path / "one.png")], "has no {name} in it, expected one to tell 2 cameras"),
-        (["--cameras", scene, "-o", str(tmp_path / "{name}.tga")], "extension '.tga', expected .png or .exr"),
-        (["--cameras", scene, "-o", str(tmp_path / "{name}")], "extension 'none'"),
-        (["--cameras", str(tmp_path / "none"), "-o", out], "none: no such folder"),
-        (["--cameras", scene, "-o", out, "--background", "red"], "expected black, white or three numbers"),
-        (["--cameras", scene, "-o", out, "--background", "1,2,3"], "expected black, white or three numbers"),
-        (["--cameras", scene, "-o", out, "--background", "white", "--alpha"], "exclude each other"),
-        (["--cameras", scene, "-o", out, "--width", "0"], "--width 0: expected a number above 0"),
-        (["--cameras", scene, "-o", out, "--scale", "2", "--width", "9"], "exclude each other"),
-        (["--cameras", scene, "-o", out, "--device", "nosuch"], "no such device"),
-    ]
-    for arguments, message in cases:
-        assert main(["render", model, *arguments]) == 2, arguments
-        assert message in error_line(capsys)
-    for names, message in [
-        (["a.jpg", "a.png"], "would be both a.jpg and a.png"),
-        (["../../a.jpg"], "leads out of the output folder"),
-        ([], "has no images"),
-    ]:
-        pipeline.cameras = {name: camera() for name in names}
-        assert main(["render", model, "--cameras", scene, "-o", out]) == 2
-        assert message in error_line(capsys)
     assert not pipeline.written
 
 
@@ -500,8 +269,8 @@ def test_devices_for_real() -> None:
 
 
 @pytest.mark.parametrize("arguments", [["train", "SCENE", "-o", "RUN"], ["eval", "MODEL", "--scene", "SCENE"]])
-def test_unknown_device_for_real(arguments: list[str], scene: str, model: str, tmp_path: Path) -> None:
-    places = {"SCENE": scene, "RUN": str(tmp_path / "run"), "MODEL": model}
+def test_unknown_device_for_real(arguments: list[str], folder: str, model: str, tmp_path: Path) -> None:
+    places = {"SCENE": folder, "RUN": str(tmp_path / "run"), "MODEL": model}
     done = command(*(places.get(word, word) for word in arguments), "--device", "no such thing")
     assert done.returncode == 2
     assert done.stdout == ""

@@ -30,6 +30,16 @@ class Blended:
     cells_from_sorted: DeviceArray | None
 
 
+def _planes(work: Workspace, width: int, height: int) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+    """Image, transmittance and stops of a frame: the workspace's, whoever asks."""
+    rows, stride = -(-height // TILE) * TILE, -(-width // TILE) * TILE
+    return (
+        work.array("image", (3, rows, stride)),
+        work.array("transmittance", (rows, stride)),
+        work.array("stops", (rows, stride), np.int32),
+    )
+
+
 def tile_items(device: Device) -> int:
     """Work-items that share a tile: no more than it has vectors."""
     return min(device.shape.items, TILE * TILE // device.shape.lanes)
@@ -54,10 +64,7 @@ def blend(
     record: keep the cells that the gradient has to go through, where the kernels' shape has them.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    rows, stride = tiles_y * TILE, tiles_x * TILE
-    image = work.array("image", (3, rows, stride))
-    transmittance = work.array("transmittance", (rows, stride))
-    stops = work.array("stops", (rows, stride), np.int32)
+    planes = _planes(work, width, height)
     items = tile_items(device)
     cells = None
     if record and items == 1 and device.shape.lanes >= 8:
@@ -76,12 +83,10 @@ def blend(
         lists.gaussian_from_sorted,
         splats,
         background,
-        image,
-        transmittance,
-        stops,
+        *planes,
         *([cells] if cells else []),
     )
-    return Blended(image, transmittance, stops, cells)
+    return Blended(*planes, cells)
 
 
 def count_pairs(
@@ -99,12 +104,7 @@ def count_pairs(
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     items = tile_items(device)
-    rows, stride = tiles_y * TILE, tiles_x * TILE
-    planes = (  # those of `blend`: it writes the same values again
-        work.array("image", (3, rows, stride)),
-        work.array("transmittance", (rows, stride)),
-        work.array("stops", (rows, stride), np.int32),
-    )
+    planes = _planes(work, camera.width, camera.height)  # those of `blend`: it writes the same values again
     tiles = band.tiles if band else tiles_x * tiles_y
     counts = work.array("counts", (tiles * items, 2), np.uint32)
     launch_groups(

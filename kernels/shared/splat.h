@@ -4,6 +4,15 @@
 #define WHITEN 0.84932180028801904f
 #define INVERSE_WHITEN2 1.38629436111989062f // 1 / WHITEN^2 = 2 ln 2
 
+// The larger eigenvalue of the covariance of which (l11, l12, l22) is the whitening.
+static inline float larger_eigenvalue(float l11, float l12, float l22) {
+  const float syy = 1.0f / (l22 * l22);
+  const float sxy = -(l12 / l11) * syy;
+  const float sxx = 1.0f / (l11 * l11) + sxy * sxy / syy;
+  const float middle = 0.5f * (sxx + syy), half_difference = 0.5f * (sxx - syy);
+  return middle + sqrt(fma1(half_difference, half_difference, sxy * sxy));
+}
+
 // Floats from one pair's slot to the next. The contribution, where it is kept, is behind the gradients.
 #ifdef ABSOLUTE_GRADIENTS
 #define SLOT_GRADIENTS SLOT_SIZE

@@ -1,5 +1,6 @@
 // The one place that says which tiles a projected Gaussian reaches. Counting and emitting both call it: were they to
 // disagree by one tile, the emitted pairs would overrun or leave holes in the arrays that the count sized.
+#include "shared/splat.h"
 
 // Slack in pixels over what float32 loses here; a tile too many only costs time, one too few would show.
 #define TILE_SLACK 0.01f
@@ -47,12 +48,7 @@ typedef struct {
 #ifdef SQUARE_TILE_TEST
 // In pixels: the larger eigenvalue of the covariance, as Kerbl et al.'s code has it, which comes back from its whitening.
 static inline float longest_half_axis(__global const float *splat) {
-  const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
-  const float syy = 1.0f / (l22 * l22);
-  const float sxy = -(l12 / l11) * syy;
-  const float sxx = 1.0f / (l11 * l11) + sxy * sxy / syy;
-  const float middle = 0.5f * (sxx + syy), half_difference = 0.5f * (sxx - syy);
-  const float larger = middle + sqrt(half_difference * half_difference + sxy * sxy);
+  const float larger = larger_eigenvalue(splat[SPLAT_L11], splat[SPLAT_L12], splat[SPLAT_L22]);
   return sqrt(EXTENT(splat[SPLAT_LOG2O]) * larger);
 }
 #endif

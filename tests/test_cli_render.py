@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat render` as a user calls it, on fakes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calls import Capture, error_line
+from fakes import Pipeline, camera
+
+from clsplat.cli import Render, main, parse
+from clsplat.config import PRESETS, RasterizerConfig, TrainConfig
+from clsplat.runs import Run
+
+
+def test_render(model: str, folder: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
+    pattern = str(tmp_path / "out" / "x_{name}_y.exr")
+    assert main(["render", model, "--cameras", folder, "-o", pattern, "--background", "0.5,0,1", "--json"]) == 0
+    records = json.loads(capsys.readouterr().out)
+    assert [record["name"] for record in records] == ["a.jpg", "sub/b.c.jpg"]
+    assert [Path(record["path"]) for record in records] == [
+        tmp_path / "out" / "x_a_y.exr",
+        tmp_path / "out" / "x_sub" / "b.c_y.exr",
+    ]
+    assert list(pipeline.written) == [record["path"] for record in records]
+    assert pipeline.calls == [("render", 4, 32, 24, (0.5, 0, 1)), ("render", 4, 20, 40, (0.5, 0, 1))]
+    assert pipeline.written[records[0]["path"]].shape == (24, 32, 3)
+
+
+def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture) -> None:
+    run = tmp_path / "run"
+    own = RasterizerConfig(alpha_min=3 / 255, sh_angle=0.5)
+    Run.create(run, TrainConfig(rasterizer=own))
+
+    def parsed(path: object, *flags: str) -> Render:
+        verb = parse(["render", str(path), "--cameras", "S", "-o", "{name}.png", "--alpha", "--json", *flags])
+        assert isinstance(verb, Render)
+        assert (verb.model, verb.output, verb.alpha, verb.json) == (Path(str(path)), "{name}.png", True, True)
+        return verb
+
+    half = ["--rasterizer.sh-storage", "half", "--rasterizer.no-frustum-cull"]
+    changes: dict[str, Any] = {"sh_storage": "half", "frustum_cull": False}
+    for path, bundle in ((model, RasterizerConfig()), (run, own)):
+        assert parsed(path).rasterizer == bundle
+        assert parsed(path, *half).rasterizer == replace(bundle, **changes)
+        for preset in ("exact", "default", "fast"):
+            assert parsed(path, "--preset", preset).rasterizer == PRESETS[preset]
+            assert parsed(path, *half, "--preset", preset).rasterizer == replace(PRESETS[preset], **changes)
+    assert parsed(run, "--rasterizer.sh-angle", "0").rasterizer == replace(own, sh_angle=0.0)
+    assert main(["render", model, "--cameras", "S", "-o", "{name}.png", "--rasterizer.sh-angle", "-1"]) == 2
+    assert "--rasterizer.sh-angle -1.0: expected 0 to 90 degrees" in error_line(capsys)
+    assert main(["render", str(tmp_path), "--cameras", "S", "-o", "{name}.png"]) == 2
+    assert "not a run" in error_line(capsys)
+
+
+@pytest.mark.parametrize("extension", ["exr", "png"])
+def test_render_with_alpha(extension: str, model: str, folder: str, pipeline: Pipeline, tmp_path: Path) -> None:
+    assert main(["render", model, "--cameras", folder, "-o", f"{tmp_path}/{{name}}.{extension}", "--alpha"]) == 0
+    image = pipeline.written[f"{tmp_path}/a.{extension}"]
+    np.testing.assert_allclose(image, np.broadcast_to([0.25] * 3 + [0.5], (24, 32, 4)))
+
+
+@pytest.mark.parametrize(
+    ("flags", "size"),
+    [
+        ("--width 64", (64, 48)),
+        ("--height 12", (16, 12)),
+        ("--scale 0.5", (16, 12)),
+        ("--width 10 --height 5", (10, 5)),
+    ],
+)
+def test_render_sizes(
+    flags: str, size: tuple[int, int], model: str, folder: str, pipeline: Pipeline, tmp_path: Path
+) -> None:
+    pipeline.cameras = {"a.jpg": camera()}
+    assert main(["render", model, "--cameras", folder, "-o", str(tmp_path / "one.png"), *flags.split()]) == 0
+    assert pipeline.calls == [("render", 4, *size, (0, 0, 0))]
+
+
+def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
+    out = str(tmp_path / "{name}.png")
+    cases = [
+        (["--cameras", folder, "-o", str(tmp_path / "one.png")], "has no {name} in it, expected one to tell 2 cameras"),
+        (["--cameras", folder, "-o", str(tmp_path / "{name}.tga")], "extension '.tga', expected .png or .exr"),
+        (["--cameras", folder, "-o", str(tmp_path / "{name}")], "extension 'none'"),
+        (["--cameras", str(tmp_path / "none"), "-o", out], "none: no such folder"),
+        (["--cameras", folder, "-o", out, "--background", "red"], "expected black, white or three numbers"),
+        (["--cameras", folder, "-o", out, "--background", "1,2,3"], "expected black, white or three numbers"),
+        (["--cameras", folder, "-o", out, "--background", "white", "--alpha"], "exclude each other"),
+        (["--cameras", folder, "-o", out, "--width", "0"], "--width 0: expected a number above 0"),
+        (["--cameras", folder, "-o", out, "--scale", "2", "--width", "9"], "exclude each other"),
+        (["--cameras", folder, "-o", out, "--device", "nosuch"], "no such device"),
+    ]
+    for arguments, message in cases:
+        assert main(["render", model, *arguments]) == 2, arguments
+        assert message in error_line(capsys)
+    for names, message in [
+        (["a.jpg", "a.png"], "would be both a.jpg and a.png"),
+        (["../../a.jpg"], "leads out of the output folder"),
+        ([], "has no images"),
+    ]:
+        pipeline.cameras = {name: camera() for name in names}
+        assert main(["render", model, "--cameras", folder, "-o", out]) == 2
+        assert message in error_line(capsys)
+    assert not pipeline.written
