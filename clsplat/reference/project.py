@@ -238,7 +238,7 @@ def project_grad_covariances(
     d_opacities: Float64,
     d_colors: Float64,
 ) -> dict[str, Float64]:
-    """As `project_grad`, from what `project` made and the gradient by the covariances (N, 3), the xx, xy, yy of (28)."""
+    """As `project_grad`, from what `project` made and the gradient by the covariances (N, 3): xx, xy, yy of (28)."""
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
     x, y, z = geometry.p.T
