@@ -113,6 +113,28 @@ def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
     _save(figure, path)
 
 
+def plot_grid(path: Path, panels: Sequence[Panel], title: str, columns: int = 3) -> None:
+    """Panels in rows, their lines without markers, one legend for all."""
+    rows = -(-len(panels) // columns)
+    figure = import_module("matplotlib.figure").Figure(figsize=(4.4 * columns, 2.9 * rows + 0.8), layout="constrained")
+    figure.suptitle(title, fontsize=9)
+    grid = figure.subplots(rows, columns, squeeze=False).flat
+    for axes, panel in zip(grid, panels, strict=False):
+        for name, points in panel.measured.items():
+            if points:
+                axes.plot(*zip(*points, strict=True), linewidth=1.2, label=name)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel(panel.x, fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.grid(alpha=0.3)
+    for axes in list(grid):
+        axes.set_visible(False)
+    first = figure.axes[0]
+    figure.legend(*first.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
+    _save(figure, path)
+
+
 def _figure(title: str, columns: int) -> Any:
     figure = import_module("matplotlib.figure").Figure(figsize=(6 + 4 * (columns - 1) + 2 * (columns > 1), 5))
     figure.subplots(1, columns)

@@ -1,6 +1,6 @@
-// Projection (Kerbl et al. 2023, section 4; docs/gradients.md, equations 1 to 13 and 44 to 47): each Gaussian to its
-// ellipse, colour, depth and number of tiles. A work-item has LANES Gaussians: in vectors as far as all have the same to
-// do, then the visible ones by turns.
+// Projection (Kerbl et al. 2023, section 4; docs/gradients.md, equations 1 to 13, 44 to 47 and 53 to 57): each Gaussian to
+// its ellipse, colour, depth and number of tiles. A work-item has LANES Gaussians: in vectors as far as all have the same
+// to do, then the visible ones by turns.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -15,6 +15,12 @@
 #elif defined(NO_OPACITY_CULL)
 #define KEEP_CULLED !opaque.lane[lane]
 #endif
+
+// (12): NaN is 0.
+static inline float clamped_colour(float colour) {
+  const float below = colour < COLOUR_MAX ? colour : COLOUR_MAX;
+  return colour > 0.0f ? below : 0.0f;
+}
 
 // means (n, 3), quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n, 3),
 // sh_rest (n, coefficients - 1, 3); splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.
@@ -47,8 +53,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   Projection p;
   if (!project_gaussians(row, means, quaternions, log_scales, camera, &p)) return;
   const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
-  floatL dx = GATHER(means, 3, 0) - camera[CAMERA_PX], dy = GATHER(means, 3, 1) - camera[CAMERA_PY];
-  floatL dz = GATHER(means, 3, 2) - camera[CAMERA_PZ];
+  floatL dx = FROM_CAMERA(means, X, 0), dy = FROM_CAMERA(means, Y, 1), dz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(dx, dx, fmaL(dy, dy, dz * dz)));
   IntLanes opaque, valid;
   opaque.all = opacity > ALPHA_MIN;
@@ -130,9 +135,9 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     __global const shT *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
     for (int k = 1; k < used; ++k, f += 3)
       colour = sh_fma(basis[k].lane[lane], sh_channels(f, k + 1 == coefficients), colour);
-    splat[SPLAT_RED] = colour.x > 0.0f ? colour.x : 0.0f;
-    splat[SPLAT_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
-    splat[SPLAT_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
+    splat[SPLAT_RED] = clamped_colour(colour.x);
+    splat[SPLAT_GREEN] = clamped_colour(colour.y);
+    splat[SPLAT_BLUE] = clamped_colour(colour.z);
 #ifdef SH_CACHE
     for (int k = 0; k < 3; ++k) {
       cached[k] = direction[k].lane[lane];

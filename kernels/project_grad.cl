@@ -1,6 +1,6 @@
 // The gradient of projection: sums a Gaussian's slots in the order of its tiles, then the chain rule back to its
-// parameters (docs/gradients.md, equations 25 to 41 in the forms 50 to 52). A work-item has LANES Gaussians, of which it
-// leaves those that are not visible.
+// parameters (docs/gradients.md, equations 25 to 41 in the forms 50, 52 and 58 to 61). A work-item has LANES Gaussians,
+// of which it leaves those that are not visible.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -22,6 +22,19 @@ __kernel void add_slots(const uint n, __global const uint *tile_counts, __global
   for (uint k = 0; k < count; ++k, slot += SLOT_STRIDE)
     for (int field = 0; field < SLOT_STRIDE; ++field) own[field] += slot[field];
   for (int field = 0; field < SLOT_STRIDE; ++field) sums[(size_t)SLOT_STRIDE * i + field] = own[field];
+}
+
+#define FREE(colour) ((colour) > 0.0f && (colour) < COLOUR_MAX)
+
+// s1 - s2, their logarithms `x` apart: near each other by the series of exp(x) - 1, as what rounding leaves of two equal
+// scales' difference would turn every ball.
+static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
+  floatL series = fmaL(x, (floatL)(1.0f / 720.0f), (floatL)(1.0f / 120.0f));
+  series = fmaL(x, series, (floatL)(1.0f / 24.0f));
+  series = fmaL(x, series, (floatL)(1.0f / 6.0f));
+  series = fmaL(x, series, (floatL)(0.5f));
+  series = fmaL(x * x, series, x) * s2;
+  return x * x < 0.0625f ? series : s1 - s2;
 }
 
 // slots (pairs, SLOT_STRIDE), or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE).
@@ -69,13 +82,12 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   const floatL l11 = GATHER(splats, SPLAT_SIZE, SPLAT_L11), l12 = GATHER(splats, SPLAT_SIZE, SPLAT_L12);
   const floatL l22 = GATHER(splats, SPLAT_SIZE, SPLAT_L22);
   const floatL m_g = m[SLOT_G].all, m_gu = m[SLOT_GU].all, m_gv = m[SLOT_GV].all;
-  const floatL uu = m[SLOT_GUU].all, uv = m[SLOT_GUV].all, vv = m[SLOT_GVV].all;
 
   // Opacity, (29) and (41): sum of g is o dL/do, and do/dlogit = o (1 - o).
   Lanes d_opacity, d_screen[2], d_mean[3], d_scale[3], d_quaternion[4];
-  d_opacity.all = m_g * (1.0f - sigmoidL(GATHER(opacity_logits, 1, 0)));
+  d_opacity.all = m_g * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also where o is next to 1
 
-  // (50). Mean on the image: -W^T (sum of g w); covariance: W^T (sum of g w w^T) W / 2.
+  // (50). Mean on the image: -W^T (sum of g w).
   const floatL d_mx = -INVERSE_WHITEN2 * (l11 * m_gu);
   const floatL d_my = -INVERSE_WHITEN2 * fmaL(l12, m_gu, l22 * m_gv);
 #ifdef ABSOLUTE_GRADIENTS
@@ -85,60 +97,52 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   d_screen[0].all = d_mx;
   d_screen[1].all = d_my;
 #endif
-  const float half4 = 0.5f * INVERSE_WHITEN2 * INVERSE_WHITEN2;
-  const floatL g_xx = half4 * l11 * l11 * uu;
-  const floatL g_xy = half4 * l11 * fmaL(l12, uu, l22 * uv);
-  const floatL g_yy = half4 * fmaL(l12, fmaL(l12, uu, 2.0f * l22 * uv), l22 * l22 * vv);
 
-  // (31), (51). M = J A S: dL/dM = 2 G M, column by column; J's entries and A's collect theirs.
-  floatL d_jx = (floatL)(0.0f), d_kx = d_jx, d_jy = d_jx, d_ky = d_jx, d_a[9];
+  // (58). The columns of M = J A S, whitened: w[k] times the scale. Of order one, and differences of nothing large.
+  const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
+  const floatL uu = unwhiten * m[SLOT_GUU].all, uv = unwhiten * m[SLOT_GUV].all, vv = unwhiten * m[SLOT_GVV].all;
+  floatL wu[3], wv[3];
+  const floatL lean = l11 / p.syy;
   for (int k = 0; k < 3; ++k) {
-    const floatL m1 = p.s[k] * p.b1[k], m2 = p.s[k] * p.b2[k];
-    const floatL d_m1 = 2.0f * fmaL(g_xx, m1, g_xy * m2);
-    const floatL d_m2 = 2.0f * fmaL(g_xy, m1, g_yy * m2);
-    d_scale[k].all = fmaL(d_m1, m1, d_m2 * m2);
-    const floatL d_b1 = p.s[k] * d_m1, d_b2 = p.s[k] * d_m2;
-    d_jx = fmaL(d_b1, p.a[k], d_jx);
-    d_kx = fmaL(d_b1, p.a[6 + k], d_kx);
-    d_jy = fmaL(d_b2, p.a[3 + k], d_jy);
-    d_ky = fmaL(d_b2, p.a[6 + k], d_ky);
-    d_a[k] = d_b1 * p.jx;
-    d_a[3 + k] = d_b2 * p.jy;
-    d_a[6 + k] = fmaL(d_b1, p.kx, d_b2 * p.ky);
+    const int l = (k + 1) % 3, n = (k + 2) % 3;
+    const floatL minors = fmaL(p.s[l] * p.b2[l], p.s[l] * p.c[n], -(p.s[n] * p.b2[n] * (p.s[n] * p.c[l])));
+    wu[k] = lean * fmaL((floatL)(LOW_PASS), p.b1[k], minors);
+    wv[k] = l22 * p.b2[k];
   }
 
-  // Rotation, (51), (34), (35): A = R_camera R(q), so dL/dR = R_camera^T dL/dA; then q, then the normalisation.
-  floatL r[9];
-  for (int j = 0; j < 3; ++j)
-    for (int k = 0; k < 3; ++k)
-      r[3 * j + k] = fmaL((floatL)(camera[CAMERA_R00 + j]), d_a[k],
-                          fmaL((floatL)(camera[CAMERA_R10 + j]), d_a[3 + k], camera[CAMERA_R20 + j] * d_a[6 + k]));
+  // (59) to (61): log scales, the turn in the Gaussian's own frame, and what the Jacobian takes of the gradient.
+  floatL d_size = (floatL)(0.0f), along_u = d_size, along_v = d_size, turned[3];
+  for (int k = 0; k < 3; ++k) {
+    const int l = (k + 1) % 3, n = (k + 2) % 3;
+    const floatL nu = p.s[k] * wu[k], nv = p.s[k] * wv[k];
+    const floatL tu = fmaL(uu, nu, uv * nv), tv = fmaL(uv, nu, vv * nv);
+    d_scale[k].all = fmaL(nu, tu, nv * tv);
+    d_size += d_scale[k].all;
+    const floatL depth = p.s[k] * p.a2[k];
+    along_u = fmaL(tu, depth, along_u);
+    along_v = fmaL(tv, depth, along_v);
+    const floatL apart = scale_difference(GATHER(log_scales, 3, l) - GATHER(log_scales, 3, n), p.s[l], p.s[n]);
+    const floatL au = apart * wu[l], av = apart * wv[l], sum = p.s[l] + p.s[n];
+    turned[k] = fmaL(fmaL(uu, au, uv * av), sum * wu[n], fmaL(uv, au, vv * av) * (sum * wv[n]));
+  }
   const floatL w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
-  floatL d_q[4];
-  d_q[0] = 2.0f * (x * (r[7] - r[5]) + y * (r[2] - r[6]) + z * (r[3] - r[1]));
-  d_q[1] = 2.0f * (w * (r[7] - r[5]) + y * (r[1] + r[3]) + z * (r[2] + r[6]) - 2.0f * x * (r[4] + r[8]));
-  d_q[2] = 2.0f * (w * (r[2] - r[6]) + x * (r[1] + r[3]) + z * (r[5] + r[7]) - 2.0f * y * (r[0] + r[8]));
-  d_q[3] = 2.0f * (w * (r[3] - r[1]) + x * (r[2] + r[6]) + y * (r[5] + r[7]) - 2.0f * z * (r[0] + r[4]));
-  const floatL radial = d_q[0] * w + d_q[1] * x + d_q[2] * y + d_q[3] * z;
-  for (int k = 0; k < 4; ++k) d_quaternion[k].all = fmaL(-radial, p.q[k], d_q[k]) / p.length;
+  const floatL turn = 2.0f / p.length;
+  d_quaternion[0].all = turn * -fmaL(x, turned[0], fmaL(y, turned[1], z * turned[2]));
+  d_quaternion[1].all = turn * fmaL(w, turned[0], fmaL(y, turned[2], -(z * turned[1])));
+  d_quaternion[2].all = turn * fmaL(w, turned[1], fmaL(z, turned[0], -(x * turned[2])));
+  d_quaternion[3].all = turn * fmaL(w, turned[2], fmaL(x, turned[1], -(y * turned[0])));
 
-  // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, kx = -jx rx
-  // depends on z alone.
+  // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, J moves with
+  // z alone.
   const floatL rx = p.x / p.z, ry = p.y / p.z;
-  floatL d_x = d_mx * p.jx, d_y = d_my * p.jy;
-  floatL d_z = -(d_mx * p.jx * rx + d_my * p.jy * ry);
-  d_z -= (d_jx * p.jx + d_kx * p.kx + d_jy * p.jy + d_ky * p.ky) / p.z;
-  const floatL d_rx = rx == p.rx ? -d_kx * p.jx / p.z : (floatL)(0.0f);
-  const floatL d_ry = ry == p.ry ? -d_ky * p.jy / p.z : (floatL)(0.0f);
-  d_x += d_rx;
-  d_y += d_ry;
-  d_z -= d_rx * rx;
-  d_z -= d_ry * ry;
+  const floatL d_j02 = rx == p.rx ? l11 * along_u : (floatL)(0.0f);
+  const floatL d_j12 = ry == p.ry ? fmaL(l12, along_u, l22 * along_v) : (floatL)(0.0f);
+  const floatL d_x = p.jx * (d_mx - d_j02 / p.z), d_y = p.jy * (d_my - d_j12 / p.z);
+  const floatL d_z = -fmaL(d_x, rx, fmaL(d_y, ry, d_size / p.z));
 
-  // Colour, (38) to (40): a channel clamped at 0 has no gradient; the basis depends on the mean through the view
-  // direction.
-  floatL vx = GATHER(means, 3, 0) - camera[CAMERA_PX], vy = GATHER(means, 3, 1) - camera[CAMERA_PY];
-  floatL vz = GATHER(means, 3, 2) - camera[CAMERA_PZ];
+  // Colour, (38) to (40): a channel that is clamped has no gradient; the basis depends on the mean through the view
+  // direction, but for SH so large that the sum overflows.
+  floatL vx = FROM_CAMERA(means, X, 0), vy = FROM_CAMERA(means, Y, 1), vz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(vx, vx, fmaL(vy, vy, vz * vz)));
   vx /= length;
   vy /= length;
@@ -149,9 +153,9 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
     const size_t i = first_row + lane;
     if (tile_counts[i] == 0) continue;
     __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
-    const float4 d_colour = (float4)(splat[SPLAT_RED] > 0.0f ? m[SLOT_RED].lane[lane] : 0.0f,
-                                     splat[SPLAT_GREEN] > 0.0f ? m[SLOT_GREEN].lane[lane] : 0.0f,
-                                     splat[SPLAT_BLUE] > 0.0f ? m[SLOT_BLUE].lane[lane] : 0.0f, 0.0f);
+    const float4 d_colour = (float4)(FREE(splat[SPLAT_RED]) ? m[SLOT_RED].lane[lane] : 0.0f,
+                                     FREE(splat[SPLAT_GREEN]) ? m[SLOT_GREEN].lane[lane] : 0.0f,
+                                     FREE(splat[SPLAT_BLUE]) ? m[SLOT_BLUE].lane[lane] : 0.0f, 0.0f);
     d_sh_dc[3 * i] = SH_CONSTANT * d_colour.x;
     d_sh_dc[3 * i + 1] = SH_CONSTANT * d_colour.y;
     d_sh_dc[3 * i + 2] = SH_CONSTANT * d_colour.z;
@@ -172,8 +176,10 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   const floatL along = d_v[0] * vx + d_v[1] * vy + d_v[2] * vz;
   for (int k = 0; k < 3; ++k) {
     const floatL v = k == 0 ? vx : (k == 1 ? vy : vz);
+    const floatL by_colour = (d_v[k] - along * v) / length;
+    const floatL above = by_colour < 1e37f ? by_colour : (floatL)(0.0f);
     d_mean[k].all = camera[CAMERA_R00 + k] * d_x + camera[CAMERA_R10 + k] * d_y + camera[CAMERA_R20 + k] * d_z +
-                    (d_v[k] - along * v) / length;
+                    (by_colour > -1e37f ? above : (floatL)(0.0f));
   }
 
   for (uint lane = 0; lane < lanes_used; ++lane) {

@@ -17,14 +17,12 @@ _TRANSFORM = (
     *("FX", "FY", "CX", "CY"),
 )
 
-CAMERA = (
-    *_TRANSFORM,
-    *("NEAR", "XMIN", "XMAX", "YMIN", "YMAX"),
-    *("PX", "PY", "PZ"),
-    *(f"{name}_LOW" for name in _TRANSFORM),
-)
-"""A camera: `cam_from_world`, intrinsics, near plane, the limits of x/z and y/z in the Jacobian, its centre; and what
-the rounding of pose and intrinsics to float32 left, so that a mean's place on the image is good to 1e-6 pixels."""
+_ROUNDED = (*_TRANSFORM, *("XMIN", "XMAX", "YMIN", "YMAX"), *("PX", "PY", "PZ"))
+
+CAMERA = (*_ROUNDED, "NEAR", "HAND", *(f"{name}_LOW" for name in _ROUNDED))
+"""A camera: `cam_from_world`, intrinsics, the limits of x/z and y/z in the Jacobian, its centre; near plane; 1, or -1
+where its rotation is a reflection; and what the rounding of them to float32 left, so that a mean's place on the image
+is good to 1e-6 pixels, and a needle's ellipse to 1e-4."""
 
 SPLAT = (
     *("PIXEL_X", "PIXEL_Y", "SUB_X", "SUB_Y"),

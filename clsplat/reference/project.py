@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Projection of Gaussians to the image plane, and its gradient: float64 twin of kernels/project*.cl.
 
-Equation numbers are those of docs/gradients.md.
+Equation numbers are those of docs/gradients.md. The arithmetic is in the precision of the parameters: with
+np.longdouble the twin's own rounding can be held against more digits.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ Bool = NDArray[np.bool_]
 ALPHA_MIN = 1.0 / 255.0
 LOW_PASS = 0.3
 FRUSTUM_MARGIN = 0.3
+COLOUR_MAX = 1e18
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,7 @@ def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera:
     raw = p[:, :2] / z[:, None]
     low, high = frustum_limits(camera)
     ratios = np.clip(raw, low, high)
-    jacobian = np.zeros((len(p), 2, 3))
+    jacobian = np.zeros((len(p), 2, 3), p.dtype)
     jacobian[:, 0, 0] = camera.fx / z
     jacobian[:, 1, 1] = camera.fy / z
     jacobian[:, 0, 2] = -camera.fx * ratios[:, 0] / z
@@ -134,7 +136,7 @@ def project(
 
         directions, _ = view_directions(means, camera)
         basis = sh_basis(directions, sh_degree)
-        colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]))
+        colors = np.clip(0.5 + np.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]), 0.0, COLOUR_MAX)
 
         visible = (z > camera.near) & (opacities > ALPHA_MIN) & (det > 0)
         for values in (means2d, whitening, conics, half_extents, colors):
@@ -214,12 +216,34 @@ def project_grad(
 
     d_means2d (N, 2), d_conics (N, 3) by a, b, c, d_opacities (N,), d_colors (N, 3).
     """
-    projected = project(means, quaternions, log_scales, opacity_logits, sh, camera, sh_degree)
+    parameters = (means, quaternions, log_scales, opacity_logits, sh)
+    projected = project(*parameters, camera, sh_degree)
+    d_covariances = covariance_grad(projected.conics, d_conics)
+    return project_grad_covariances(
+        *parameters, camera, sh_degree, projected, d_means2d, d_covariances, d_opacities, d_colors
+    )
+
+
+def project_grad_covariances(
+    means: Float64,
+    quaternions: Float64,
+    log_scales: Float64,
+    opacity_logits: Float64,
+    sh: Float64,
+    camera: Camera,
+    sh_degree: int,
+    projected: Projected,
+    d_means2d: Float64,
+    d_covariances: Float64,
+    d_opacities: Float64,
+    d_colors: Float64,
+) -> dict[str, Float64]:
+    """As `project_grad`, from what `project` made and the gradient by the covariances (N, 3): xx, xy, yy of (28)."""
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
     x, y, z = geometry.p.T
 
-    gxx, gxy, gyy = covariance_grad(projected.conics[rows], d_conics[rows]).T
+    gxx, gxy, gyy = d_covariances[rows].T
     d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
     d_half = 2 * d_covariance @ geometry.half  # (31)
 
@@ -244,7 +268,8 @@ def project_grad(
     directions, distances = view_directions(means[rows], camera)
     basis = sh_basis(directions, sh_degree)
     count = basis.shape[1]
-    d_value = np.where(projected.colors[rows] > 0, d_colors[rows], 0.0)  # (39)
+    free = (projected.colors[rows] > 0) & (projected.colors[rows] < COLOUR_MAX)
+    d_value = np.where(free, d_colors[rows], 0.0)  # (39)
     d_directions = np.einsum("nkd,nkc,nc->nd", sh_basis_grad(directions, sh_degree), sh[rows, :count], d_value)
     radial = (directions * d_directions).sum(axis=1, keepdims=True)
     d_means = d_p @ camera.rotation + (d_directions - directions * radial) / distances  # (38), (40)

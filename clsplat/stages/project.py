@@ -228,6 +228,7 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "CX": camera.cx,
         "CY": camera.cy,
         "NEAR": camera.near,
+        "HAND": float(np.copysign(1.0, np.linalg.det(camera.rotation))),
         "XMIN": -camera.cx / camera.fx - 0.3 * half_w,
         "XMAX": (camera.width - camera.cx) / camera.fx + 0.3 * half_w,
         "YMIN": -camera.cy / camera.fy - 0.3 * half_h,

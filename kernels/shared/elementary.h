@@ -58,3 +58,36 @@ static inline Double multiply_add2(float a, float a_low, floatL b, Double s) {
   const floatL low = s.low + sum.low + fmaL((floatL)(a_low), b, fmaL((floatL)(a), b, -product));
   return sum2(sum.high, low);
 }
+
+static inline Double add2(Double a, Double b) {
+  const Double sum = sum2(a.high, b.high);
+  return sum2(sum.high, sum.low + (a.low + b.low));
+}
+
+static inline Double subtract2(Double a, Double b) {
+  const Double sum = sum2(a.high, -b.high);
+  return sum2(sum.high, sum.low + (a.low - b.low));
+}
+
+static inline Double twice2(Double a) {
+  const Double result = {2.0f * a.high, 2.0f * a.low};
+  return result;
+}
+
+// Exact.
+static inline Double product2(floatL a, floatL b) {
+  const floatL high = a * b;
+  const Double product = {high, fmaL(a, b, -high)};
+  return product;
+}
+
+static inline Double multiply2(Double a, Double b) {
+  Double product = product2(a.high, b.high);
+  product.low += fmaL(a.high, b.low, a.low * b.high);
+  return product;
+}
+
+static inline Double scaled2(float a, float a_low, Double b) {
+  const Double factor = {(floatL)(a), (floatL)(a_low)};
+  return multiply2(factor, b);
+}

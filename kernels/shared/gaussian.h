@@ -1,16 +1,23 @@
 // From LANES Gaussians' parameters to their ellipses on the image: what projection and its gradient both need.
 // Equation numbers are those of docs/gradients.md.
 
+#define COLOUR_MAX 1e18f // no sum of what a colour is a factor of overflows
+// Where `refine` is called for: longest axis over the ellipse's short one, and an axis over what is seen of it. Up to
+// there float32 is good to 3e-5.
+#define REFINE_FROM 64.0f
+#define FORESHORTENED 256.0f
+
 typedef struct {
   intL valid;            // not to be culled
   floatL x, y, z;        // mean in the camera's frame
   floatL lx, ly, lz;     // what rounding it to float32 left
   floatL rx, ry;         // x/z and y/z as the Jacobian takes them, clamped
-  floatL jx, jy, kx, ky; // Jacobian: rows (jx, 0, kx) and (0, jy, ky)
+  floatL jx, jy;         // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
   floatL q[4];           // unit quaternion w x y z
   floatL length;         // of the raw one
-  floatL a[9];           // camera from Gaussian rotation, a[3 * row + column]
-  floatL b1[3], b2[3];   // the two rows of J a
+  floatL a2[3];          // the last row of the camera from Gaussian rotation A: its axes' depths
+  floatL b1[3], b2[3];   // the two rows of J A
+  floatL c[3];           // their minors: b1[k] b2[l] - b1[l] b2[k] is c[m], for k, l, m in turn
   floatL s[3];           // scales
   floatL sxx, sxy, syy;  // projected covariance with the low-pass
   floatL det;
@@ -43,21 +50,98 @@ static inline Double camera_row(__constant float *r, __constant float *r_low, fl
   return multiply_add2(r[2], r_low[2], z, sum);
 }
 
+// x/z - ratio in two floats' terms: what is left of the quotient.
+static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) {
+  return (fmaL(-ratio, z, x) + fmaL(-ratio, z_low, x_low)) / z;
+}
+
 // (2): focal * (x / z) + centre, as whole pixels and the rest in [0, 1).
 static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low, float focal, float focal_low,
                                   float centre, float centre_low, floatL *whole, floatL *rest) {
   const floatL ratio = x / z;
-  const floatL ratio_low = (fmaL(-ratio, z, x) + fmaL(-ratio, z_low, x_low)) / z;
-  const Double c = {(floatL)(centre), fmaL((floatL)(focal), ratio_low, (floatL)(centre_low))};
+  const Double c = {(floatL)(centre),
+                    fmaL((floatL)(focal), ratio_rest(ratio, x, x_low, z, z_low), (floatL)(centre_low))};
   const Double at = multiply_add2(focal, focal_low, ratio, c);
   *whole = floorL(at.high);
   *rest = (at.high - *whole) + at.low;
 }
 
+// From the camera's centre to the mean, along a world axis.
+#define FROM_CAMERA(means, axis, index) ((GATHER(means, 3, index) - camera[CAMERA_P##axis]) - camera[CAMERA_P##axis##_LOW])
+
 // x within [low, high], and NaN as it is.
 static inline floatL clampL(floatL x, float low, float high) {
   const floatL above = x < low ? (floatL)(low) : x;
   return above > high ? (floatL)(high) : above;
+}
+
+// (5) to (7) from J A and S, with the determinant as a sum of squares (56).
+static inline void covariance(Projection *p) {
+  floatL xx = (floatL)(0.0f), yy = xx, xy = xx, minors = (floatL)(LOW_PASS * LOW_PASS);
+  for (int k = 0; k < 3; ++k) {
+    const floatL m1 = p->s[k] * p->b1[k], m2 = p->s[k] * p->b2[k];
+    xx = fmaL(m1, m1, xx);
+    yy = fmaL(m2, m2, yy);
+    xy = fmaL(m1, m2, xy);
+    const floatL minor = p->s[(k + 1) % 3] * p->s[(k + 2) % 3] * p->c[k];
+    minors = fmaL(minor, minor, minors);
+  }
+  p->sxx = xx + LOW_PASS;
+  p->syy = yy + LOW_PASS;
+  p->sxy = xy;
+  p->det = fmaL((floatL)(LOW_PASS), xx + yy, minors);
+}
+
+// The rest of x/z as the Jacobian takes it: of a limit where it is clamped.
+static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
+                                  float low_rest, float high, float high_rest) {
+  const floatL rest = ratio_rest(ratio, x, x_low, z, z_low);
+  const floatL above = ratio == low ? (floatL)(low_rest) : rest;
+  return ratio == high ? (floatL)(high_rest) : above;
+}
+
+// (57): J A and its minors once more, in two floats up to where nothing cancels any more, for the lanes of `which`.
+static inline void refine(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
+                          Projection *p) {
+  // By a power of two, which is exact: the rest of a product must not fall among denormals.
+  const floatL size = AS_FLOATL(AS_INTL(p->length) & 0x7f800000);
+  const floatL w = GATHER(quaternions, 4, 0) / size, x = GATHER(quaternions, 4, 1) / size;
+  const floatL y = GATHER(quaternions, 4, 2) / size, z = GATHER(quaternions, 4, 3) / size;
+  const Double xx = product2(x, x), yy = product2(y, y), zz = product2(z, z), ww = product2(w, w);
+  const Double xy = product2(x, y), xz = product2(x, z), yz = product2(y, z);
+  const Double wx = product2(w, x), wy = product2(w, y), wz = product2(w, z);
+  const Double s = subtract2(ww, zz), d = subtract2(xx, yy);
+  Double r[9]; // |q|^2 times the rotation
+  r[0] = add2(s, d);
+  r[4] = subtract2(s, d);
+  r[8] = subtract2(add2(ww, zz), add2(xx, yy));
+  r[1] = twice2(subtract2(xy, wz));
+  r[3] = twice2(add2(xy, wz));
+  r[2] = twice2(add2(xz, wy));
+  r[6] = twice2(subtract2(xz, wy));
+  r[5] = twice2(subtract2(yz, wx));
+  r[7] = twice2(add2(yz, wx));
+  const Double rx = {p->rx, clamped_rest(p->rx, p->x, p->lx, p->z, p->lz, camera[CAMERA_XMIN], camera[CAMERA_XMIN_LOW],
+                                         camera[CAMERA_XMAX], camera[CAMERA_XMAX_LOW])};
+  const Double ry = {p->ry, clamped_rest(p->ry, p->y, p->ly, p->z, p->lz, camera[CAMERA_YMIN], camera[CAMERA_YMIN_LOW],
+                                         camera[CAMERA_YMAX], camera[CAMERA_YMAX_LOW])};
+  const floatL length = p->length / size;
+  const floatL along_x = p->jx / (length * length), along_y = p->jy / (length * length);
+  const floatL area = camera[CAMERA_HAND] * p->jx * along_y;
+  for (int k = 0; k < 3; ++k) {
+    Double a[3];
+    for (int i = 0; i < 3; ++i) {
+      a[i] = scaled2(camera[CAMERA_R00 + 3 * i], camera[CAMERA_R00_LOW + 3 * i], r[k]);
+      a[i] = add2(a[i], scaled2(camera[CAMERA_R01 + 3 * i], camera[CAMERA_R01_LOW + 3 * i], r[3 + k]));
+      a[i] = add2(a[i], scaled2(camera[CAMERA_R02 + 3 * i], camera[CAMERA_R02_LOW + 3 * i], r[6 + k]));
+    }
+    const floatL b1 = along_x * subtract2(a[0], multiply2(rx, a[2])).high;
+    const floatL b2 = along_y * subtract2(a[1], multiply2(ry, a[2])).high;
+    const floatL c = area * add2(add2(multiply2(rx, a[0]), multiply2(ry, a[1])), a[2]).high;
+    p->b1[k] = which ? b1 : p->b1[k];
+    p->b2[k] = which ? b2 : p->b2[k];
+    p->c[k] = which ? c : p->c[k];
+  }
 }
 
 // Fills *p: (1), (3) to (7). Conditions are positive, so that NaN culls. `row` as ROWS_OF_ITEM makes it. Returns 0 where
@@ -84,11 +168,11 @@ static inline int project_gaussians(const uint *row, __global const float *means
   p->valid &= (norm2 > 1e-30f) & (norm2 < 1e30f);
   p->length = sqrt(norm2);
   for (int i = 0; i < 4; ++i) p->q[i] = raw[i] / p->length;
-  floatL r[9];
+  floatL r[9], a[9];
   rotation_of(p->q, r);
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j)
-      p->a[3 * i + j] =
+      a[3 * i + j] =
           fmaL((floatL)(camera[CAMERA_R00 + 3 * i]), r[j],
                fmaL((floatL)(camera[CAMERA_R01 + 3 * i]), r[3 + j], camera[CAMERA_R02 + 3 * i] * r[6 + j]));
   p->s[0] = expL(GATHER(log_scales, 3, 0));
@@ -99,30 +183,28 @@ static inline int project_gaussians(const uint *row, __global const float *means
   p->ry = clampL(p->y / p->z, camera[CAMERA_YMIN], camera[CAMERA_YMAX]);
   p->jx = camera[CAMERA_FX] / p->z;
   p->jy = camera[CAMERA_FY] / p->z;
-  p->kx = -p->jx * p->rx;
-  p->ky = -p->jy * p->ry;
+  const floatL area = camera[CAMERA_HAND] * p->jx * p->jy;
+  for (int k = 0; k < 3; ++k) {
+    p->a2[k] = a[6 + k];
+    p->b1[k] = p->jx * fmaL(-p->rx, a[6 + k], a[k]);
+    p->b2[k] = p->jy * fmaL(-p->ry, a[6 + k], a[3 + k]);
+    p->c[k] = area * fmaL(p->rx, a[k], fmaL(p->ry, a[3 + k], a[6 + k]));
+  }
+  covariance(p);
 
-  // (5) to (7): the square root M = J A S. Its entries give the covariance; the minors of its columns give the
-  // determinant as a sum of squares, where sxx * syy - sxy * sxy would cancel for a needle.
-  floatL m1[3], m2[3];
-  for (int k = 0; k < 3; ++k) {
-    p->b1[k] = fmaL(p->jx, p->a[k], p->kx * p->a[6 + k]);
-    p->b2[k] = fmaL(p->jy, p->a[3 + k], p->ky * p->a[6 + k]);
-    m1[k] = p->s[k] * p->b1[k];
-    m2[k] = p->s[k] * p->b2[k];
+  // Rounding the rotation moves a point at a long axis' end by that axis times 1e-7, which has to be little beside the
+  // ellipse's short axis: the square root of det / (sxx + syy), or up to 1.42 times that. The gradient wants to know an
+  // axis that points at the camera too.
+  floatL longest = p->s[0] > p->s[1] ? p->s[0] : p->s[1];
+  longest = longest > p->s[2] ? longest : p->s[2];
+  const floatL across2 = fmaL(p->jx, p->jx, p->jy * p->jy);
+  intL which = longest * longest * across2 * (p->sxx + p->syy) > REFINE_FROM * REFINE_FROM * p->det;
+  for (int k = 0; k < 3; ++k)
+    which |= across2 > FORESHORTENED * FORESHORTENED * fmaL(p->b1[k], p->b1[k], p->b2[k] * p->b2[k]);
+  if (ANYL(which & p->valid)) {
+    refine(row, quaternions, camera, MASKL(which), p);
+    covariance(p);
   }
-  const floatL xx = fmaL(m1[0], m1[0], fmaL(m1[1], m1[1], m1[2] * m1[2]));
-  const floatL yy = fmaL(m2[0], m2[0], fmaL(m2[1], m2[1], m2[2] * m2[2]));
-  p->sxx = xx + LOW_PASS;
-  p->syy = yy + LOW_PASS;
-  p->sxy = fmaL(m1[0], m2[0], fmaL(m1[1], m2[1], m1[2] * m2[2]));
-  floatL det = fmaL((floatL)(LOW_PASS), xx + yy, (floatL)(LOW_PASS * LOW_PASS));
-  for (int k = 0; k < 3; ++k) {
-    const int l = k == 2 ? 0 : k + 1;
-    const floatL minor = p->s[k] * p->s[l] * fmaL(p->b1[k], p->b2[l], -(p->b1[l] * p->b2[k]));
-    det = fmaL(minor, minor, det);
-  }
-  p->det = det;
-  p->valid &= (p->sxx < 1e30f) & (p->syy < 1e30f) & (det > 0.0f) & (det < 1e30f);
+  p->valid &= (p->sxx < 1e30f) & (p->syy < 1e30f) & (p->det > 0.0f) & (p->det < 1e30f);
   return 1;
 }
