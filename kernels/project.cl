@@ -9,6 +9,9 @@
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 
+// Of a channel. The squares that SSIM multiplies stay finite below it, and no picture has a colour over it.
+#define COLOUR_LIMIT 1e9f
+
 // Whether a Gaussian goes on that reaches no tile (RasterizerConfig.frustum_cull, opacity_cull).
 #if defined(NO_FRUSTUM_CULL)
 #define KEEP_CULLED 1
@@ -18,6 +21,7 @@
 
 // means (n, 3), quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n, 3),
 // sh_rest (n, coefficients - 1, 3); splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.
+// A colour that is not finite, or of more than COLOUR_LIMIT, is not drawn: one such pixel would be all of the loss.
 // With KEEP_CULLED shown (n): 1 where a splat is written, also of those that have no tile. Of a model that is held:
 // with SH_DEGREES sh_degrees (n): the highest that is looked at; with SH_CACHE sh_cache (n, 6): the direction that a
 // Gaussian's colour was last worked out for, and the colour.
@@ -130,6 +134,15 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     __global const shT *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
     for (int k = 1; k < used; ++k, f += 3)
       colour = sh_fma(basis[k].lane[lane], sh_channels(f, k + 1 == coefficients), colour);
+#ifndef UNGUARDED
+    if (!(colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT)) {
+      tile_counts[i] = 0;
+#ifdef KEEP_CULLED
+      shown[i] = 0;
+#endif
+      continue;
+    }
+#endif
     splat[SPLAT_RED] = colour.x > 0.0f ? colour.x : 0.0f;
     splat[SPLAT_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
     splat[SPLAT_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
