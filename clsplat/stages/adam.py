@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -13,10 +12,8 @@ from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
+from clsplat.quarantine import limit_of
 from clsplat.stages.project import GROUPS, DeviceGaussians
-
-SH_LIMIT = 1e7
-"""No SH coefficient may be larger: a colour over project.cl's COLOUR_LIMIT, which is not drawn, has one that is."""
 
 REFUSED = ("parameters", "gradients", "moments", "steps")
 """Why the steps of elements were refused: what adam.cl counts."""
@@ -55,7 +52,7 @@ def adam(
                 continue
             updates = step // config.sh_rest_every
         rate, root = rates[group] / (1.0 - beta1**updates), (1.0 - beta2**updates) ** -0.5
-        constants = (rate, root, beta1, beta2, epsilon, SH_LIMIT if group.startswith("sh_") else math.inf, found)
+        constants = (rate, root, beta1, beta2, epsilon, limit_of(group), found)
         arrays = (parameters[group], gradients[group], first[group], second[group])
         size, rows = parameters[group].size, parameters.count
         if size == 0:
