@@ -30,7 +30,7 @@ from clsplat.camera import Camera
 from clsplat.config import TrainConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
-from clsplat.device.layout import SlotFields
+from clsplat.device.layout import SPLAT, SlotFields
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import atomic_writer
 from clsplat.quarantine import Incident, finite_or_zero
@@ -150,7 +150,8 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     result = {"parameters": _wrong(parameters)}
     frame = rasterizer.forward(parameters, camera, background)
     drawn = frame.projected.tile_counts.get() > 0
-    result["project"] = int(np.count_nonzero(~np.isfinite(frame.projected.splats.get()[drawn])))
+    written = [column for column, name in enumerate(SPLAT) if name != "UNUSED"]
+    result["project"] = int(np.count_nonzero(~np.isfinite(frame.projected.splats.get()[drawn][:, written])))
     image = frame.blended.image.get()[:, : camera.height, : camera.width]
     result["blend"] = int(np.count_nonzero(~np.isfinite(image)))
     lost = loss(device, rasterizer.work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight)

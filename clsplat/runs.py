@@ -218,7 +218,7 @@ def _read_checkpoint(path: Path) -> Checkpoint:
     digests = record.get("sha256")  # runs of earlier versions have none
     if digests is not None:
         if arrays.keys() != digests.keys():
-            raise ValueError(f"it has not the arrays it was written with: {sorted(arrays.keys() ^ digests.keys())[0]}")
+            raise ValueError(f"it has not the arrays it was written with: {min(arrays.keys() ^ digests.keys())}")
         for name, array in arrays.items():
             if _digest(array) != digests[name]:
                 raise ValueError(f"{name} is not what was written: its sha256 differs")

@@ -64,7 +64,7 @@ class Watch:
         if not any(refused) or self._noticed is not None or self._last is None:
             return
         counts = dict(zip(REFUSED, refused, strict=True))
-        stage = "project_grad" if counts["gradients"] else ("parameters" if counts["parameters"] else "adam")
+        stage = "parameters" if counts["parameters"] else ("project_grad" if counts["gradients"] else "adam")
         if not np.isfinite(self._last.sums.get()).all():
             stage = "loss"
         self._noticed = (self._last, stage, sum(refused))

@@ -153,8 +153,11 @@ class Workspace:
         self._poison = _poison()
         self._arrays: dict[str, DeviceArray] = {}
 
-    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> DeviceArray:
-        """An array whose contents are whatever the last user left there."""
+    def array(
+        self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
+    ) -> DeviceArray:
+        """An array of which the contents are not to be read before they are written; kept: it was handed out before in
+        this shape, and has what was left there."""
         kind = np.dtype(dtype)
         elements = int(np.prod(shape, dtype=np.int64))
         held = self._arrays.get(name)
@@ -164,7 +167,7 @@ class Workspace:
             held = self._arrays.pop(name, None)
             del held  # before its successor is made: there need not be room for both
             held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
-        if self._poison is not None:
+        if self._poison is not None and not kept:
             _fill_bytes(self._device, held.buffer, self._poison, elements * kind.itemsize)
         return DeviceArray(self._device, held.buffer, shape, kind)
 
