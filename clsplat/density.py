@@ -91,7 +91,9 @@ def plan(
     """
     n = len(seen)
     useless = _useless(config, step, contributions, n)
-    gradients = np.asarray(gradient_sums / np.maximum(seen, 1), np.float32)
+    with np.errstate(invalid="ignore"):
+        gradients = np.asarray(gradient_sums / np.maximum(seen, 1), np.float32)
+    gradients[~np.isfinite(gradients)] = 0  # statistics that something has spoilt ask for nothing
     wanted = _wanted(config, step, gradients, agreeing, useless)
     sizes = np.exp(log_scales.max(axis=1))
     large = sizes > config.dense_fraction * extent
@@ -183,7 +185,7 @@ def split_halves(
     """Means and log scales of halves: drawn from the Gaussian they come from, and smaller. (m, 3), (m, 4), (m, 3)."""
     offsets = rng.standard_normal(means.shape) * np.exp(log_scales.astype(np.float64))
     q = quaternions.astype(np.float64)
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # of length 0, which is not drawn: no rotation
     w, axis = q[:, :1], q[:, 1:]
     twice = 2 * np.cross(axis, offsets)
     rotated = offsets + w * twice + np.cross(axis, twice)

@@ -19,6 +19,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
 from clsplat.needs import plan_frame
 from clsplat.sh import check_half, coefficients_in_use, needed_degrees
+from clsplat.stages.adam import REFUSED
 from clsplat.stages.blend import Blended, blend, blend_grad
 from clsplat.stages.duplicate import (
     MAX_PAIRS,
@@ -66,7 +67,8 @@ class Part:
 class Frame:
     """One forward pass: every stage's arrays, valid until the rasterizer's next forward pass.
 
-    bands: one of all tiles, unless memory is short; then `part` is the last one's.
+    bands: one of all tiles, unless memory is short; then `part` is the last one's; refused: what `adam` had counted in
+    `Rasterizer.found` by then.
     """
 
     camera: Camera
@@ -76,6 +78,7 @@ class Frame:
     bands: tuple[Band, ...]
     part: Part
     blended: Blended
+    refused: tuple[int, ...] = ()
 
     @property
     def pairs(self) -> Pairs:
@@ -91,13 +94,17 @@ class Frame:
 class Rasterizer:
     """The pipeline on one device, with the memory that it works in, which can be another's.
 
-    capacity: most (tile, Gaussian) pairs that are worked on together; the plan of who owns the rasterizer.
+    capacity: most (tile, Gaussian) pairs that are worked on together; the plan of who owns the rasterizer; found (8,)
+    uint32: what a pass reads back, and in the last four what `adam` counts.
     """
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
-        self.device = device.with_switches(kernel_defines(self.config))
+        self.device = device.with_switches({**device.switches, **kernel_defines(self.config)})
         self.work = work or Workspace(device)
+        # What `count` reads each time, with room for what training counts beside it: one copy for both.
+        self.found = allocate(device, (4 + len(REFUSED),), np.uint32)
+        self.found.fill(0)
         self._all_bits = self.config.key_bits == "all"
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS)
 
@@ -119,7 +126,8 @@ class Rasterizer:
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
         camera_array.set(pack)
         projected = project(device, work, gaussians, camera, camera_array)
-        counted = count(device, work, projected.splats, projected.tile_counts, projected.shown, all_bits=self._all_bits)
+        of = (projected.splats, projected.tile_counts, projected.shown)
+        counted = count(device, work, *of, all_bits=self._all_bits, found=self.found)
         bands = self._plan(projected, counted, tiles_of(camera))
         part = None
         for band in bands:
@@ -129,7 +137,7 @@ class Rasterizer:
             record = backward and len(bands) == 1 and self.config.record_cells
             blended = blend(device, work, part.lists, projected.splats, background, *size, band, record=record)
         assert part is not None, "an image has a tile"
-        return Frame(camera, camera_array, background, projected, bands, part, blended)
+        return Frame(camera, camera_array, background, projected, bands, part, blended, counted.beside)
 
     def part(self, frame: Frame, band: Band) -> Part:
         """What the band lists; where there are several bands it takes the memory of the one before."""

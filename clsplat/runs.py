@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -153,12 +154,13 @@ class Run:
     def save_checkpoint(self, step: int, arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Path:
         """Write checkpoints/step-STEP.npz atomically and keep the latest two.
 
-        arrays: any dtype but object; state: what JSON holds. Checkpoints of later steps are removed: training has
-        gone back before them.
+        arrays: any dtype but object; state: what JSON holds. The digest of each array is kept with the state.
+        Checkpoints of later steps are removed: training has gone back before them.
         """
         if STATE_KEY in arrays:
             raise ValueError(f"no array of a checkpoint may be called {STATE_KEY}")
-        text = json.dumps({"version": clsplat.__version__, "step": step, "state": dict(state)})
+        digests = {name: _digest(array) for name, array in arrays.items()}
+        text = json.dumps({"version": clsplat.__version__, "step": step, "sha256": digests, "state": dict(state)})
         self.checkpoints_path.mkdir(parents=True, exist_ok=True)
         path = self.checkpoints_path / f"step-{step:07d}.npz"
         members: Arrays = {STATE_KEY: np.frombuffer(text.encode(), np.uint8), **arrays}
@@ -180,7 +182,8 @@ class Run:
         """The latest checkpoint that is whole; None where there is none at all.
 
         A damaged one gives a warning and the one before it is taken; with none left, InputError. In a run that
-        resumes, metrics.jsonl is cut back to the checkpoint's step.
+        resumes, metrics.jsonl is cut back to the checkpoint's step, and what a killed process left half-written is
+        removed.
         """
         found = self.checkpoints()
         checkpoint: Checkpoint | None = None
@@ -188,25 +191,37 @@ class Run:
             try:
                 checkpoint = _read_checkpoint(path)
                 break
-            except (OSError, ValueError, KeyError, EOFError, _bad_zip()) as error:
-                warnings.warn(f"{path}: checkpoint is damaged and was passed over ({error})", stacklevel=2)
+            except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly anything for a flipped bit
+                why = str(error) or type(error).__name__
+                warnings.warn(f"{path}: checkpoint is damaged and was passed over ({why})", stacklevel=2)
         if found and checkpoint is None:
             raise InputError(f"{self.checkpoints_path}: no checkpoint there is whole, use --overwrite to start again")
         if self.resuming:
+            for left in self.path.rglob(".*" + TEMPORARY_SUFFIX):
+                left.unlink(missing_ok=True)
             self.truncate_metrics(checkpoint.step if checkpoint else 0)
         return checkpoint
 
 
-def _bad_zip() -> type[Exception]:
-    from zipfile import BadZipFile
-
-    return BadZipFile
+def _digest(array: NDArray[Any]) -> str:
+    """Of what an array is and holds."""
+    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
+    digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()
 
 
 def _read_checkpoint(path: Path) -> Checkpoint:
+    """Raises all manner of things for a file that is not whole."""
     with np.load(path, allow_pickle=False) as archive:
         arrays: Arrays = {name: archive[name] for name in archive.files}
     record = json.loads(arrays.pop(STATE_KEY).tobytes())
+    digests = record.get("sha256")  # runs of earlier versions have none
+    if digests is not None:
+        if arrays.keys() != digests.keys():
+            raise ValueError(f"it has not the arrays it was written with: {min(arrays.keys() ^ digests.keys())}")
+        for name, array in arrays.items():
+            if _digest(array) != digests[name]:
+                raise ValueError(f"{name} is not what was written: its sha256 differs")
     return Checkpoint(int(record["step"]), arrays, record["state"])
 
 
@@ -238,7 +253,7 @@ def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
 
 def owned_files(path: Path) -> list[Path]:
     """The files in a run's folder that clsplat wrote, and that --overwrite may therefore remove."""
-    patterns = ("checkpoints/step-*.npz", "test/**/*.png", "**/.*" + TEMPORARY_SUFFIX)
+    patterns = ("checkpoints/step-*.npz", "trouble-step-*.npz", "test/**/*.png", "**/.*" + TEMPORARY_SUFFIX)
     # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
     names = ("model.ply", "metrics.jsonl", "eval.json", "report.html", "config.toml")
     found = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from clsplat.evaluate import background_colour
 from clsplat.gaussians import Gaussians
 from clsplat.initialise import from_points, random_points
 from clsplat.needs import plan_step
+from clsplat.quarantine import Patience
 from clsplat.rendering import Rasterizer
 from clsplat.resolution import sizes_of
 from clsplat.runs import Checkpoint
@@ -54,6 +55,7 @@ from clsplat.stages.project import (
     upload_gaussians,
 )
 from clsplat.stages.target import target
+from clsplat.watch import Remedy, Watch
 
 if TYPE_CHECKING:
     from clsplat.scene import Scene, View
@@ -87,7 +89,10 @@ class Photographs:
 
 
 class Trainer:
-    """A model in training: parameters, moments, statistics and the random state, all of which a checkpoint holds."""
+    """A model in training: parameters, moments, statistics and the random state, all of which a checkpoint holds.
+
+    watch: what is not finite in it, and how much of that there was.
+    """
 
     def __init__(self, scene: Scene, config: TrainConfig, device: Device, initial: Gaussians | None = None) -> None:
         self.scene, self.config, self.device = scene, config, device
@@ -97,11 +102,17 @@ class Trainer:
         self.sizes = sizes_of(
             config.warmup, config.frequency_steps, len(self.views), lambda index: self.views[index].load()
         )
-        self.rng = np.random.default_rng(config.seed)
+        self.background = allocate(device, (3,), np.float32)
+        self.given = initial
+        self.watch = Watch(self.rasterizer.found, [view.name for view in self.views])
+        self._start()
+
+    def _start(self) -> None:
+        """Begin with the first step."""
+        self.rng = np.random.default_rng(self.config.seed)
         self.step = 0
         self.queue: list[int] = []
-        self.background = allocate(device, (3,), np.float32)
-        initial = initial if initial is not None else self._initial()
+        device, initial = self.device, self.given if self.given is not None else self._initial()
         self._make_plan(len(initial))
         if self.plan.streamed:
             self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
@@ -179,21 +190,24 @@ class Trainer:
         its Gaussians are split or made transparent, not just after.
         """
         config, device, work = self.config, self.device, self.rasterizer.work
+        self.mend()
         self._control_density()
         self.step += 1
         self._raise_sh_degree()
         view, factor = self._next_view(), self.sizes.factor(self.step)
         image = self.photographs.load(view, factor)
         camera = self.views[view].camera.resized(image.shape[1], image.shape[0])
-        self.background.set(self._background_colour())
+        self.background.set(colour := self._background_colour())
 
         planes = target(device, work, image, self.background)
         frame = self.rasterizer.forward(self.parameters, camera, self.background)
+        self.watch.notice(frame.refused)
         channels, settings = self.plan.channels, config.density
         fields = SlotFields(settings.absolute_gradients, density.wants_contributions(settings, self.step))
         result = loss(
             device, work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight, channels
         )
+        self.watch.follow(self.step, view, colour, result.sums)
         slots = self.rasterizer.pair_gradients(frame, result.gradient, fields=fields)
         model = (self.parameters, self.first, self.second)
         for start, stop, (parameters, first, second) in parts(work, *model, keep=True):  # one, if the model fits
@@ -209,7 +223,8 @@ class Trainer:
             )
             self._add_statistics(self.statistics.rows(start, stop), view, camera, projected, screen)
             moved = (parameters, self.gradients, first, second)
-            adam(device, self.step, self.rates(), config.optimiser, *moved, projected.tile_counts)
+            counted = (projected.tile_counts, self.rasterizer.found)
+            adam(device, self.step, self.rates(), config.optimiser, *moved, *counted)
         return result
 
     def _add_statistics(
@@ -224,8 +239,26 @@ class Trainer:
             area = full.width * full.height / (camera.width * camera.height)
             add_contributions(self.device, statistics.current, projected, screen.contributions, area)
 
+    def mend(self, *, look: bool = False) -> None:
+        """See to the Gaussians in which something was not finite, if that has been noticed; look: read whether there
+        is something to notice."""
+        if look:
+            self.watch.look()
+        self._apply(self.watch.examine(self.parameters, self.first, self.second))
+
+    def _apply(self, remedy: Remedy | None) -> None:
+        if remedy is None:
+            return
+        for kind, groups in (remedy.moments or {}).items():
+            for group, values in groups.items():
+                (self.first if kind == "first" else self.second)[group].set(values)
+        if remedy.rows is not None:
+            none = np.zeros(len(remedy.rows), bool)
+            self._rearrange(density.Plan(remedy.rows, none, none), densified=False)
+
     def rates(self) -> dict[str, float]:
-        """Learning rate of each group at this step; the means' falls exponentially, all of them in the cooldown."""
+        """Learning rate of each group at this step; the means' falls exponentially, all of them in the cooldown, and
+        with each return to a checkpoint."""
         optimiser = self.config.optimiser
         into = optimiser.cooldown - max(self.config.iterations - self.step, 0)
         cooled = optimiser.cooldown_to ** (into / optimiser.cooldown) if into > 0 else 1.0
@@ -239,7 +272,7 @@ class Trainer:
             "sh_dc": optimiser.sh_dc_rate,
             "sh_rest": optimiser.sh_rest_rate,
         }
-        return {group: rate * cooled for group, rate in rates.items()}
+        return {group: rate * cooled * self.watch.patience.rate_factor for group, rate in rates.items()}
 
     def _next_view(self) -> int:
         if not self.queue:
@@ -268,11 +301,14 @@ class Trainer:
         config = self.config.density
         if self.step == 0:
             return
-        if density.is_due(config, self.step):
+        due, prunes = density.is_due(config, self.step), density.is_pruning_due(config, self.step)
+        resets = density.is_reset_due(config, self.step, white=self.config.background == "white")
+        self.mend(look=due or prunes or resets)
+        if due:
             self._densify()
-        elif density.is_pruning_due(config, self.step):
+        elif prunes:
             self._prune()
-        if density.is_reset_due(config, self.step, white=self.config.background == "white"):
+        if resets:
             logits = self.parameters["opacity_logits"]
             logits.set(density.reset_opacities(config, logits.get()))
             self.first["opacity_logits"].fill(0.0)
@@ -346,17 +382,35 @@ class Trainer:
         return model
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Everything that the steps to come depend on: arrays and JSON state."""
+        """Everything that the steps to come depend on: arrays and JSON state. All of the model is finite, unless
+        `watch.patience.lost`."""
+        self.mend(look=True)
+        arrays = self._arrays()
+        if (remedy := self.watch.examine_all(arrays)) is not None:  # hidden Gaussians, which no step has come by
+            self._apply(remedy)
+            arrays = self._arrays()
+        state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(self.watch.patience)}
+        return arrays, state
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         for kind, source in (("parameters", self.parameters), ("first", self.first), ("second", self.second)):
             arrays.update({f"{kind}/{group}": source[group].get() for group in GROUPS})
-        return arrays, {"rng": self.rng.bit_generator.state, "queue": self.queue}
+        return arrays
+
+    def restart(self) -> None:
+        """Begin again, as slowly as `watch.patience` has it."""
+        del self.parameters, self.first, self.second, self.gradients, self.statistics
+        self.watch.forget()
+        self._start()
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint."""
         self.step = checkpoint.step
         self.rng.bit_generator.state = checkpoint.state["rng"]
         self.queue = list(checkpoint.state["queue"])
+        self.watch.patience = Patience(**checkpoint.state.get("patience", {}))
+        self.watch.forget()
         loaded = [self._loaded(checkpoint, kind) for kind in ("parameters", "first", "second")]
         del self.parameters, self.first, self.second, self.gradients, self.statistics
         self._make_plan(loaded[0].count)
@@ -366,6 +420,9 @@ class Trainer:
         self.statistics.load(found)  # what the settings did not ask for before the checkpoint is not known
 
     def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
+        for group in GROUPS:
+            if f"{kind}/{group}" not in checkpoint.arrays:
+                raise InputError(f"checkpoint of step {checkpoint.step}: has no {kind}/{group}")
         host = {group: checkpoint.arrays[f"{kind}/{group}"] for group in GROUPS}
         count, coefficients = len(host["means"]), host["sh_rest"].shape[1] + 1
         for group, shape in group_shapes(count, coefficients).items():

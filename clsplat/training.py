@@ -6,6 +6,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -21,7 +22,9 @@ from clsplat.errors import ClsplatError
 from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
+from clsplat.quarantine import RETURNS, WINDOW
 from clsplat.rendering import Renderer
+from clsplat.replay import write_bundle
 from clsplat.runs import Run
 from clsplat.stages.loss import Loss
 from clsplat.trainer import Trainer
@@ -72,6 +75,8 @@ class _Session:
         self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
         self.saved = 0
+        self.told_stages: set[str] = set()
+        self.untold = 0
 
     def resume(self) -> None:
         """Go on from the latest checkpoint, if there is one."""
@@ -81,11 +86,65 @@ class _Session:
             self.saved = checkpoint.step
 
     def save(self) -> None:
-        """Write a checkpoint, unless this step has one."""
+        """Write a checkpoint, unless this step has one, or the model is not one to go back to."""
         if self.run is not None and self.trainer.step > self.saved:
             arrays, state = self.trainer.checkpoint()
-            self.run.save_checkpoint(self.trainer.step, arrays, {**state, "seconds": self.seconds})
-            self.saved = self.trainer.step
+            if not self.trainer.watch.patience.lost:
+                self.run.save_checkpoint(self.trainer.step, arrays, {**state, "seconds": self.seconds})
+                self.saved = self.trainer.step
+
+    def go_back(self) -> bool:
+        """Tell what trouble there was; after too much of it go back to the last checkpoint, with smaller steps, and
+        after too much of that raise ClsplatError. Whether it went back."""
+        trainer, patience = self.trainer, self.trainer.watch.patience
+        self.tell_trouble()
+        if not patience.over:
+            return False
+        if patience.spent:
+            self.give_up()
+        checkpoint = self.run.load_latest_checkpoint() if self.run is not None else None
+        stopped = trainer.step
+        if checkpoint is not None:
+            trainer.restore(checkpoint)
+        else:
+            trainer.restart()
+        trainer.watch.patience = patience.after_return()
+        if self.run is not None:
+            self.run.truncate_metrics(trainer.step)
+            self.saved = -1
+            self.save()  # how small the steps are now must outlast a crash
+        warnings.warn(
+            f"step {stopped}: {len(patience.troubled)} of the last {WINDOW} steps had trouble: back to step "
+            f"{trainer.step}, with learning rates of {trainer.watch.patience.rate_factor:g} of what they would be"
+        )
+        return True
+
+    def tell_trouble(self) -> None:
+        """A warning for the first trouble of each stage; the rest is counted."""
+        for incident in self.trainer.watch.incidents:
+            if incident.stage in self.told_stages:
+                self.untold += 1
+            else:
+                warnings.warn(f"{incident} (more of this kind will be counted only)")
+            self.told_stages.add(incident.stage)
+        self.trainer.watch.incidents.clear()
+
+    def tell_the_rest(self) -> None:
+        """How much trouble was counted only."""
+        self.trainer.mend()
+        self.tell_trouble()
+        if self.untold:
+            warnings.warn(f"{self.untold} more steps had something that was not finite")
+
+    def give_up(self) -> None:
+        """Raise ClsplatError, with what reproduces the trouble in the run's folder."""
+        incident = self.trainer.watch.latest
+        assert incident is not None, "patience is over only after trouble"
+        told = f"{incident}, and {RETURNS} returns with smaller steps did not help"
+        if self.run is None:
+            raise ClsplatError(f"{told}: give a run, and what reproduces it is written there")
+        path = write_bundle(self.run.path, self.trainer, incident)
+        raise ClsplatError(f"{told}: {path} reproduces it (python -m clsplat.replay)")
 
     def tell_plan(self) -> None:
         """Tell how the device's memory is used, at first and when more is done in pieces, or less."""
@@ -94,15 +153,14 @@ class _Session:
             self.on_plan(plan)
         self.told = plan
 
-    def report(self, result: Loss) -> StepReport:
-        """Read the loss of the step just made. Raises ClsplatError where it is not finite."""
+    def report(self, result: Loss) -> StepReport | None:
+        """Read the loss of the step just made; None where it is not finite."""
         start = time.perf_counter()
         value, squared = result.read()
         self.seconds += time.perf_counter() - start
         if not np.isfinite(value):
-            raise ClsplatError(
-                f"step {self.trainer.step}: the loss is {value}; the last checkpoint is of step {self.saved}"
-            )
+            self.trainer.watch.loss_failed()
+            return None
         psnr = float(-10 * np.log10(max(squared, 1e-12)))
         return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
 
@@ -123,6 +181,16 @@ class _Session:
             seconds=self.seconds,
         )
 
+    def record(self, report: StepReport, on_step: Callable[[StepReport], None] | None, *, evaluating: bool) -> None:
+        """Hand the report on, and write it down."""
+        if on_step is not None:
+            on_step(report)
+        record = asdict(report)
+        if evaluating:
+            record["eval"] = self.evaluate(keep=False)
+        if self.run is not None:
+            self.run.append_metrics(record)
+
     def step(self, on_step: Callable[[StepReport], None] | None) -> None:
         """One step, and what is due after it."""
         trainer, config = self.trainer, self.trainer.config
@@ -130,17 +198,16 @@ class _Session:
         result = trainer.train_step()
         self.seconds += time.perf_counter() - start
         self.tell_plan()
+        if trainer.step == config.iterations:
+            trainer.mend(look=True)
+        if self.go_back():
+            return
         step = trainer.step
         evaluating = step in config.eval_at and bool(trainer.scene.test_views)
         if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
             report = self.report(result)
-            if on_step is not None:
-                on_step(report)
-            record = asdict(report)
-            if evaluating:
-                record["eval"] = self.evaluate(keep=False)
-            if self.run is not None:
-                self.run.append_metrics(record)
+            if report is not None:
+                self.record(report, on_step, evaluating=evaluating)
         if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
             self.save()
 
@@ -162,8 +229,9 @@ def train(
     run: a folder for metrics, checkpoints, held-out renders and
     the model, or None for none of them; resume: go on from the run's latest checkpoint; on_step: called every
     REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes.
-    Raises InputError for a scene without views, ClsplatError for a loss that is not finite, and
-    KeyboardInterrupt on Ctrl-C after a checkpoint has been written.
+    Raises InputError for a scene without views, ClsplatError where numbers are not finite again and again
+    (docs/decisions/0016-never-a-nan.md; a warning tells of what could be mended), and KeyboardInterrupt on Ctrl-C after
+    a checkpoint has been written.
     """
     config = config or TrainConfig()
     config.check()
@@ -174,9 +242,13 @@ def train(
         session.resume()
     session.tell_plan()
     with _interruption() as interrupted:
-        while trainer.step < config.iterations and not interrupted():
-            session.step(on_step)
-        session.save()
+        while True:
+            while trainer.step < config.iterations and not interrupted():
+                session.step(on_step)
+            session.save()
+            if trainer.step < config.iterations or not session.go_back():
+                break
+        session.tell_the_rest()
         if trainer.step < config.iterations:
             raise KeyboardInterrupt
     model = trainer.gaussians()

@@ -1,6 +1,13 @@
 // Adam (Kingma and Ba 2015, algorithm 1; docs/gradients.md, equation 42) on one parameter group. It leaves the gradient
 // zero, so that the next step need only write the rows of visible Gaussians.
 // rate: learning rate / (1 - beta1^t); root: 1 / sqrt(1 - beta2^t).
+//
+// No parameter and no moment becomes NaN or infinite here: an element of which the new values would be, or whose
+// parameter would not be within `limit`, is left as it is, and counted in the last four of `found` (8), of which
+// compact_visible has the first: by the parameter that it had, its gradient, its moments, or all of these well and the
+// step not. Moments that are broken begin again from zero. In the other cases the second moment becomes infinite and
+// the first 0, which refuses every step until the host has seen to the row (docs/decisions/0016-never-a-nan.md). One
+// sum is all that this costs where nothing is wrong.
 #include "shared/math.h"
 #include "shared/lanes.h"
 
@@ -12,43 +19,72 @@ static inline floatL change(floatL g, float rate, float root, float beta1, float
   return rate * *m / fmaL(sqrt(*v), (floatL)(root), (floatL)(epsilon));
 }
 
+// Whether new values may be stored. A second moment is a square, so that the sum is one test of both.
+#ifdef UNGUARDED
+#define WELL(parameter, second) ((intL)(-1))
+#else
+#define WELL(parameter, second) MASKL(fabs(parameter) + second < limit)
+#endif
+
+// What becomes of an element whose step is refused: p, g, m and v as they were before it.
+static inline void refuse(size_t i, float limit, float p, float g, float m, float v, __global float *first,
+                          __global float *second, __global uint *found) {
+  const int parameter = fabs(p) < limit, gradient = fabs(g) < INFINITY;
+  const int moments = fabs(m) < INFINITY && v >= 0.0f && v < INFINITY, marked = m == 0.0f && v == INFINITY;
+  const int again = parameter && gradient && !moments && !marked;
+  first[i] = 0.0f;
+  second[i] = again ? 0.0f : INFINITY;
+  atomic_inc(found + 4 + (!parameter ? 0 : (!gradient ? 1 : (again ? 2 : 3))));
+}
+
 // One element, as `change` has it.
-static inline void step_element(size_t i, float rate, float root, float beta1, float beta2, float epsilon,
-                                __global float *parameters, __global float *gradients, __global float *first,
-                                __global float *second) {
+static inline void step_element(size_t i, float rate, float root, float beta1, float beta2, float epsilon, float limit,
+                                __global uint *found, __global float *parameters, __global float *gradients,
+                                __global float *first, __global float *second) {
   const float g = gradients[i];
   const float m = fma1(beta1, first[i], (1.0f - beta1) * g);
   const float v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));
+  const float p = parameters[i] - rate * m / fma1(sqrt(v), root, epsilon);
+  gradients[i] = 0.0f;
+#ifndef UNGUARDED
+  if (!(fabs(p) + v < limit)) {
+    refuse(i, limit, parameters[i], g, first[i], second[i], first, second, found);
+    return;
+  }
+#endif
   first[i] = m;
   second[i] = v;
-  parameters[i] -= rate * m / fma1(sqrt(v), root, epsilon);
-  gradients[i] = 0.0f;
+  parameters[i] = p;
 }
 
 // The group as a flat array, LANES elements a work-item. parameters, gradients, first, second (n).
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
-                   const float epsilon, __global float *parameters, __global float *gradients,
-                   __global float *first, __global float *second) {
+                   const float epsilon, const float limit, __global uint *found, __global float *parameters,
+                   __global float *gradients, __global float *first, __global float *second) {
   const ulong i = get_global_id(0) * (ulong)LANES;
   if (i + LANES <= n) {
     floatL m = LOADL(first + i), v = LOADL(second + i);
     const floatL by = change(LOADL(gradients + i), rate, root, beta1, beta2, epsilon, &m, &v);
-    STOREL(m, first + i);
-    STOREL(v, second + i);
-    STOREL(LOADL(parameters + i) - by, parameters + i);
-    STOREL((floatL)(0.0f), gradients + i);
-    return;
+    const floatL p = LOADL(parameters + i) - by;
+    if (!ANYL(~WELL(p, v))) {
+      STOREL(m, first + i);
+      STOREL(v, second + i);
+      STOREL(p, parameters + i);
+      STOREL((floatL)(0.0f), gradients + i);
+      return;
+    }
   }
-  for (ulong k = i; k < n; ++k)
-    step_element(k, rate, root, beta1, beta2, epsilon, parameters, gradients, first, second);
+  for (ulong k = i; k < min(i + LANES, n); ++k)
+    step_element(k, rate, root, beta1, beta2, epsilon, limit, found, parameters, gradients, first, second);
 }
 
 #ifdef WIDTH
 // Only the rows of visible Gaussians, LANES rows a work-item (OptimiserConfig.sparse); gradients of the others are zero
 // already. tile_counts (n): 0 where hidden; parameters, gradients, first, second (n, WIDTH).
 __kernel void adam_visible(const uint n, const float rate, const float root, const float beta1, const float beta2,
-                           const float epsilon, __global const uint *tile_counts, __global float *parameters,
-                           __global float *gradients, __global float *first, __global float *second) {
+                           const float epsilon, const float limit, __global uint *found,
+                           __global const uint *tile_counts, __global float *parameters, __global float *gradients,
+                           __global float *first, __global float *second) {
   const uint row = get_global_id(0) * LANES;
   if (row >= n) return;
   int visible[LANES], some = 0;
@@ -61,7 +97,7 @@ __kernel void adam_visible(const uint n, const float rate, const float root, con
   if (n - row < LANES) {
     for (size_t i = begin; i < end; ++i)
       if (visible[(i - begin) / WIDTH])
-        step_element(i, rate, root, beta1, beta2, epsilon, parameters, gradients, first, second);
+        step_element(i, rate, root, beta1, beta2, epsilon, limit, found, parameters, gradients, first, second);
     return;
   }
   for (uint k = 0; k < WIDTH; ++k) {
@@ -71,9 +107,17 @@ __kernel void adam_visible(const uint n, const float rate, const float root, con
     const floatL m_before = LOADL(first + i), v_before = LOADL(second + i);
     floatL m = m_before, v = v_before;
     const floatL by = change(LOADL(gradients + i), rate, root, beta1, beta2, epsilon, &m, &v);
+    const floatL p = LOADL(parameters + i) - (taken.all ? by : (floatL)(0.0f));
+    if (ANYL(~WELL(p, v) & taken.all)) {
+      for (uint lane = 0; lane < LANES; ++lane)
+        if (taken.lane[lane])
+          step_element(i + lane, rate, root, beta1, beta2, epsilon, limit, found, parameters, gradients, first,
+                       second);
+      continue;
+    }
     STOREL(taken.all ? m : m_before, first + i);
     STOREL(taken.all ? v : v_before, second + i);
-    STOREL(LOADL(parameters + i) - (taken.all ? by : (floatL)(0.0f)), parameters + i);
+    STOREL(p, parameters + i);
     STOREL((floatL)(0.0f), gradients + i);
   }
 }

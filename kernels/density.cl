@@ -10,18 +10,20 @@ static inline float ndc_norm(__global const float *screen, const size_t i, const
 
 // One work-item a Gaussian; those with tiles are seen. screen (n, 2): gradient of the mean on the image in pixels;
 // x_scale, y_scale to NDC -> gradient_sums (n): norms added up; seen (n): views; radii (n): largest radius in pixels
-// at 3 sigma.
+// at 3 sigma. A view in which one of them is not finite does not count, here and below.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
                                  __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums,
                                  __global float *seen, __global float *radii) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
-  gradient_sums[i] += ndc_norm(screen, i, x_scale, y_scale);
-  seen[i] += 1.0f;
+  const float norm = ndc_norm(screen, i, x_scale, y_scale);
   __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
   const float l11 = splat[SPLAT_L11] / WHITEN, l12 = splat[SPLAT_L12] / WHITEN, l22 = splat[SPLAT_L22] / WHITEN;
   const float radius = ceil(3.0f * sqrt(larger_eigenvalue(l11, l12, l22)));
+  if (!(norm < INFINITY && radius < INFINITY)) return;
+  gradient_sums[i] += norm;
+  seen[i] += 1.0f;
   radii[i] = radii[i] > radius ? radii[i] : radius;
 }
 
@@ -42,6 +44,7 @@ __kernel void contribution_statistics(const uint n, const float area, __global c
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
   const float contribution = area * contributions[i];
+  if (!(contribution < INFINITY)) return;
   totals[i] += contribution;
   largest[i] = largest[i] > contribution ? largest[i] : contribution;
 }

@@ -9,6 +9,9 @@
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 
+// Of a channel. The squares that SSIM multiplies stay finite below it, and no picture has a colour over it.
+#define COLOUR_LIMIT 1e9f
+
 // Whether a Gaussian goes on that reaches no tile (RasterizerConfig.frustum_cull, opacity_cull).
 #if defined(NO_FRUSTUM_CULL)
 #define KEEP_CULLED 1
@@ -16,14 +19,9 @@
 #define KEEP_CULLED !opaque.lane[lane]
 #endif
 
-// (12): NaN is 0.
-static inline float clamped_colour(float colour) {
-  const float below = colour < COLOUR_MAX ? colour : COLOUR_MAX;
-  return colour > 0.0f ? below : 0.0f;
-}
-
 // means (n, 3), quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n, 3),
 // sh_rest (n, coefficients - 1, 3); splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.
+// A colour that is not finite, or of more than COLOUR_LIMIT, is not drawn: one such pixel would be all of the loss.
 // With KEEP_CULLED shown (n): 1 where a splat is written, also of those that have no tile. Of a model that is held:
 // with SH_DEGREES sh_degrees (n): the highest that is looked at; with SH_CACHE sh_cache (n, 6): the direction that a
 // Gaussian's colour was last worked out for, and the colour.
@@ -135,9 +133,18 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     __global const shT *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
     for (int k = 1; k < used; ++k, f += 3)
       colour = sh_fma(basis[k].lane[lane], sh_channels(f, k + 1 == coefficients), colour);
-    splat[SPLAT_RED] = clamped_colour(colour.x);
-    splat[SPLAT_GREEN] = clamped_colour(colour.y);
-    splat[SPLAT_BLUE] = clamped_colour(colour.z);
+#ifndef UNGUARDED
+    if (!(colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT)) {
+      tile_counts[i] = 0;
+#ifdef KEEP_CULLED
+      shown[i] = 0;
+#endif
+      continue;
+    }
+#endif
+    splat[SPLAT_RED] = colour.x > 0.0f ? colour.x : 0.0f;
+    splat[SPLAT_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
+    splat[SPLAT_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
 #ifdef SH_CACHE
     for (int k = 0; k < 3; ++k) {
       cached[k] = direction[k].lane[lane];

@@ -24,8 +24,6 @@ __kernel void add_slots(const uint n, __global const uint *tile_counts, __global
   for (int field = 0; field < SLOT_STRIDE; ++field) sums[(size_t)SLOT_STRIDE * i + field] = own[field];
 }
 
-#define FREE(colour) ((colour) > 0.0f && (colour) < COLOUR_MAX)
-
 // s1 - s2, their logarithms `x` apart: near each other by the series of exp(x) - 1, as what rounding leaves of two equal
 // scales' difference would turn every ball.
 static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
@@ -153,9 +151,9 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
     const size_t i = first_row + lane;
     if (tile_counts[i] == 0) continue;
     __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
-    const float4 d_colour = (float4)(FREE(splat[SPLAT_RED]) ? m[SLOT_RED].lane[lane] : 0.0f,
-                                     FREE(splat[SPLAT_GREEN]) ? m[SLOT_GREEN].lane[lane] : 0.0f,
-                                     FREE(splat[SPLAT_BLUE]) ? m[SLOT_BLUE].lane[lane] : 0.0f, 0.0f);
+    const float4 d_colour = (float4)(splat[SPLAT_RED] > 0.0f ? m[SLOT_RED].lane[lane] : 0.0f,
+                                     splat[SPLAT_GREEN] > 0.0f ? m[SLOT_GREEN].lane[lane] : 0.0f,
+                                     splat[SPLAT_BLUE] > 0.0f ? m[SLOT_BLUE].lane[lane] : 0.0f, 0.0f);
     d_sh_dc[3 * i] = SH_CONSTANT * d_colour.x;
     d_sh_dc[3 * i + 1] = SH_CONSTANT * d_colour.y;
     d_sh_dc[3 * i + 2] = SH_CONSTANT * d_colour.z;

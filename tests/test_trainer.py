@@ -442,16 +442,22 @@ def test_the_cap_holds(scene: Scene, default_device: Device) -> None:
 # What stops it
 
 
-def test_a_loss_that_is_not_finite_stops_it(
+def test_a_loss_that_is_never_finite_stops_it(
     scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = Run.create(tmp_path / "run", config := short(checkpoint_every=6))
+    run = Run.create(tmp_path / "run", config := short(iterations=300, checkpoint_every=6))
     real = Loss.read
     monkeypatch.setattr(Loss, "read", lambda self: real(self) if len(run.read_metrics()) < 1 else (np.nan, 1.0))
-    with pytest.raises(ClsplatError, match="step 20: the loss is nan; the last checkpoint is of step 18") as caught:
+    with (
+        pytest.warns(UserWarning, match=r"step 20, view \d\d\.png, stage loss: the loss is not finite"),
+        pytest.raises(
+            ClsplatError, match=r"the loss is not finite; .*, and 3 returns with smaller steps did not"
+        ) as caught,
+    ):
         train(scene, config, device=default_device, run=run)
     assert caught.value.exit_status == 1
-    assert [step for step, _ in run.checkpoints()] == [12, 18]
+    assert [record["step"] for record in run.read_metrics()] == [10]
+    assert len(run.checkpoints()) == 2
 
 
 def test_nothing_left_stops_it(scene: Scene, default_device: Device) -> None:

@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays in device memory: a shape and a dtype over a buffer, and a workspace of named ones that grow."""
+"""Arrays in device memory: a shape and a dtype over a buffer, and a workspace of named ones that grow.
+
+Debug mode: with CLSPLAT_POISON=1 every array is full of NaN (as integers 2143289344) when it is handed out, with
+CLSPLAT_POISON=0xff800000 or another number of 32 bits of that. What reads memory that nobody has written then shows.
+"""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +15,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike, NDArray
 
-from clsplat.errors import CapacityError
+from clsplat.errors import CapacityError, InputError
 
 if TYPE_CHECKING:
     from clsplat.device.context import Device
@@ -79,6 +84,26 @@ class DeviceArray:
         return DeviceArray(self.device, self.buffer, shape, self.dtype)
 
 
+def _poison() -> NDArray[np.uint32] | None:
+    """What new memory is full of, or None for whatever is there. Raises InputError."""
+    value = os.environ.get("CLSPLAT_POISON", "")
+    if value in ("", "0"):
+        return None
+    try:
+        return np.array(0x7FC00000 if value == "1" else int(value, 0), np.uint32)
+    except (ValueError, OverflowError):
+        raise InputError(f"CLSPLAT_POISON {value}: expected 1, or 32 bits such as 0xff800000") from None
+
+
+def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nbytes: int) -> None:
+    """Of the buffer's first `nbytes` what whole words there are, and the rest by its last byte."""
+    whole = nbytes // 4 * 4
+    if whole:
+        cl.enqueue_fill_buffer(device.queue, buffer, word, 0, whole)
+    if nbytes > whole:
+        cl.enqueue_fill_buffer(device.queue, buffer, np.uint8(word & 0xFF), whole, nbytes - whole)
+
+
 class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
     """A buffer that can be referred to weakly, as the account of the device's memory wants."""
 
@@ -106,6 +131,8 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
             f"{device.memory.used / 2**20:.0f} MiB in use: give --max-device-mem less than that"
         ) from None
     device.memory.add(buffer, nbytes)
+    if (word := _poison()) is not None:
+        _fill_bytes(device, buffer, word, nbytes)
     return DeviceArray(device, buffer, shape, kind)
 
 
@@ -123,10 +150,14 @@ class Workspace:
     def __init__(self, device: Device) -> None:
         self._device = device
         self.tight = device.memory.limit is not None
+        self._poison = _poison()
         self._arrays: dict[str, DeviceArray] = {}
 
-    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> DeviceArray:
-        """An array whose contents are whatever the last user left there."""
+    def array(
+        self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
+    ) -> DeviceArray:
+        """An array of which the contents are not to be read before they are written; kept: it was handed out before in
+        this shape, and has what was left there."""
         kind = np.dtype(dtype)
         elements = int(np.prod(shape, dtype=np.int64))
         held = self._arrays.get(name)
@@ -136,6 +167,8 @@ class Workspace:
             held = self._arrays.pop(name, None)
             del held  # before its successor is made: there need not be room for both
             held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
+        if self._poison is not None and not kept:
+            _fill_bytes(self._device, held.buffer, self._poison, elements * kind.itemsize)
         return DeviceArray(self._device, held.buffer, shape, kind)
 
     def clear(self) -> None:

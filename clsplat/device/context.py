@@ -122,6 +122,11 @@ class Device:
         device._switches = switches  # noqa: SLF001  # a copy of our own class
         return device
 
+    @property
+    def switches(self) -> Mapping[str, object]:
+        """The defines that `with_switches` gave it."""
+        return self._switches
+
     def switched(self, *names: str) -> bool:
         """Whether kernels are built with any of these switches."""
         return any(name in self._switches for name in names)

@@ -21,7 +21,7 @@ Bool = NDArray[np.bool_]
 ALPHA_MIN = 1.0 / 255.0
 LOW_PASS = 0.3
 FRUSTUM_MARGIN = 0.3
-COLOUR_MAX = 1e18
+COLOUR_LIMIT = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +136,9 @@ def project(
 
         directions, _ = view_directions(means, camera)
         basis = sh_basis(directions, sh_degree)
-        colors = np.clip(0.5 + np.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]), 0.0, COLOUR_MAX)
+        colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]))
 
-        visible = (z > camera.near) & (opacities > ALPHA_MIN) & (det > 0)
+        visible = (z > camera.near) & (opacities > ALPHA_MIN) & (det > 0) & (colors < COLOUR_LIMIT).all(axis=1)
         for values in (means2d, whitening, conics, half_extents, colors):
             visible &= np.isfinite(values).all(axis=1)
 
@@ -268,7 +268,7 @@ def project_grad_covariances(
     directions, distances = view_directions(means[rows], camera)
     basis = sh_basis(directions, sh_degree)
     count = basis.shape[1]
-    free = (projected.colors[rows] > 0) & (projected.colors[rows] < COLOUR_MAX)
+    free = projected.colors[rows] > 0
     d_value = np.where(free, d_colors[rows], 0.0)  # (39)
     d_directions = np.einsum("nkd,nkc,nc->nd", sh_basis_grad(directions, sh_degree), sh[rows, :count], d_value)
     radial = (directions * d_directions).sum(axis=1, keepdims=True)

@@ -8,11 +8,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from clsplat.config import OptimiserConfig
-from clsplat.device.buffers import DeviceArray
+from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
+from clsplat.quarantine import limit_of
 from clsplat.stages.project import GROUPS, DeviceGaussians
+
+REFUSED = ("parameters", "gradients", "moments", "steps")
+"""Why the steps of elements were refused: what adam.cl counts."""
 
 
 def updates_sh_rest(config: OptimiserConfig, step: int) -> bool:
@@ -31,11 +35,14 @@ def adam(
     first: DeviceGaussians,
     second: DeviceGaussians,
     tile_counts: DeviceArray,
+    found: DeviceArray | None = None,
 ) -> None:
     """Step number `step` (from 1) with the constants of `config` and a rate per group; leaves the gradients zero.
 
-    tile_counts (n,) uint32: 0 where the view does not show a Gaussian, for `config.sparse`.
+    tile_counts (n,) uint32: 0 where the view does not show a Gaussian, for `config.sparse`; found (8,) uint32: in its
+    last four are counted the elements that got no step because it, or what it comes from, is not finite (`REFUSED`).
     """
+    found = found or allocate(device, (4 + len(REFUSED),), np.uint32)
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     lanes = device.shape.lanes
     for group in GROUPS:
@@ -44,7 +51,8 @@ def adam(
             if not updates_sh_rest(config, step):
                 continue
             updates = step // config.sh_rest_every
-        constants = (rates[group] / (1.0 - beta1**updates), (1.0 - beta2**updates) ** -0.5, beta1, beta2, epsilon)
+        rate, root = rates[group] / (1.0 - beta1**updates), (1.0 - beta2**updates) ** -0.5
+        constants = (rate, root, beta1, beta2, epsilon, limit_of(group), found)
         arrays = (parameters[group], gradients[group], first[group], second[group])
         size, rows = parameters[group].size, parameters.count
         if size == 0:

@@ -30,13 +30,13 @@ class Blended:
     cells_from_sorted: DeviceArray | None
 
 
-def _planes(work: Workspace, width: int, height: int) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Image, transmittance and stops of a frame: the workspace's, whoever asks."""
+def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+    """Image, transmittance and stops of a frame: the workspace's, whoever asks; kept: as the last one left them."""
     rows, stride = -(-height // TILE) * TILE, -(-width // TILE) * TILE
     return (
-        work.array("image", (3, rows, stride)),
-        work.array("transmittance", (rows, stride)),
-        work.array("stops", (rows, stride), np.int32),
+        work.array("image", (3, rows, stride), kept=kept),
+        work.array("transmittance", (rows, stride), kept=kept),
+        work.array("stops", (rows, stride), np.int32, kept=kept),
     )
 
 
@@ -64,7 +64,7 @@ def blend(
     record: keep the cells that the gradient has to go through, where the kernels' shape has them.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    planes = _planes(work, width, height)
+    planes = _planes(work, width, height, kept=band is not None and band.first > 0)
     items = tile_items(device)
     cells = None
     if record and items == 1 and device.shape.lanes >= 8:
@@ -104,7 +104,7 @@ def count_pairs(
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     items = tile_items(device)
-    planes = _planes(work, camera.width, camera.height)  # those of `blend`: it writes the same values again
+    planes = _planes(work, camera.width, camera.height, kept=True)  # those of `blend`: it writes the same values again
     tiles = band.tiles if band else tiles_x * tiles_y
     counts = work.array("counts", (tiles * items, 2), np.uint32)
     launch_groups(

@@ -39,7 +39,7 @@ class Band:
 class Counted:
     """tile_counts, first_slots (n): a Gaussian's tiles, and their scan; gaussian_from_visible, depth_keys (visible):
     in order of Gaussians; visible and pairs: the totals, pairs capped at 2^32 - 1; least_key and key_bits: what every
-    depth key has at least, and how many low bits of the rest can be set."""
+    depth key has at least, and how many low bits of the rest can be set; beside: what else was in `found`."""
 
     tile_counts: DeviceArray
     first_slots: DeviceArray
@@ -49,6 +49,7 @@ class Counted:
     pairs: int
     least_key: int
     key_bits: int
+    beside: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +71,13 @@ def count(
     shown: DeviceArray | None = None,
     *,
     all_bits: bool = False,
+    found: DeviceArray | None = None,
 ) -> Counted:
     """Which Gaussians are visible, how many pairs they make, and by which bits their depths differ, or with `all_bits`
     32; waits for the device.
 
-    shown (n,): not 0 where a Gaussian is visible; its tile_counts if not given, unless culling is switched off.
+    shown (n,): not 0 where a Gaussian is visible; its tile_counts if not given, unless culling is switched off;
+    found (4 or more) uint32: the array that is read, if what is beyond its first four is to be read with them.
     """
     (n,) = tile_counts.shape
     shown = shown or tile_counts
@@ -86,8 +89,8 @@ def count(
     scan(device, work, tile_counts, first_slots, pairs_total)
     gaussian_from_visible = work.array("gaussian_from_visible", (n,), np.uint32)
     depth_keys = work.array("depth_keys", (n,), np.uint32)
-    found = work.array("found", (4,), np.uint32)
-    found.fill(0)
+    found = found or work.array("found", (4,), np.uint32)
+    found.reshaped(4).fill(0)
     groups, chunk = chunking(device, n)
     launch_groups(
         device,
@@ -105,7 +108,7 @@ def count(
         depth_keys,
         found,
     )
-    visible, pairs, turned, largest = (int(value) for value in found.get())
+    visible, pairs, turned, largest, *beside = (int(value) for value in found.get())
     least = 0 if all_bits else 2**32 - 1 - turned
     return Counted(
         tile_counts,
@@ -116,6 +119,7 @@ def count(
         pairs,
         least,
         32 if all_bits else max(largest - least, 1).bit_length(),
+        tuple(beside),
     )
 
 

@@ -1,7 +1,6 @@
 // From LANES Gaussians' parameters to their ellipses on the image: what projection and its gradient both need.
 // Equation numbers are those of docs/gradients.md.
 
-#define COLOUR_MAX 1e18f // no sum of what a colour is a factor of overflows
 // Where `refine` is called for: longest axis over the ellipse's short one, and an axis over what is seen of it. Up to
 // there float32 is good to 3e-5.
 #define REFINE_FROM 64.0f

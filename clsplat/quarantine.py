@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of Gaussians, steps and runs in which a number is not finite: policy only, no OpenCL.
+
+docs/decisions/0016-never-a-nan.md says why it is so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+PATIENCE = 5
+"""Troubled steps among the last WINDOW with which training goes back to a checkpoint."""
+WINDOW = 100
+RETURNS = 3
+"""How often it goes back in a run; the next time it stops."""
+SMALLER = 0.5
+"""What each return leaves of the learning rates, for the rest of the run."""
+MOST_LOST = 0.5
+"""With more of its Gaussians broken a model is not mended: training goes back at once."""
+SH_LIMIT = 1e7
+"""No SH coefficient may be larger: a colour that project.cl does not draw for its size has one that is."""
+KEPT = 1000
+"""Gaussians of an incident of which a copy is kept."""
+
+Model = Mapping[str, NDArray[np.float32]]
+"""Arrays by parameter group, the first axis of each being the Gaussians."""
+
+
+def limit_of(group: str) -> float:
+    """What the magnitudes of a group's parameters have to be under."""
+    return SH_LIMIT if group.startswith("sh_") else float("inf")
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """broken (n,): Gaussians with a parameter that is not finite or over its limit; refused (n,): those with a moment
+    that is not finite, which is also how `adam` marks whom it has refused a step."""
+
+    broken: NDArray[np.bool_]
+    refused: NDArray[np.bool_]
+
+    @property
+    def any(self) -> bool:
+        """Whether something is to be done."""
+        return bool(self.broken.any() or self.refused.any())
+
+    def lost(self, stage: str) -> NDArray[np.bool_]:
+        """Those to remove. A loss that is not finite is no fault of the Gaussians that got no gradient from it."""
+        return self.broken if stage == "loss" else self.broken | self.refused
+
+
+def examine(parameters: Model, first: Model, second: Model) -> Findings:
+    """Look at every number of a model and its moments."""
+    count = len(parameters["means"])
+    broken, refused = np.zeros(count, bool), np.zeros(count, bool)
+    for group, values in parameters.items():
+        broken |= ~(np.abs(values) < limit_of(group)).reshape(count, -1).all(axis=1)
+    for moments in (first, second):
+        for values in moments.values():
+            refused |= ~np.isfinite(values).reshape(count, -1).all(axis=1)
+    return Findings(broken, refused)
+
+
+def finite_or_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A copy in which what is not finite is zero, as moments begin."""
+    return np.where(np.isfinite(values), values, np.float32(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Incident:
+    """Something that was not finite. step and view: in which it arose; stage: the first in which it showed ("loss",
+    "project_grad", "parameters", "adam"); count: Gaussians concerned, or where there are none elements of arrays; done:
+    what was done about it; gaussians: up to KEPT of those concerned, by "parameters/means" and so on."""
+
+    step: int
+    view: int
+    name: str
+    stage: str
+    count: int
+    done: str
+    background: NDArray[np.float32]
+    gaussians: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        concerned = len(self.gaussians.get("parameters/means", ()))
+        whose = f"{self.count:,} {'Gaussian' if concerned else 'element'}{'' if self.count == 1 else 's'}"
+        what = {
+            "loss": "the loss is not finite",
+            "project_grad": f"gradients of {whose} are not finite",
+            "parameters": f"parameters of {whose} are not finite, or far too large",
+            "adam": f"steps or moments of {whose} are not finite",
+        }[self.stage]
+        return f"step {self.step}, view {self.name}, stage {self.stage}: {what}; {self.done}"
+
+
+@dataclass
+class Patience:
+    """How much trouble there was of late, and what earlier trouble has left; a checkpoint has it."""
+
+    troubled: list[int] = field(default_factory=list)
+    rate_factor: float = 1.0
+    returns: int = 0
+    lost: bool = False
+
+    def note(self, step: int, *, lost: bool = False) -> None:
+        """Step number `step` had trouble; lost: too much of the model is gone to go on with it."""
+        self.troubled = [*(each for each in self.troubled if step - WINDOW < each < step), step]
+        self.lost = self.lost or lost
+
+    @property
+    def over(self) -> bool:
+        """Whether it is time to go back."""
+        return self.lost or len(self.troubled) >= PATIENCE
+
+    @property
+    def spent(self) -> bool:
+        """Whether going back has been tried often enough."""
+        return self.returns >= RETURNS
+
+    def after_return(self) -> Patience:
+        """What goes on with the model of a checkpoint."""
+        return Patience(rate_factor=SMALLER * self.rate_factor, returns=self.returns + 1)

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bundle that a training leaves when it gives up on numbers that are not finite, and the one step that it repeats.
+
+    python -m clsplat.replay RUN/trouble-step-0001234.npz [--device DEVICE] [--json]
+
+prints how many numbers are not finite after each stage of that step. Exit status 0 where some are, 1 where all is well.
+A bundle has a photograph, a camera, settings, versions and the Gaussians concerned; all of them only where those alone
+do not show it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+import clsplat
+from clsplat import density
+from clsplat.camera import Camera
+from clsplat.config import TrainConfig
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device, open_device
+from clsplat.device.layout import SPLAT, SlotFields
+from clsplat.errors import ClsplatError, InputError
+from clsplat.files import atomic_writer
+from clsplat.quarantine import Incident, finite_or_zero
+from clsplat.rendering import Rasterizer
+from clsplat.runs import config_text, read_config
+from clsplat.stages.adam import REFUSED, adam
+from clsplat.stages.loss import loss
+from clsplat.stages.project import GROUPS, DeviceGaussians, allocate_gaussians, group_shapes
+from clsplat.stages.target import target
+
+if TYPE_CHECKING:
+    from clsplat.trainer import Trainer
+
+RECORD = "bundle.json"
+"""The member of a bundle with everything that is no array."""
+_KINDS = ("parameters", "first", "second")
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """One training step. record: step, stage, name of the view, rates, size, versions, device; config: the settings;
+    camera: at the size of photograph (H, W, 3 or 4); background (3,); models: parameters and moments by group."""
+
+    record: dict[str, Any]
+    config: TrainConfig
+    camera: Camera
+    photograph: NDArray[Any]
+    background: NDArray[np.float32]
+    models: dict[str, dict[str, NDArray[np.float32]]]
+
+
+def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
+    """Write `folder`/trouble-step-STEP.npz of what happened; the path."""
+    photograph = trainer.photographs.load(incident.view, trainer.sizes.factor(incident.step))
+    camera = trainer.views[incident.view].camera.resized(photograph.shape[1], photograph.shape[0])
+    device = trainer.device
+    record: dict[str, Any] = {
+        "step": incident.step,
+        "view": incident.name,
+        "stage": incident.stage,
+        "message": str(incident),
+        "rates": trainer.rates(),
+        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "near")},
+        "settings": config_text(trainer.config, None),
+        "versions": {
+            "clsplat": clsplat.__version__,
+            "numpy": np.__version__,
+            "pyopencl": cl.VERSION_TEXT,
+            "python": platform.python_version(),
+            "system": platform.platform(),
+        },
+        "device": {"name": device.name, "driver": device.driver, "shape": str(device.shape)},
+    }
+    pixels = {"photograph": photograph, "background": incident.background}
+    pose = {"rotation": camera.rotation, "translation": camera.translation}
+    models = {kind: {g: incident.gaussians[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS if incident.gaussians}
+
+    def bundle() -> Bundle:
+        return Bundle(record, trainer.config, camera, photograph, incident.background, models)
+
+    alone = bool(models) and len(models["parameters"]["means"]) > 0
+    if alone:
+        _forget_marks(models)
+        alone = bool(first_trouble(replay(bundle(), device)))
+    if not alone:
+        whole = {"parameters": trainer.parameters, "first": trainer.first, "second": trainer.second}
+        models = {kind: {g: model[g].get() for g in GROUPS} for kind, model in whole.items()}
+        _forget_marks(models)
+    record["of"] = len(models["parameters"]["means"]), trainer.parameters.count
+    record["reproduced"] = alone or bool(first_trouble(replay(bundle(), device)))
+    arrays = {f"{kind}/{g}": values for kind, groups in models.items() for g, values in groups.items()}
+    path = folder / f"trouble-step-{incident.step:07d}.npz"
+    text = np.frombuffer(json.dumps(record).encode(), np.uint8)
+    with atomic_writer(path) as file:
+        np.savez(file, allow_pickle=False, **{RECORD: text, **pixels, **pose, **arrays})
+    return path
+
+
+def _forget_marks(models: dict[str, dict[str, NDArray[np.float32]]]) -> None:
+    """Moments as they were before `adam` refused a step, as far as they are known."""
+    for kind in ("first", "second"):
+        models[kind] = {group: finite_or_zero(values) for group, values in models[kind].items()}
+
+
+def read_bundle(path: Path) -> Bundle:
+    """Raises InputError for what is no bundle."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        record = json.loads(arrays[RECORD].tobytes())
+        pose = (arrays["rotation"], arrays["translation"])
+        size = record["camera"]
+        lens = (size["width"], size["height"], size["fx"], size["fy"], size["cx"], size["cy"])
+        models = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS}
+        with tempfile.TemporaryDirectory() as folder:
+            settings = Path(folder) / "config.toml"
+            settings.write_text(record["settings"], "utf-8")
+            config, _ = read_config(settings)
+        camera = Camera(*lens, *pose, near=size["near"])
+        return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+        raise InputError(f"{path}: not a bundle of a training that gave up ({error})") from None
+
+
+def replay(bundle: Bundle, device: Device) -> dict[str, int]:
+    """Make the step once more: after each stage how many numbers are not finite, and how many steps `adam` refuses."""
+    config, camera = bundle.config, bundle.camera
+    rasterizer = Rasterizer(device, config.rasterizer)
+    parameters, first, second = (_upload(device, bundle.models[kind]) for kind in _KINDS)
+    count, coefficients = parameters.count, parameters.coefficients
+    gradients = allocate_gaussians(device, count, coefficients, zero=True)
+    background = upload(device, bundle.background)
+    planes = target(device, rasterizer.work, bundle.photograph, background)
+    fields = SlotFields(config.density.absolute_gradients, density.wants_contributions(config.density))
+    result = {"parameters": _wrong(parameters)}
+    frame = rasterizer.forward(parameters, camera, background)
+    drawn = frame.projected.tile_counts.get() > 0
+    written = [column for column, name in enumerate(SPLAT) if name != "UNUSED"]
+    result["project"] = int(np.count_nonzero(~np.isfinite(frame.projected.splats.get()[drawn][:, written])))
+    image = frame.blended.image.get()[:, : camera.height, : camera.width]
+    result["blend"] = int(np.count_nonzero(~np.isfinite(image)))
+    lost = loss(device, rasterizer.work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight)
+    image_gradient = lost.gradient.get()[:, : camera.height, : camera.width]
+    result["loss"] = int(np.count_nonzero(~np.isfinite(image_gradient)))
+    slots = rasterizer.pair_gradients(frame, lost.gradient, fields=fields)
+    result["blend_grad"] = int(np.count_nonzero(~np.isfinite(slots.values.get())))
+    rasterizer.row_gradients(parameters, frame, frame.projected, slots, gradients, fields=fields)
+    result["project_grad"] = _wrong(gradients)
+    step, rates = bundle.record["step"], bundle.record["rates"]
+    moved = (parameters, gradients, first, second)
+    adam(device, step, rates, config.optimiser, *moved, frame.projected.tile_counts, rasterizer.found)
+    result["adam"] = int(rasterizer.found.get()[-len(REFUSED) :].sum())
+    return result
+
+
+def first_trouble(counts: dict[str, int]) -> str | None:
+    """The first stage after which something is not finite."""
+    return next((stage for stage, count in counts.items() if count), None)
+
+
+def _upload(device: Device, arrays: dict[str, NDArray[np.float32]]) -> DeviceGaussians:
+    count, coefficients = len(arrays["means"]), arrays["sh_rest"].shape[1] + 1
+    if any(arrays[group].shape != shape for group, shape in group_shapes(count, coefficients).items()):
+        raise InputError("the bundle's Gaussians have arrays that do not belong together")
+    return DeviceGaussians(count, coefficients, {group: upload(device, arrays[group]) for group in GROUPS})
+
+
+def _wrong(gaussians: DeviceGaussians) -> int:
+    return sum(int(np.count_nonzero(~np.isfinite(gaussians[group].get()))) for group in GROUPS)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line above."""
+    parser = argparse.ArgumentParser(prog="python -m clsplat.replay", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("bundle", type=Path)
+    parser.add_argument("--device")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    try:
+        bundle = read_bundle(options.bundle)
+        counts = replay(bundle, open_device(options.device))
+    except ClsplatError as error:
+        print(f"clsplat.replay: error: {error}", file=sys.stderr)
+        return error.exit_status
+    stage = first_trouble(counts)
+    if options.json:
+        print(json.dumps({"counts": counts, "stage": stage, **bundle.record}, indent=2))
+        return 0 if stage else 1
+    print(bundle.record["message"])
+    kept, of = bundle.record["of"]
+    print(f"{kept:,} of {of:,} Gaussians, {bundle.camera.width}x{bundle.camera.height}; not finite after")
+    for name, count in counts.items():
+        print(f"  {name:13}{count:>12,}")
+    print(f"first in {stage}" if stage else "all is well on this device")
+    return 0 if stage else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
