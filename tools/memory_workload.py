@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,7 @@ each is the cause of a crash or of findings."""
 PLANTED = """
 __kernel void planted_bounds(__global float *out, const int n) { out[n + get_global_id(0)] = 1.0f; }
 __kernel void planted_race(__global float *out) { out[0] = (float)get_global_id(0); }
-__kernel void planted_uninitialised(__global float *out, __global const float *in) { out[0] = in[1] > 0.0f ? 1.0f : 2.0f; }
+__kernel void planted_uninitialised(__global float *out, __global const float *in) { out[0] = in[1] > 0.0f; }
 """
 """One fault of each kind that the check is there to find; it fails where it does not."""
 
@@ -82,11 +82,9 @@ def frames(device: Device) -> None:
     view = camera(33, 17)
     gaussians, background = cloud(40, view), upload(device, np.array([0.1, 0.2, 0.3], np.float32))
     held = upload_gaussians(device, gaussians)
-    all_off = RasterizerConfig(
-        **{"tile_test": "square", "depth_sort": "pairs", "key_bits": "all", "row_skip": False, "column_skip": False},
-        **{"vector_skip": False, "early_stop": False, "last_contributor": False, "record_cells": False},
-        **{"gradient_skip": False, "frustum_cull": False, "opacity_cull": False},
-    )
+    names = [each.name for each in fields(RasterizerConfig) if isinstance(each.default, bool)]
+    switched: dict[str, Any] = {"tile_test": "square", "depth_sort": "pairs", "key_bits": "all"}
+    all_off = RasterizerConfig(**switched, **dict.fromkeys(names, False))
     for config, small in ((RasterizerConfig(), False), (all_off, False), (RasterizerConfig(), True)):
         rasterizer = Rasterizer(device, config)
         if small:
@@ -139,7 +137,12 @@ def training(device: Device) -> None:
         background="random",
         optimiser=OptimiserConfig(sparse=True),
         density=replace(
-            paper.density, absolute_gradients=True, views_agree=2, min_contribution=1e-3, prune_every=3, max_gaussians=60
+            paper.density,
+            absolute_gradients=True,
+            views_agree=2,
+            min_contribution=1e-3,
+            prune_every=3,
+            max_gaussians=60,
         ),
     )
     for config, channels in ((paper, 3), (wide, 4)):
@@ -178,7 +181,7 @@ def sorts(device: Device) -> None:
 
 
 def limits(device: Device) -> None:
-    """The kernels of `clsplat bench` that measure what the device does at most, a round of each."""
+    """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the tests' probes."""
     items, lanes = tile_items(device), device.shape.lanes
     splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
     kernels = device.kernels("limit", ITEMS=items)
@@ -187,6 +190,15 @@ def limits(device: Device) -> None:
     sums.get()
     source, copy = upload(device, np.ones(16 * lanes, np.float32)), allocate(device, (16 * lanes,), np.float32)
     launch.launch_items(device, device.kernels("limit").limit_copy, 16, 16 * lanes, source, copy)
+    probe = device.kernels("probe")
+    for name, values, rows in (
+        ("probe_elementary", np.linspace(0.1, 0.9, 5, dtype=np.float32), 4),
+        ("probe_half", np.arange(5, dtype=np.uint16), 4),
+    ):
+        out = allocate(device, (rows, len(values)), np.float32)
+        extra = (len(values),) if name == "probe_elementary" else ()
+        launch.launch_grid(device, getattr(probe, name), (len(values),), upload(device, values), out, *extra)
+        out.get()
     copy.get()
 
 
