@@ -58,6 +58,8 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   Lanes m[SLOT_STRIDE];
   int any = 0;
   for (int field = 0; field < SLOT_STRIDE; ++field) m[field].all = (floatL)(0.0f);
+  Lanes whitening[3]; // nobody has written the splats of Gaussians that are not visible
+  for (int k = 0; k < 3; ++k) whitening[k].all = (floatL)(0.0f);
   for (uint lane = 0; lane < lanes_used; ++lane) {
     const uint count = tile_counts[first_row + lane];
     if (count == 0) continue;
@@ -74,11 +76,14 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
     for (uint k = 0; k < addends; ++k, slot += SLOT_STRIDE)
       for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] += slot[field];
     for (int field = 0; field < SLOT_STRIDE; ++field) m[field].lane[lane] = sums[field];
+    __global const float *splat = splats + (size_t)SPLAT_SIZE * (first_row + lane);
+    whitening[0].lane[lane] = splat[SPLAT_L11];
+    whitening[1].lane[lane] = splat[SPLAT_L12];
+    whitening[2].lane[lane] = splat[SPLAT_L22];
   }
   Projection p;
   if (!any || !project_gaussians(row, means, quaternions, log_scales, camera, &p)) return;
-  const floatL l11 = GATHER(splats, SPLAT_SIZE, SPLAT_L11), l12 = GATHER(splats, SPLAT_SIZE, SPLAT_L12);
-  const floatL l22 = GATHER(splats, SPLAT_SIZE, SPLAT_L22);
+  const floatL l11 = whitening[0].all, l12 = whitening[1].all, l22 = whitening[2].all;
   const floatL m_g = m[SLOT_G].all, m_gu = m[SLOT_GU].all, m_gv = m[SLOT_GV].all;
 
   // Opacity, (29) and (41): sum of g is o dL/do, and do/dlogit = o (1 - o).

@@ -1,0 +1,297 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""What `tools/check_memory.py` runs in a child under Oclgrind: every kernel on scenes of a few tiles.
+
+    memory_workload.py planted|LANESxITEMS [plain]
+
+Prints the name of each kernel before it runs. `plain`: what the check of uninitialised reads wants of Oclgrind 21.10,
+see STAND_INS.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from clsplat.bench import _Picture
+from clsplat.camera import Camera
+from clsplat.config import DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
+from clsplat.device import buffers, launch, program
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
+from clsplat.device.context import Device, all_devices
+from clsplat.device.layout import WIDEST_SLOTS
+from clsplat.device.shapes import Shape
+from clsplat.gaussians import Gaussians
+from clsplat.rendering import Rasterizer, Renderer
+from clsplat.scene import Scene
+from clsplat.stages.blend import count_pairs, tile_items
+from clsplat.stages.limit import _splats
+from clsplat.stages.project import GROUPS, allocate_gaussians, upload_gaussians
+from clsplat.stages.sort import bitonic_sort, radix_sort
+from clsplat.trainer import Trainer
+from clsplat.undistort import Lens
+
+STAND_INS = (
+    "arrays are filled by a copy from the host, as what clEnqueueFillBuffer writes counts as uninitialised there",
+    "no buffer is released, as what is written to memory that is used again counts as uninitialised at times",
+    "vectors made of shorter vectors are made of their elements, as its shadow of such a shuffle reads past the end",
+    "the padding of an image gradient is masked by a choice in each lane, as its shadow of x & 0 is that of x",
+)
+"""Where the check of uninitialised reads does other than the product, and why. What is not replaced here is found:
+each is the cause of a crash or of findings."""
+
+PLANTED = """
+__kernel void planted_bounds(__global float *out, const int n) { out[n + get_global_id(0)] = 1.0f; }
+__kernel void planted_race(__global float *out) { out[0] = (float)get_global_id(0); }
+__kernel void planted_uninitialised(__global float *out, __global const float *in) { out[0] = in[1] > 0.0f; }
+"""
+"""One fault of each kind that the check is there to find; it fails where it does not."""
+
+
+def camera(width: int, height: int) -> Camera:
+    """Looks along z, a little off the centre."""
+    return Camera(width, height, 0.9 * width, 0.8 * width, 0.45 * width, 0.55 * height, np.eye(3), np.zeros(3))
+
+
+def cloud(count: int, view: Camera, seed: int = 0, degree: int = 3) -> Gaussians:
+    """Gaussians of all sizes and opacities, some beside the image, behind the camera or too faint to show."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(1.5, 5.0, count)
+    depth[::9] *= -1
+    at = rng.uniform(-0.2, 1.2, (count, 2)) * (view.width, view.height)
+    sides = (at - (view.cx, view.cy)) / (view.fx, view.fy) * depth[:, None]
+    sh = rng.normal(0, 0.2, (count, (degree + 1) ** 2, 3))
+    return Gaussians(
+        np.concatenate([sides, depth[:, None]], axis=1).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        np.log(np.abs(depth)[:, None] / view.fx * rng.uniform(0.5, 4.0, (count, 3))).astype(np.float32),
+        rng.uniform(-6, 6, count).astype(np.float32),
+        sh.astype(np.float32),
+    )
+
+
+def frames(device: Device) -> None:
+    """Forward and backward: as trained, with every exact switch off, in bands, and the counting build."""
+    view = camera(33, 17)
+    gaussians, background = cloud(40, view), upload(device, np.array([0.1, 0.2, 0.3], np.float32))
+    held = upload_gaussians(device, gaussians)
+    names = [each.name for each in fields(RasterizerConfig) if isinstance(each.default, bool)]
+    switched: dict[str, Any] = {"tile_test": "square", "depth_sort": "pairs", "key_bits": "all"}
+    all_off = RasterizerConfig(**switched, **dict.fromkeys(names, False))
+    for config, small in ((RasterizerConfig(), False), (all_off, False), (RasterizerConfig(), True)):
+        rasterizer = Rasterizer(device, config)
+        if small:
+            rasterizer.capacity = 70
+        frame = rasterizer.forward(held, view, background)
+        if small and len(frame.bands) < 2:
+            raise SystemExit("the frame in bands has one band only")
+        gradient = np.zeros(frame.blended.image.shape, np.float32)
+        gradient[:, :17, :33] = np.random.default_rng(1).normal(size=(3, 17, 33))
+        gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
+        screen = rasterizer.backward(held, frame, upload(device, gradient), gradients, fields=WIDEST_SLOTS)
+        read = [*(gradients[group].get() for group in GROUPS), screen.gradients.get(), frame.blended.image.get()]
+        shown = frame.projected.tile_counts.get() > 0
+        if not all(np.isfinite(values[shown] if len(values) == len(shown) else values).all() for values in read):
+            raise SystemExit("a gradient is not finite")
+        if not small:
+            count_pairs(
+                rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, background, frame.camera
+            )
+
+
+def rendering(device: Device) -> None:
+    """What only rendering has: fewer SH bands by Gaussian, half floats, colours kept between frames."""
+    view = camera(20, 17)
+    gaussians = cloud(27, view, 3)
+    gaussians.sh[::2, 4:] = 0
+    for config in (RasterizerConfig(sh_storage="half", sh_tolerance=0.05), RasterizerConfig(sh_angle=2.0)):
+        renderer = Renderer(device, config=config)
+        for shift in (0.0, 0.01):
+            moved = replace(view, translation=np.array([shift, 0.0, 0.0]))
+            renderer.render(gaussians, moved)
+
+
+def training(device: Device) -> None:
+    """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset."""
+    view = camera(20, 17)
+    paper = TrainConfig(
+        iterations=6,
+        sh_degree=2,
+        sh_degree_every=2,
+        warmup=(1,),
+        density=DensityConfig(every=2, start=1, stop=6, gradient_threshold=1e-7, opacity_reset_every=3),
+    )
+    wide = replace(
+        paper,
+        iterations=4,
+        warmup=(),
+        sh_degree=1,
+        sh_degree_every=1,
+        background="random",
+        optimiser=OptimiserConfig(sparse=True),
+        density=replace(
+            paper.density,
+            absolute_gradients=True,
+            views_agree=2,
+            min_contribution=1e-3,
+            prune_every=3,
+            max_gaussians=60,
+        ),
+    )
+    for config, channels in ((paper, 3), (wide, 4)):
+        pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
+        if channels == 3:
+            pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
+        start = cloud(18, view, 5, degree=0)
+        trainer = Trainer(scene_of(view, pixels), config, device, start)
+        losses = [trainer.train_step().read()[0] for _ in range(config.iterations)]
+        if not np.isfinite(losses).all():
+            raise SystemExit(f"the training went wrong: losses {losses}")
+
+
+def scene_of(view: Camera, pixels: NDArray[np.float32]) -> Scene:
+    """One view, its picture in memory at any size."""
+
+    class Picture(_Picture):
+        def load(self, width: int | None = None, height: int | None = None) -> NDArray[np.float32]:
+            return self.pixels[: height or view.height, : width or view.width]
+
+    lens = Lens("PINHOLE", view.width, view.height, (view.fx, view.fy, view.cx, view.cy))
+    picture = Picture("0.png", view, Path("0.png"), "train", lens, pixels=pixels)
+    return Scene("tiny", [picture], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (-np.ones(3), np.ones(3)))
+
+
+def sorts(device: Device) -> None:
+    """Both sorts, the radix sort with several groups and passes; scans with them."""
+    rng, work = np.random.default_rng(4), Workspace(device)
+    for n, bits, sort in ((300, 16, None), (2500, 13, radix_sort), (77, 5, radix_sort), (1, 1, radix_sort)):
+        keys = rng.integers(0, 1 << bits, n).astype(np.uint32)
+        on_device = upload(device, keys)
+        done = sort(device, work, "keys", on_device, bits) if sort else bitonic_sort(device, work, "keys", on_device)
+        order = np.argsort(keys, kind="stable")
+        if not (np.array_equal(done[0].get(), keys[order]) and np.array_equal(done[1].get(), order)):
+            raise SystemExit(f"{n} keys were not sorted")
+
+
+def limits(device: Device) -> None:
+    """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the tests' probes."""
+    items, lanes = tile_items(device), device.shape.lanes
+    splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
+    kernels = device.kernels("limit", ITEMS=items)
+    for kernel in (kernels.limit_blend, kernels.limit_blend_grad):
+        launch.launch_groups(device, kernel, 1, items, 2, splats, sums)
+    sums.get()
+    source, copy = upload(device, np.ones(16 * lanes, np.float32)), allocate(device, (16 * lanes,), np.float32)
+    launch.launch_items(device, device.kernels("limit").limit_copy, 16, 16 * lanes, source, copy)
+    probe = device.kernels("probe")
+    for name, values, rows in (
+        ("probe_elementary", np.linspace(0.1, 0.9, 5, dtype=np.float32), 4),
+        ("probe_half", np.arange(5, dtype=np.uint16), 4),
+    ):
+        out = allocate(device, (rows, len(values)), np.float32)
+        extra = (len(values),) if name == "probe_elementary" else ()
+        launch.launch_grid(device, getattr(probe, name), (len(values),), upload(device, values), out, *extra)
+        out.get()
+    copy.get()
+
+
+def planted(device: Device) -> None:
+    """Faults that Oclgrind has to find."""
+    kernels = cl.Program(device.context, PLANTED).build(options=["-cl-std=CL1.2"])
+    out, unwritten = allocate(device, (8,), np.float32), allocate(device, (8,), np.float32)
+    for name, size, arguments in (
+        ("planted_bounds", 1, (out.buffer, np.int32(8))),
+        ("planted_race", 4, (out.buffer,)),
+        ("planted_uninitialised", 1, (out.buffer, unwritten.buffer)),
+    ):
+        print(name, flush=True)
+        getattr(kernels, name)(device.queue, (size,), (1,), *arguments)
+        device.finish()
+
+
+def stand_in(lanes: int) -> None:
+    """See STAND_INS."""
+    kept = []
+
+    class Kept(buffers._Buffer):  # noqa: SLF001
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            kept.append(self)
+
+    def fill(self: DeviceArray, value: float) -> None:
+        self.set(np.full(self.shape, value, self.dtype))
+
+    buffers._Buffer = Kept  # type: ignore[misc]  # noqa: SLF001
+    DeviceArray.fill = fill  # type: ignore[method-assign]
+    real = program.kernel_source
+    program.kernel_source = lambda stem: by_elements(real(stem), lanes)  # type: ignore[attr-defined]
+
+
+def by_elements(source: str, lanes: int) -> str:
+    """Kernel source in which (float8)(a.lo, b.s01, ...) has .s0 and so on of every part, and LOAD_CELL and the mask of
+    image gradients are of elements too, line by line."""
+    parts = r"\w+\.(?:lo|hi|s[0-9a-f]{2,8})"
+    halves = {"lo": "0123", "hi": "4567"}
+
+    def elements(match: re.Match[str]) -> str:
+        pieces = [part.strip().split(".") for part in match[2].split(",")]
+        each = [f"{name}.s{i}" for name, which in pieces for i in halves.get(which, which[1:])]
+        return f"({match[1]})({', '.join(each)})"
+
+    def masked(match: re.Match[str]) -> str:
+        at = f"({match[1]})"
+        if lanes == 1:
+            return f"(inside ? *{at} : 0.0f)"
+        each = [f"inside.s{4 * row + i} ? {at}[{row} * stride + {i}] : 0.0f" for row in range(2) for i in range(4)]
+        return f"(floatL)({', '.join(each)})"
+
+    source = re.sub(rf"\((float8|int8)\)\(({parts}(?:, {parts})+)\)", elements, source)
+    gradient = r"AS_FLOATL\(LOAD_CELL\(int, \(__global const int \*\)(image_gradient[^,]*), stride\) & inside\)"
+    source = re.sub(gradient, masked, source)
+    loads = "((type##8)(LOAD4(type, p), LOAD4(type, (p) + (stride))))"
+    each = [f"(p)[{i}]" for i in range(4)] + [f"(p)[(stride) + {i}]" for i in range(4)]
+    return source.replace(loads, f"((type##8)({', '.join(each)}))")
+
+
+def note_kernels() -> None:
+    """Print the name of each kernel when it is put on the queue, and wait for it: a crash is then the last one's."""
+    real = launch._enqueue  # noqa: SLF001
+
+    def noted(device: Device, kernel: Any, *rest: Any) -> None:
+        print(kernel.function_name, flush=True)
+        real(device, kernel, *rest)
+        device.finish()
+
+    launch._enqueue = noted  # noqa: SLF001
+
+
+def main(arguments: list[str]) -> int:
+    """Run what the arguments say on Oclgrind's device."""
+    note_kernels()
+    device = next(each for each in all_devices() if "Oclgrind" in each.name)
+    if arguments[0] == "planted":
+        planted(Device(device, Shape(lanes=1, items=64, chunks=4)))
+        return 0
+    lanes, items = map(int, arguments[0].split("x"))
+    if "plain" in arguments[1:]:
+        if lanes not in (1, 8):
+            raise SystemExit(f"{lanes} lanes: expected 1 or 8")
+        stand_in(lanes)
+    opened = Device(device, Shape(lanes=lanes, items=items, chunks=4))
+    print("probe_fma", flush=True)  # which opening a device runs
+    if items == 1:
+        opened.kind = "cpu"  # the launches too are then those of a CPU
+    for part in (sorts, limits, frames, rendering, training):
+        part(opened)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
