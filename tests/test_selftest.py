@@ -88,8 +88,8 @@ def test_a_shape_without_a_stored_digest_is_no_failure(default_device: Device) -
 
 
 SLOPPY = {
-    "arithmetic: x / y": "(x / y) * 1.00000024f",
-    "arithmetic: sqrt(y)": "(sqrt(y) * 1.00000024f)",
+    "arithmetic: x / y": "(x / y) * 1.00000012f",
+    "arithmetic: sqrt(y)": "(sqrt(y) * 1.00000012f)",
     "project: sqrt(p.syy / p.det)": "(sqrt(p.syy / p.det) * 1.0000003f)",
     "project: dx / length": "dx / length * 0.9999998f",
     "blend_grad: 1.0f / (1.0f - alpha)": "1.0f / (1.0f - alpha) * 1.00000024f",
@@ -140,7 +140,7 @@ def test_errors_in_ulp() -> None:
 def test_scenes_are_frozen() -> None:
     """The same numbers on every machine: exact multiples of powers of two, from integers."""
     cloud, wall = scenes(quick=True)
-    assert cloud.gaussians.means[100].tolist() == [-3.69671630859375, 2.0308923721313477, 6.8572998046875]
+    assert cloud.gaussians.means[100].tolist() == [-1.0265355110168457, 0.296017587184906, 1.552978515625]
     assert cloud.gaussians.sh[7, 3, 1] * 8192 % 1 == 0
     depths = wall.gaussians.means[:, 2]
     assert len(np.unique(depths)) == len(depths) // 2
@@ -198,20 +198,14 @@ def test_no_such_device(capsys: Capture) -> None:
 # Drivers that die
 
 
-def test_a_driver_that_aborts(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    """PoCL 3.0's compiler does at 16 lanes."""
-    index = next((info.index for info in list_devices() if "PoCL 3.0" in info.version), None)
-    if index is None:
-        pytest.skip("PoCL 3.0 is not here")
-    monkeypatch.setenv("CLSPLAT_SHAPE", "16x1")
-    (record,) = records(capsys, "--device", str(index), status=1)
-    assert "was ended by signal 6 in building" in record["verdict"]
-    assert record["stages"] == []
-
-
 def child(monkeypatch: pytest.MonkeyPatch, code: str) -> Report:
     monkeypatch.setattr(trust, "command", lambda *_, **__: [sys.executable, "-c", code])
     return examine(0, shape_of(all_devices()[0]), patience=2.0)
+
+
+def test_a_driver_that_aborts(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = f'import os; print({trust.MARK!r} + \'{{"begins": "building blend.cl"}}\', flush=True); os.abort()'
+    assert child(monkeypatch, code).failure == "the process was ended by signal 6 in building blend.cl"
 
 
 def test_a_driver_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -291,7 +285,7 @@ def test_a_memory_that_is_broken_or_read_only(
 
 
 def test_other_bits_are_a_warning(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(BREAK, "arithmetic: x / y => (x / y) * 1.00000024f")
+    monkeypatch.setenv(BREAK, "arithmetic: x / y => (x / y) * 1.00000012f")
     with pytest.warns(UserWarning, match=r"its bits are not those of other devices in arithmetic: .* division"):
         trust.require(default_device, forward=True)
     assert untrusting.exists()
