@@ -218,7 +218,21 @@ class Tune:
     """Print the result as JSON."""
 
 
-Verb = Devices | Demo | Sfm | Train | Eval | Render | Bench | Tune
+@dataclass(frozen=True)
+class Selftest:
+    """Test every device: build the kernels, run each stage on frozen scenes, compare with float64 and stored digests.
+
+    Exit status 1 where a driver cannot be trusted. train, eval, render and demo make a short form of this test the
+    first time they meet a device; CLSPLAT_TRUST_DRIVER=1 leaves that out.
+    """
+
+    device: Device = "all"
+    """all, or one of them: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them."""
+    json: Flag = False
+    """Print the result as JSON."""
+
+
+Verb = Devices | Demo | Sfm | Train | Eval | Render | Bench | Tune | Selftest
 Commands = (
     Annotated[Devices, subcommand("devices")]
     | Annotated[Demo, subcommand("demo")]
@@ -228,6 +242,7 @@ Commands = (
     | Annotated[Render, subcommand("render")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Tune, subcommand("tune")]
+    | Annotated[Selftest, subcommand("selftest")]
 )
 DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
 

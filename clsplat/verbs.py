@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from clsplat.cli import Bench, Demo, Devices, Eval, Render, Sfm, Train, Tune, Verb
+from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb
 from clsplat.errors import DeviceError, InputError
 from clsplat.memory import Plan, parse_bytes
 
@@ -45,6 +45,10 @@ def run(verb: Verb) -> int:
             return bench(verb)
         case Tune():
             return tune(verb)
+        case Selftest():
+            from clsplat.selftest_table import selftest
+
+            return selftest(verb)
 
 
 def devices(verb: Devices) -> int:
@@ -80,7 +84,10 @@ def devices(verb: Devices) -> int:
 def demo(verb: Demo) -> int:
     """The whole pipeline on a scene of its own."""
     from clsplat.demo import run_demo
+    from clsplat.device.context import open_device
+    from clsplat.trust import require
 
+    require(open_device(verb.device))
     result = run_demo(verb.output, device=verb.device)
     if verb.json:
         print(json.dumps(result, indent=2))
@@ -116,6 +123,7 @@ def train(verb: Train) -> int:
     """Scene to run. Everything that can be wrong with the call is found before the run's folder is touched."""
     from clsplat.device.context import open_device
     from clsplat.runs import Run, check_output, check_resumed
+    from clsplat.trust import require
 
     check_output(verb.output, resume=verb.resume, overwrite=verb.overwrite)
     limit = parse_bytes(verb.max_device_mem)
@@ -139,6 +147,7 @@ def train(verb: Train) -> int:
             f"clsplat: warning: {source}: has a single point, training starts from one Gaussian of next to no size",
             file=sys.stderr,
         )
+    require(device)
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
     print(
         f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
@@ -186,6 +195,7 @@ def evaluate(verb: Eval) -> int:
     from clsplat.metrics import lpips_missing
     from clsplat.rendering import Renderer
     from clsplat.runs import Run, is_run
+    from clsplat.trust import require
 
     limit = parse_bytes(verb.max_device_mem)
     given_run = Run.open(verb.model) if verb.model.is_dir() else None
@@ -197,11 +207,13 @@ def evaluate(verb: Eval) -> int:
         raise InputError(f"{verb.model}: the scene it was trained on is not known, expected --scene SCENE")
     resolution = config.resolution if verb.resolution is None else verb.resolution
     test_every = config.test_every if verb.test_every is None else verb.test_every
-    renderer = Renderer(open_device(verb.device, limit), config=config.rasterizer)
+    device = open_device(verb.device, limit)
     scene = _load_scene(source, resolution, test_every)
     views = [view for view in scene.views if view.split == "test"]
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {test_every}")
+    require(device, forward=True)
+    renderer = Renderer(device, config=config.rasterizer)
 
     background = background_colour(verb.background or config.background)
     trained_for = given_run.model_record() if given_run else {}
@@ -233,6 +245,7 @@ def render(verb: Render) -> int:
     from clsplat.device.context import open_device
     from clsplat.images import write_image
     from clsplat.rendering import Renderer
+    from clsplat.trust import require
 
     extension = PurePosixPath(verb.output).suffix.lower()
     if extension not in IMAGE_EXTENSIONS:
@@ -250,7 +263,9 @@ def render(verb: Render) -> int:
         raise InputError(f"{verb.cameras}: has no images, expected at least one")
     paths = output_paths(verb.output, list(cameras))
     gaussians = _load_model(verb.model)
-    renderer = Renderer(open_device(verb.device, limit), config=verb.rasterizer)
+    device = open_device(verb.device, limit)
+    require(device, forward=True)
+    renderer = Renderer(device, config=verb.rasterizer)
 
     written = []
     for name, camera in cameras.items():

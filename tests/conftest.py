@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -13,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from opencl_drivers import use_every_driver
 
 use_every_driver()
+os.environ.setdefault("CLSPLAT_TRUST_DRIVER", "1")  # the test at a driver's first use has tests of its own
 
 from calls import train
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures

@@ -32,7 +32,7 @@ def test_wheel_has_every_kernel_and_module_and_nothing_else(wheel):
     modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "clsplat").rglob("*.py")}
     assert kernels
     assert {f"clsplat/{name}" for name in kernels} <= names
-    assert names == {f"clsplat/{name}" for name in kernels} | modules | {"clsplat/py.typed"}
+    assert names == {f"clsplat/{name}" for name in kernels} | modules | {"clsplat/py.typed", "clsplat/selftest.json"}
 
 
 def test_kernels_hold_no_python():

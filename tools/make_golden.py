@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """Write what tests/golden/ holds and the tests repeat: the losses of 20 steps of the tests' tiny training, and
-checksums of frames and gradients.
+checksums of frames and gradients; and clsplat/selftest.json, the digests that `clsplat selftest` compares with.
 
-    .venv/bin/python tools/make_golden.py [loss_curve] [frames]
+    .venv/bin/python tools/make_golden.py [loss_curve] [frames] [selftest]
 
 Run it, and commit what it writes, only where a change is meant to change training, or the bits of a frame or of a
-gradient; say why in the commit. Without a name it writes both files.
+gradient; say why in the commit. Without a name it writes all three files. The default device has to be one that can
+have 16 lanes, which PoCL 3.0 cannot.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ GOLDEN = ROOT / "tests" / "golden"
 
 def main(names: list[str]) -> int:
     """Write the files on the default device."""
-    makers = {"loss_curve": write_loss_curve, "frames": write_frames}
+    makers = {"loss_curve": write_loss_curve, "frames": write_frames, "selftest": write_selftest}
+    paths = {"selftest": ROOT / "clsplat" / "selftest.json"}
     for name in names or list(makers):
         if name not in makers:
             print(__doc__, file=sys.stderr)
             return 2
-        makers[name](GOLDEN / f"{name}.json")
+        makers[name](paths.get(name, GOLDEN / f"{name}.json"))
     return 0
 
 
@@ -62,6 +64,33 @@ def write_frames(path: Path) -> None:
     sums = checksums(device)
     _write(path, device, {"checksums": sums})
     print(f"{path}: {len(sums)} scenes")
+
+
+SHAPES = ((1, 1), *((1, items) for items in (16, 32, 64, 128, 256)), (4, 1), (8, 1), (8, 16), (16, 1))
+"""Whose gradients get a digest: those that some device has by default, and those of the tests."""
+
+
+def write_selftest(path: Path) -> None:
+    """Run the self-test in every shape and write the digests: one of all shapes, of blending's gradient one each."""
+    from clsplat.device.context import open_device
+    from clsplat.selftest import run, shape_label
+
+    device = open_device()
+    by_shape: dict[str, dict[str, str]] = {}
+    for lanes, items in SHAPES:
+        shaped = device.with_shape(lanes=lanes, items=items)
+        found = by_shape.setdefault(shape_label(shaped), {})
+        for result in run(shaped, found=found):
+            if not result.passed:
+                raise SystemExit(f"{lanes}x{items}: {result}")
+    digests: dict[str, object] = {}
+    for name in next(iter(by_shape.values())):
+        by = {shape: found[name] for shape, found in by_shape.items()}
+        digests[name] = by if name.endswith("/blend_grad") else by["8x1"]
+        if not name.endswith("/blend_grad") and len(set(by.values())) > 1:
+            raise SystemExit(f"{name}: {by}, expected the same bits in every shape")
+    _write(path, device, {"digests": digests})
+    print(f"{path}: {len(digests)} digests")
 
 
 def _write(path: Path, device: Device, content: dict[str, object]) -> None:

@@ -153,7 +153,12 @@ class Device:
         self.queue.finish()
 
     def _probe_fma(self) -> dict[str, object]:
-        """Whether the compiler fuses a lone a*b + c: then that is the fast way to fma's bits."""
+        """Whether the compiler fuses a lone a*b + c in vectors: then that is the fast way to fma's bits.
+
+        Not without vectors: Intel's runtime, which vectorises loops by itself, then fuses here and not there.
+        """
+        if self.shape.lanes == 1:
+            return {}
         values = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, "FMA_BY_CONTRACTION": True}
         kernels = Kernels(build(self.context, self.cl_device, "probe", values, self._options))
         out = np.zeros(2 * self.shape.lanes, np.float32)

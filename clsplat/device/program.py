@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -10,12 +11,32 @@ from typing import Any
 import pyopencl as cl
 
 from clsplat.device.source import kernel_source
-from clsplat.errors import KernelBuildError
+from clsplat.errors import InputError, KernelBuildError
+
+BREAK = "CLSPLAT_BREAK_KERNEL"
+"""For the tests of `clsplat selftest` alone: STEM: WORDS => WORDS replaces words of one kernel's text, as a driver that
+miscompiles an operation would."""
+
+
+def _broken(stem: str, source: str) -> str:
+    """The source, or what BREAK makes of it. Raises InputError where that makes no sense."""
+    wanted = os.environ.get(BREAK)
+    if not wanted:
+        return source
+    where, _, change = wanted.partition(":")
+    old, arrow, new = (part.strip() for part in change.partition("=>"))
+    if not (where and old and arrow):
+        raise InputError(f"{BREAK}={wanted}: expected STEM: WORDS => WORDS")
+    if where.strip() != stem:
+        return source
+    if old not in source:
+        raise InputError(f"{BREAK}={wanted}: {stem}.cl has no such words")
+    return source.replace(old, new)
 
 
 def build(context: cl.Context, device: cl.Device, stem: str, defines: Mapping[str, object], options: str) -> cl.Program:
     """Compile `stem`.cl. Raises KernelBuildError with the device, the options, the log and the source."""
-    source = kernel_source(stem)
+    source = _broken(stem, kernel_source(stem))
     flags = [f"-D{name}" if value is True else f"-D{name}={value}" for name, value in sorted(defines.items())]
     all_options = [*flags, *options.split()]
     try:

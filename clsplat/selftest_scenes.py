@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the self-test feeds the kernels with: numbers that are the same on every machine, to the last bit.
+
+All come from one integer hash and are multiples of a power of two, so that neither NumPy's generators nor a
+mathematical library has a say in them. The digests in selftest.json are of these and no others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.device.layout import TILE
+from clsplat.gaussians import Gaussians
+
+Float32 = NDArray[np.float32]
+
+STEPS = 1 << 12
+"""Values between two ends."""
+
+
+def hashed(seed: int, count: int) -> NDArray[np.uint64]:
+    """(count,) of 64 bits: SplitMix64 (Steele, Lea and Flood 2014) at `count` places of its sequence."""
+    with np.errstate(over="ignore"):
+        z = (np.arange(1, count + 1, dtype=np.uint64) + np.uint64(seed << 32)) * np.uint64(0x9E3779B97F4A7C15)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return z ^ (z >> np.uint64(31))
+
+
+def evenly(seed: int, shape: tuple[int, ...], low: float, high: float, steps: int = STEPS) -> NDArray[np.float64]:
+    """Numbers from low to below high, ends with few binary digits: each is a float32, exactly."""
+    values = (hashed(seed, int(np.prod(shape))) >> np.uint64(20)) % np.uint64(steps)
+    return low + (high - low) / steps * values.astype(np.float64).reshape(shape)
+
+
+def keys(seed: int, count: int, bits: int) -> NDArray[np.uint32]:
+    """(count,) keys of so many bits to sort, each some three times."""
+    pool = (hashed(seed, count // 3 + 1) >> np.uint64(64 - bits)).astype(np.uint32)
+    return pool[(hashed(seed + 1, count) % np.uint64(len(pool))).astype(np.int64)]
+
+
+@dataclass(frozen=True, eq=False)
+class Frozen:
+    """A model, a view of it, its background, and planes (3, rows, stride) for the loss: a photograph, zero in the
+    padding."""
+
+    name: str
+    gaussians: Gaussians
+    camera: Camera
+    background: Float32
+    photograph: Float32
+
+    def image_gradient(self) -> Float32:
+        """(3, rows, stride), zero in the padding."""
+        return padded(self.camera, 31, -0.5, 0.5)
+
+
+def padded(camera: Camera, seed: int, low: float, high: float) -> Float32:
+    """Planes (3, rows, stride) of noise in the image and zeros beside it."""
+    height, width = camera.height, camera.width
+    planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
+    planes[:, :height, :width] = evenly(seed, (3, height, width), low, high)
+    return planes
+
+
+def cloud(name: str, count: int, width: int, height: int, seed: int) -> Frozen:
+    """Gaussians of every size, direction and opacity in and around the view of a tilted camera whose principal point
+    is off the middle; some behind it, some at its near plane, some fainter than 1/255, SH of degree 3."""
+    unit = 0.125
+    z = evenly(seed, (count,), 1.5, 8.5)
+    sides = evenly(seed + 1, (count, 2), -0.75, 0.75)
+    means = np.stack([z * sides[:, 0], z * sides[:, 1] * 0.75, z], axis=1)
+    means[: count // 16, 2] *= -1
+    means[count // 16 : count // 8, 2] *= unit * unit
+    log_scales = evenly(seed + 2, (count, 1), -4.0, -1.5) + evenly(seed + 3, (count, 3), -1.0, 1.0)
+    quaternions = evenly(seed + 4, (count, 4), -1.0, 1.0)
+    quaternions[:, 0] = evenly(seed + 5, (count,), 0.25, 1.25)
+    sh = evenly(seed + 6, (count, 16, 3), -0.25, 0.25)
+    sh[:, 0] = evenly(seed + 7, (count, 3), -1.5, 1.5)
+    model = _gaussians(means, quaternions, log_scales, evenly(seed + 8, (count,), -6.5, 5.0), sh)
+    translation = np.array([unit, -2 * unit, 4 * unit])
+    camera = Camera(width, height, width, width + 4.0, 0.4375 * width, 0.5625 * height, _rotation(), translation)
+    return _frozen(name, model, camera)
+
+
+def wall(name: str = "wall", count: int = 64, width: int = 40, height: int = 36) -> Frozen:
+    """Nearly opaque layers, two and two at the same depth: alpha is at its cap, pixels end after a few of them, and the
+    order of equals is that of their indices."""
+    depths = 1.5 + 0.0625 * (np.arange(count) // 2)
+    sides = evenly(11, (count, 2), -0.5, 0.5)
+    means = np.stack([depths * sides[:, 0], depths * sides[:, 1], depths], axis=1)
+    log_scales = evenly(12, (count, 3), -2.5, -0.5)
+    quaternions = evenly(13, (count, 4), -1.0, 1.0)
+    quaternions[:, 0] = evenly(14, (count,), 0.25, 1.25)
+    sh = evenly(15, (count, 4, 3), -0.25, 0.25)
+    sh[:, 0] = evenly(16, (count, 3), -1.5, 1.5)
+    model = _gaussians(means, quaternions, log_scales, evenly(17, (count,), 2.0, 9.0), sh)
+    camera = Camera(width, height, float(width), float(width), width / 2, height / 2, np.eye(3), np.zeros(3))
+    return _frozen(name, model, camera)
+
+
+def scenes(*, quick: bool) -> list[Frozen]:
+    """What the stages are run on."""
+    few = [cloud("cloud", 240, 70, 45, 1), wall()]
+    return few if quick else [*few, cloud("crowd", 1500, 120, 75, 41)]
+
+
+def _frozen(name: str, model: Gaussians, camera: Camera) -> Frozen:
+    return Frozen(name, model, camera, np.array([0.125, 0.25, 0.5], np.float32), padded(camera, 32, 0.0, 1.0))
+
+
+def _gaussians(*arrays: NDArray[np.float64]) -> Gaussians:
+    return Gaussians(*(np.ascontiguousarray(values, np.float32) for values in arrays))
+
+
+def _rotation() -> NDArray[np.float64]:
+    """By the quaternion (15, 2, -3, 1): every entry is one division of whole numbers."""
+    w, x, y, z = 15.0, 2.0, -3.0, 1.0
+    rows = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return np.array(rows) / (w * w + x * x + y * y + z * z)

@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: Apache-2.0
+"""clsplat selftest: every driver here passes, a driver with one operation wrong does not, one that dies is told."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pipeline import shaped
+
+from clsplat import trust
+from clsplat.cli import main
+from clsplat.device.context import Device, all_devices, list_devices
+from clsplat.device.program import BREAK
+from clsplat.device.shapes import shape_of
+from clsplat.errors import DeviceError, InputError
+from clsplat.selftest import BOUNDS, STAGES, Result, run
+from clsplat.selftest_bench import error_of
+from clsplat.selftest_scenes import keys, scenes
+from clsplat.trust import Report, examine
+
+Capture = pytest.CaptureFixture[str]
+
+BROKEN = {
+    "arithmetic: x / y": ("x * y", "arithmetic"),
+    "project: -(p.sxy / p.syy)": ("(p.sxy / p.syy)", "project"),
+    "project: tile_counts[i] = count": ("tile_counts[i] = count + 1", "project"),
+    "duplicate: gaussian_from_visible[order[rank]]": ("gaussian_from_visible[rank]", "duplicate"),
+    "duplicate: ty * tiles_x + tx": ("tx * tiles_x + ty", "duplicate"),
+    "sort_radix: & (digits - 1)": ("& (digits - 2)", "sort"),
+    "ranges: = i + 1;": ("= i;", "ranges"),
+    "blend: before * alpha": ("before + alpha", "blend"),
+    "blend: fmaL(-before, alpha, before)": ("fmaL(-before, before, before)", "blend"),
+    "loss: 2.0f * (mu1 * mu2) + C1": ("2.0f * (mu1 * mu2) - C1", "loss"),
+    "blend_grad: fmaL(weight, shade, behind[k])": ("fmaL(weight, shade, -behind[k])", "blend_grad"),
+    "project_grad: sums[field] += slot[field]": ("sums[field] -= slot[field]", "project_grad"),
+    "adam: (1.0f - beta2) * (g * g)": ("(1.0f - beta2) * g", "adam"),
+    "density: fma1(gx, gx, gy * gy)": ("fma1(gx, gx, gx * gy)", "statistics"),
+}
+"""What is miscompiled: kernel and words, the words that stand there then, and the stage that is to notice."""
+
+
+def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str) -> list[Result]:
+    """What the stages come to that are run on the device with this change."""
+    monkeypatch.setenv(BREAK, change)
+    fresh = device.with_shape()
+    return list(run(fresh, quick=True))
+
+
+@pytest.mark.parametrize("words", BROKEN)
+def test_one_wrong_operation_is_found(words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device) -> None:
+    change, stage = BROKEN[words]
+    results = condemned(default_device, monkeypatch, f"{words} => {change}")
+    first = next(result for result in results if not result.passed)
+    assert first.stage == stage
+    assert first.trouble or first.ulp > 3 * first.bound
+
+
+def test_every_stage_has_an_operation_that_is_broken() -> None:
+    assert {stage for _, stage in BROKEN.values()} == set(STAGES) == set(BOUNDS)
+
+
+def test_in_every_shape(shaped_device: Device) -> None:
+    results = list(run(shaped_device, quick=True))
+    assert [result.stage for result in results] == list(STAGES)
+    assert [result for result in results if not result.passed] == []
+    # All drivers here round as IEEE 754 has it.
+    assert [result.stage for result in results if result.same_bits is not True] == []
+    assert not any(result.otherwise for result in results)
+
+
+@pytest.mark.parametrize("lanes", [8, 16])
+def test_all_scenes_in_the_shape_of_a_cpu(default_device: Device, lanes: int) -> None:
+    results = list(run(shaped(default_device, lanes, 1)))
+    assert [result for result in results if not (result.passed and result.same_bits)] == []
+
+
+def test_a_shape_without_a_stored_digest_is_no_failure(default_device: Device) -> None:
+    results = {result.stage: result for result in run(shaped(default_device, 4, 4), quick=True)}
+    assert results["blend_grad"].passed
+    assert results["blend_grad"].same_bits is None
+    assert results["blend"].same_bits is True
+
+
+SLOPPY = {
+    "arithmetic: x / y": "(x / y) * 1.00000012f",
+    "arithmetic: sqrt(y)": "(sqrt(y) * 1.00000012f)",
+    "project: sqrt(p.syy / p.det)": "(sqrt(p.syy / p.det) * 1.0000003f)",
+    "project: dx / length": "dx / length * 0.9999998f",
+    "blend_grad: 1.0f / (1.0f - alpha)": "1.0f / (1.0f - alpha) * 1.00000024f",
+    "loss: 1.0f / (c * d)": "1.0f / (c * d) * 0.9999998f",
+    "adam: sqrt(*v)": "sqrt(*v) * 1.0000003f",
+    "density: sqrt(fma1(gx, gx, gy * gy))": "(sqrt(fma1(gx, gx, gy * gy)) * 1.0000003f)",
+}
+"""A division or a square root that is off by two or three ulp, which OpenCL allows a GPU."""
+
+
+@pytest.mark.parametrize("words", SLOPPY)
+def test_rounding_otherwise_is_told_and_forgiven(
+    words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device
+) -> None:
+    results = condemned(default_device, monkeypatch, f"{words} => {SLOPPY[words]}")
+    report = Report(results)
+    assert report.failure == ""
+    assert any(result.same_bits is False for result in results)
+    assert "can be trusted, but its bits are not those of other devices" in report.verdict
+    told = {"x / y": "division", "sqrt(y)": "square root"}.get(words.partition(": ")[2], "the reason is not known")
+    assert told in report.verdict
+
+
+@pytest.mark.parametrize("change", ["blend", "blend: a", ": a => b"])
+def test_a_change_that_makes_no_sense(change: str, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(BREAK, change)
+    with pytest.raises(InputError, match="expected STEM: WORDS => WORDS"):
+        default_device.with_shape()
+
+
+def test_a_change_of_words_that_are_not_there(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(BREAK, "blend: abacus => slide rule")
+    with pytest.raises(InputError, match=r"blend\.cl has no such words"):
+        default_device.with_shape().kernels("blend")
+
+
+def test_errors_in_ulp() -> None:
+    one = np.array([1.0, 1.0])
+    assert error_of(np.array([1.0, 1.0 + 2.0**-23]), one) == (2.0**-23, 1.0)
+    # next to nothing among large values is measured by those
+    absolute, ulp = error_of(np.array([8.0, 2.0**-21]), np.array([8.0, 0.0]))
+    assert absolute == 2.0**-21
+    assert ulp == 1.0
+    assert error_of(np.array([np.nan]), np.array([1.0])) == (float("inf"), float("inf"))
+    assert error_of(np.zeros(0), np.zeros(0)) == (0.0, 0.0)
+
+
+def test_scenes_are_frozen() -> None:
+    """The same numbers on every machine: exact multiples of powers of two, from integers."""
+    cloud, wall = scenes(quick=True)
+    assert cloud.gaussians.means[100].tolist() == [-1.0265355110168457, 0.296017587184906, 1.552978515625]
+    assert cloud.gaussians.sh[7, 3, 1] * 8192 % 1 == 0
+    depths = wall.gaussians.means[:, 2]
+    assert len(np.unique(depths)) == len(depths) // 2
+    found = keys(1, 3000, 20)
+    assert len(np.unique(found)) < 1000
+    assert found.max() < 2**20
+
+
+# The verb
+
+
+def records(capsys: Capture, *flags: str, status: int = 0) -> list[dict[str, Any]]:
+    assert main(["selftest", "--json", *flags]) == status
+    found: list[dict[str, Any]] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_every_driver_here_passes(capsys: Capture) -> None:
+    found = records(capsys)
+    assert [record["version"] for record in found] == [info.version for info in list_devices()]
+    for record in found:
+        assert record["trusted"], record["verdict"]
+        assert [stage["stage"] for stage in record["stages"]] == list(STAGES)
+        assert all(stage["same_bits"] for stage in record["stages"])
+        assert record["build_seconds"] > 0
+
+
+def test_the_table(capsys: Capture) -> None:
+    assert main(["selftest", "--device", "0"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"0: {list_devices()[0].name}, OpenCL ")
+    assert lines[1].split()[:3] == ["stage", "worst", "error"]
+    assert [line.split()[0] for line in lines[2:-1]] == ["build", *STAGES]
+    assert lines[-1] == "This driver can be trusted."
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["blend: before * alpha => before + alpha", "scan: sum += VALUE => sum += 2 * VALUE", "loss: mu1 => this is no C"],
+)
+def test_a_broken_driver_fails(change: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(BREAK, change)
+    assert main(["selftest", "--device", "0"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out.splitlines()[-1].startswith("This driver cannot be trusted: ")
+    (line,) = captured.err.splitlines()
+    assert line.startswith("clsplat: error: 1 of 1 drivers cannot be trusted: ")
+
+
+def test_no_such_device(capsys: Capture) -> None:
+    assert main(["selftest", "--device", "abacus"]) == 2
+    assert "no such device" in capsys.readouterr().err
+
+
+# Drivers that die
+
+
+def child(monkeypatch: pytest.MonkeyPatch, code: str) -> Report:
+    monkeypatch.setattr(trust, "command", lambda *_, **__: [sys.executable, "-c", code])
+    return examine(0, shape_of(all_devices()[0]), patience=2.0)
+
+
+def test_a_driver_that_aborts(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = f'import os; print({trust.MARK!r} + \'{{"begins": "building blend.cl"}}\', flush=True); os.abort()'
+    assert child(monkeypatch, code).failure == "the process was ended by signal 6 in building blend.cl"
+
+
+def test_a_driver_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = f'import time; print({trust.MARK!r} + \'{{"begins": "blend"}}\', flush=True); time.sleep(60)'
+    report = child(monkeypatch, code)
+    assert report.failure == "the driver did not come back within 2 s from blend"
+
+
+def test_a_child_that_ends_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    report = child(monkeypatch, "import sys; print('noise'); sys.exit('no good')")
+    assert report.failure == "the process ended with status 1 in starting (no good)"
+
+
+# At the first use
+
+
+@pytest.fixture
+def untrusting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    monkeypatch.delenv(trust.REGARDLESS)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return trust.memory_path()
+
+
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Whether a frame was enough, of each test that is made."""
+    made: list[bool] = []
+    real = trust.examine
+
+    def counting(index: int, shape: Any, *, quick: bool, forward: bool) -> Report:
+        made.append(forward)
+        return real(index, shape, quick=quick, forward=forward)
+
+    monkeypatch.setattr(trust, "examine", counting)
+    return made
+
+
+def test_it_is_tested_once(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = counted(monkeypatch)
+    for forward in (True, True, False, False, True):
+        trust.require(default_device, forward=forward)
+    assert made == [True, False], "first a frame, later training, nothing again"
+    assert list(json.loads(untrusting.read_text()).values()) == [list(STAGES)]
+    trust.require(shaped(default_device, 4, 1))
+    assert made == [True, False, False], "another shape has other kernels"
+    monkeypatch.setattr("clsplat.__version__", "0.0.0")
+    trust.require(default_device, forward=True)
+    assert made[3:] == [True], "so has another version"
+
+
+def test_a_failure_is_an_error_and_not_remembered(
+    untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(BREAK, "blend: before * alpha => before + alpha")
+    with pytest.raises(DeviceError, match="cannot be trusted: blend: image is off by .* clsplat selftest tells more"):
+        trust.require(default_device, forward=True)
+    assert not untrusting.exists()
+    monkeypatch.setenv(trust.REGARDLESS, "1")
+    trust.require(default_device, forward=True)
+    monkeypatch.delenv(BREAK)
+    monkeypatch.setenv(trust.REGARDLESS, "0")
+    trust.require(default_device, forward=True)
+    assert untrusting.exists()
+
+
+def test_a_memory_that_is_broken_or_read_only(
+    untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = counted(monkeypatch)
+    untrusting.parent.mkdir(parents=True)
+    untrusting.write_text("[]")
+    trust.require(default_device, forward=True)
+    assert len(made) == 1
+    assert len(json.loads(untrusting.read_text())) == 1
+    monkeypatch.setenv("XDG_CACHE_HOME", str(untrusting))  # a file, where a folder would have to be
+    with pytest.warns(UserWarning, match="cannot be written"):
+        trust.require(default_device, forward=True)
+
+
+def test_other_bits_are_a_warning(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(BREAK, "arithmetic: x / y => (x / y) * 1.00000012f")
+    with pytest.warns(UserWarning, match=r"its bits are not those of other devices in arithmetic: .* division"):
+        trust.require(default_device, forward=True)
+    assert untrusting.exists()
+
+
+def test_training_and_rendering_ask_for_it(
+    untrusting: Path, scene: Path, trained: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(BREAK, "project_grad: sums[field] += slot[field] => sums[field] -= slot[field]")
+    run_folder = tmp_path / "run"
+    assert main(["train", str(scene), "-o", str(run_folder), "--iterations", "1"]) == 2
+    assert "cannot be trusted: project_grad: " in capsys.readouterr().err
+    assert not run_folder.exists()
+    frames = str(tmp_path / "{name}.png")
+    assert main(["render", str(trained), "--cameras", str(scene), "-o", frames]) == 0, "that has no gradient"
+    assert main(["eval", str(trained / "model.ply"), "--scene", str(scene)]) == 0
+    monkeypatch.setenv(BREAK, "blend: before * alpha => before + alpha")
+    for words in (
+        ["render", str(trained), "--cameras", str(scene), "-o", frames],
+        ["eval", str(trained / "model.ply"), "--scene", str(scene)],
+        ["demo", "-o", str(tmp_path / "demo")],
+    ):
+        capsys.readouterr()
+        assert main(words) == 2
+        assert "cannot be trusted: blend: " in capsys.readouterr().err
+
+
+def test_asking_again_takes_no_time(untrusting: Path, default_device: Device) -> None:
+    trust.require(default_device, forward=True)
+    start = time.perf_counter()
+    trust.require(default_device, forward=True)
+    assert time.perf_counter() - start < 0.1, "a file of a few lines is read, and the kernels' texts are hashed"
