@@ -23,6 +23,8 @@ MOST_LOST = 0.5
 """With more of its Gaussians broken a model is not mended: training goes back at once."""
 SH_LIMIT = 1e7
 """No SH coefficient may be larger: a colour that project.cl does not draw for its size has one that is."""
+LIMIT = 1e19
+"""No parameter may be larger: its square is to be a float32."""
 KEPT = 1000
 """Gaussians of an incident of which a copy is kept."""
 
@@ -32,7 +34,7 @@ Model = Mapping[str, NDArray[np.float32]]
 
 def limit_of(group: str) -> float:
     """What the magnitudes of a group's parameters have to be under."""
-    return SH_LIMIT if group.startswith("sh_") else float("inf")
+    return SH_LIMIT if group.startswith("sh_") else LIMIT
 
 
 @dataclass(frozen=True, eq=False)

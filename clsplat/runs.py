@@ -212,7 +212,7 @@ def _digest(array: NDArray[Any]) -> str:
 
 def _read_checkpoint(path: Path) -> Checkpoint:
     """Raises all manner of things for a file that is not whole."""
-    with np.load(path, allow_pickle=False) as archive:
+    with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
         arrays: Arrays = {name: archive[name] for name in archive.files}
     record = json.loads(arrays.pop(STATE_KEY).tobytes())
     digests = record.get("sha256")  # runs of earlier versions have none

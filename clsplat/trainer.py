@@ -406,12 +406,12 @@ class Trainer:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint."""
+        loaded = [self._loaded(checkpoint, kind) for kind in ("parameters", "first", "second")]
         self.step = checkpoint.step
         self.rng.bit_generator.state = checkpoint.state["rng"]
         self.queue = list(checkpoint.state["queue"])
         self.watch.patience = Patience(**checkpoint.state.get("patience", {}))
         self.watch.forget()
-        loaded = [self._loaded(checkpoint, kind) for kind in ("parameters", "first", "second")]
         del self.parameters, self.first, self.second, self.gradients, self.statistics
         self._make_plan(loaded[0].count)
         self._set_parameters(*(self._placed(model) for model in loaded))

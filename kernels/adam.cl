@@ -3,11 +3,10 @@
 // rate: learning rate / (1 - beta1^t); root: 1 / sqrt(1 - beta2^t).
 //
 // No parameter and no moment becomes NaN or infinite here: an element of which the new values would be, or whose
-// parameter would not be within `limit`, is left as it is, and counted in the last four of `found` (8), of which
-// compact_visible has the first: by the parameter that it had, its gradient, its moments, or all of these well and the
-// step not. Moments that are broken begin again from zero. In the other cases the second moment becomes infinite and
-// the first 0, which refuses every step until the host has seen to the row (docs/decisions/0016-never-a-nan.md). One
-// sum is all that this costs where nothing is wrong.
+// parameter's square would not be less than `limit2`, is left as it is, and counted in the last four of `found` (8), of
+// which compact_visible has the first: by the parameter that it had, its gradient, its moments, or all of these well and
+// the step not. Moments that are broken begin again from zero. In the other cases the second moment becomes infinite
+// and the first 0, which refuses every step until the host has seen to the row (docs/decisions/0016-never-a-nan.md).
 #include "shared/math.h"
 #include "shared/lanes.h"
 
@@ -19,17 +18,17 @@ static inline floatL change(floatL g, float rate, float root, float beta1, float
   return rate * *m / fmaL(sqrt(*v), (floatL)(root), (floatL)(epsilon));
 }
 
-// Whether new values may be stored. A second moment is a square, so that the sum is one test of both.
+// Whether new values may be stored. A second moment is a square as well, so that the sum is one test of both.
 #ifdef UNGUARDED
 #define WELL(parameter, second) ((intL)(-1))
 #else
-#define WELL(parameter, second) MASKL(fabs(parameter) + second < limit)
+#define WELL(parameter, second) MASKL(fmaL(parameter, parameter, second) < limit2)
 #endif
 
 // What becomes of an element whose step is refused: p, g, m and v as they were before it.
-static inline void refuse(size_t i, float limit, float p, float g, float m, float v, __global float *first,
+static inline void refuse(size_t i, float limit2, float p, float g, float m, float v, __global float *first,
                           __global float *second, __global uint *found) {
-  const int parameter = fabs(p) < limit, gradient = fabs(g) < INFINITY;
+  const int parameter = p * p < limit2, gradient = fabs(g) < INFINITY;
   const int moments = fabs(m) < INFINITY && v >= 0.0f && v < INFINITY, marked = m == 0.0f && v == INFINITY;
   const int again = parameter && gradient && !moments && !marked;
   first[i] = 0.0f;
@@ -38,7 +37,7 @@ static inline void refuse(size_t i, float limit, float p, float g, float m, floa
 }
 
 // One element, as `change` has it.
-static inline void step_element(size_t i, float rate, float root, float beta1, float beta2, float epsilon, float limit,
+static inline void step_element(size_t i, float rate, float root, float beta1, float beta2, float epsilon, float limit2,
                                 __global uint *found, __global float *parameters, __global float *gradients,
                                 __global float *first, __global float *second) {
   const float g = gradients[i];
@@ -47,8 +46,8 @@ static inline void step_element(size_t i, float rate, float root, float beta1, f
   const float p = parameters[i] - rate * m / fma1(sqrt(v), root, epsilon);
   gradients[i] = 0.0f;
 #ifndef UNGUARDED
-  if (!(fabs(p) + v < limit)) {
-    refuse(i, limit, parameters[i], g, first[i], second[i], first, second, found);
+  if (!(fma1(p, p, v) < limit2)) {
+    refuse(i, limit2, parameters[i], g, first[i], second[i], first, second, found);
     return;
   }
 #endif
@@ -59,7 +58,7 @@ static inline void step_element(size_t i, float rate, float root, float beta1, f
 
 // The group as a flat array, LANES elements a work-item. parameters, gradients, first, second (n).
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
-                   const float epsilon, const float limit, __global uint *found, __global float *parameters,
+                   const float epsilon, const float limit2, __global uint *found, __global float *parameters,
                    __global float *gradients, __global float *first, __global float *second) {
   const ulong i = get_global_id(0) * (ulong)LANES;
   if (i + LANES <= n) {
@@ -75,14 +74,14 @@ __kernel void adam(const ulong n, const float rate, const float root, const floa
     }
   }
   for (ulong k = i; k < min(i + LANES, n); ++k)
-    step_element(k, rate, root, beta1, beta2, epsilon, limit, found, parameters, gradients, first, second);
+    step_element(k, rate, root, beta1, beta2, epsilon, limit2, found, parameters, gradients, first, second);
 }
 
 #ifdef WIDTH
 // Only the rows of visible Gaussians, LANES rows a work-item (OptimiserConfig.sparse); gradients of the others are zero
 // already. tile_counts (n): 0 where hidden; parameters, gradients, first, second (n, WIDTH).
 __kernel void adam_visible(const uint n, const float rate, const float root, const float beta1, const float beta2,
-                           const float epsilon, const float limit, __global uint *found,
+                           const float epsilon, const float limit2, __global uint *found,
                            __global const uint *tile_counts, __global float *parameters, __global float *gradients,
                            __global float *first, __global float *second) {
   const uint row = get_global_id(0) * LANES;
@@ -97,7 +96,7 @@ __kernel void adam_visible(const uint n, const float rate, const float root, con
   if (n - row < LANES) {
     for (size_t i = begin; i < end; ++i)
       if (visible[(i - begin) / WIDTH])
-        step_element(i, rate, root, beta1, beta2, epsilon, limit, found, parameters, gradients, first, second);
+        step_element(i, rate, root, beta1, beta2, epsilon, limit2, found, parameters, gradients, first, second);
     return;
   }
   for (uint k = 0; k < WIDTH; ++k) {
@@ -111,7 +110,7 @@ __kernel void adam_visible(const uint n, const float rate, const float root, con
     if (ANYL(~WELL(p, v) & taken.all)) {
       for (uint lane = 0; lane < LANES; ++lane)
         if (taken.lane[lane])
-          step_element(i + lane, rate, root, beta1, beta2, epsilon, limit, found, parameters, gradients, first,
+          step_element(i + lane, rate, root, beta1, beta2, epsilon, limit2, found, parameters, gradients, first,
                        second);
       continue;
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from calls import Capture
 from calls import train as command_train
+from compare import assert_same_bits
 from tiny import CONFIG, short, write_scene
 
 from clsplat import replay
@@ -38,6 +40,10 @@ from clsplat.scene import Scene, load_scene
 from clsplat.stages.project import GROUPS, group_shapes
 from clsplat.trainer import Trainer
 from clsplat.training import train
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
+import bench_guards
 
 CHECKED = short(checkpoint_every=5)
 
@@ -91,7 +97,7 @@ def test_what_is_broken_and_what_is_refused() -> None:
     assert not found.any
     parameters["means"][1, 2] = np.nan
     parameters["sh_rest"][2, 1, 0] = -SH_LIMIT
-    parameters["means"][3] = 1e30  # far away, but a place
+    parameters["means"][3] = 1e18  # far away, but a place
     first["sh_dc"][4, 1] = np.inf
     second["opacity_logits"][5] = np.nan
     found = examine(parameters, first, second)
@@ -322,6 +328,43 @@ def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device:
     config = replace(CONFIG, iterations=100)
     with heard(), spoilt(lambda _: True), pytest.raises(ClsplatError, match="give a run, and what reproduces it"):
         train(scene, config, device=default_device)
+
+
+# Without the checks
+
+
+def test_kernels_without_checks_have_the_same_bits_and_no_checks(scene: Scene, default_device: Device) -> None:
+    """What `tools/bench_guards.py` compares with."""
+    trainers = [Trainer(scene, CONFIG, each) for each in (default_device, unguarded(default_device))]
+    for trainer in trainers:
+        for _ in range(20):
+            trainer.train_step()
+    arrays = [trainer.checkpoint()[0] for trainer in trainers]
+    for name, array in arrays[0].items():
+        assert_same_bits(arrays[1][name], array, name)
+    for trainer in trainers:
+        values = trainer.first["means"].get()
+        values[3] = np.nan
+        trainer.first["means"].set(values)
+        trainer.train_step()
+    spoilt = [bool(np.isnan(trainer.parameters["means"].get()).any()) for trainer in trainers]
+    assert spoilt == [False, True]
+
+
+def unguarded(device: Device) -> Device:
+    return device.with_switches({"UNGUARDED": True})
+
+
+def test_the_cost_of_the_checks_is_told(scene: Scene, capsys: Capture) -> None:
+    folder = Path(scene.views[0].path).parents[1]
+    assert bench_guards.main([str(folder), "--repeat", "2", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["gaussians"] == 40
+    for kind in ("wall", "cpu"):
+        assert result[kind]["with_ms"] > 0
+        assert result[kind]["without_ms"] > 0
+    assert bench_guards.main(["--repeat", "0"]) == 2
+    assert "--repeat 0: expected at least 1" in capsys.readouterr().err
 
 
 def test_rates_are_the_settings_where_nothing_happened(scene: Scene, default_device: Device) -> None:

@@ -52,7 +52,7 @@ def adam(
                 continue
             updates = step // config.sh_rest_every
         rate, root = rates[group] / (1.0 - beta1**updates), (1.0 - beta2**updates) ** -0.5
-        constants = (rate, root, beta1, beta2, epsilon, limit_of(group), found)
+        constants = (rate, root, beta1, beta2, epsilon, limit_of(group) ** 2, found)
         arrays = (parameters[group], gradients[group], first[group], second[group])
         size, rows = parameters[group].size, parameters.count
         if size == 0:

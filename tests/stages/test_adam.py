@@ -90,3 +90,50 @@ def test_sh_rest_waits_for_its_step(device: Device) -> None:
         else:
             wanted = reference(wanted[0], np.full((5, 3, 3), 0.5 * step), *wanted[1:], step // 3, 0.1)
     assert_close(p["sh_rest"].get(), wanted[0], relative=1e-6, absolute=1e-5)  # as in test_steps
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 100])
+def test_what_is_not_finite_is_refused_and_marked(shaped_device: Device, count: int, sparse: bool) -> None:
+    """Element by element, whatever shares its vector; counted by what was wrong."""
+    device, rng = shaped_device, np.random.default_rng(count)
+    rates = dict.fromkeys(GROUPS, 0.01)
+    spoils = {  # array, value, what is then in the first and second moment, place in the counts
+        "parameter": (0, np.nan, (0, np.inf), 0),
+        "coefficient": (0, -2e7, (0, np.inf), 0),
+        "gradient": (1, -np.inf, (0, np.inf), 1),
+        "large gradient": (1, 1e30, (0, np.inf), 3),
+        "first moment": (2, np.nan, (0, 0), 2),
+        "second moment": (3, -1.0, (0, 0), 2),
+    }
+    for name, (which, value, marks, place) in spoils.items():
+        group = "sh_dc" if name == "coefficient" else "means"
+        row, column = rng.integers(count), rng.integers(3)
+        start = {
+            g: rng.uniform(0.5, 1.0, (4, *shape)).astype(np.float32) for g, shape in group_shapes(count, 4).items()
+        }
+        found = upload(device, np.zeros(8, np.uint32))
+        models = []
+        for spoilt in (True, False):
+            arrays = [allocate_gaussians(device, count, 4) for _ in range(4)]
+            for g in GROUPS:
+                for index, array in enumerate(arrays):
+                    values = start[g][index].copy()
+                    if spoilt and (g, index) == (group, which):
+                        values[row, column] = value
+                    array[g].set(values)
+            shown = upload(device, np.ones(count, np.uint32))
+            counts = found if spoilt else upload(device, np.zeros(8, np.uint32))
+            adam(device, 5, rates, OptimiserConfig(sparse=sparse), *arrays, shown, counts)
+            models.append([{g: array[g].get() for g in GROUPS} for array in arrays])
+        assert found.get().tolist() == [0] * 4 + [int(index == place) for index in range(4)], name
+        got, wanted = models
+        before = np.float32(value) if which == 0 else start[group][0][row, column]
+        np.testing.assert_equal(got[0][group][row, column], before)
+        assert (got[2][group][row, column], got[3][group][row, column]) == marks, name
+        assert not any(got[1][g].any() for g in GROUPS), "the gradient is to be left zero"
+        for index in (0, 2, 3):
+            got[index][group][row, column] = wanted[index][group][row, column]
+            for g in GROUPS:
+                # A neighbour in the vector is worked out as a scalar, whose root a driver may round otherwise.
+                assert_close(got[index][g], wanted[index][g], relative=1e-6)
