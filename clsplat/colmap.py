@@ -7,18 +7,22 @@ takes a cut cameras.bin for a good one and goes on with what it did not read. He
 
 from __future__ import annotations
 
+import io
 import math
+import os
 import struct
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
-from typing import TypeVar
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
+from clsplat.files import is_file, open_input
 from clsplat.undistort import Lens, check_lens, models
 
 Float32 = NDArray[np.float32]
@@ -29,6 +33,12 @@ STEMS = ("cameras", "images", "points3D")
 OBSERVATION_BYTES = 24  # x, y, id of the point
 TRACK_BYTES = 8  # ids of the image and of the observation in it
 MAX_NAME_BYTES = 4096
+MAX_LINE = 1 << 26
+"""Characters of a line of text; the observations of a picture and the track of a point are one each."""
+MAX_NUMBER = 1e30
+"""Coordinates beyond it are damage; their squares are still finite."""
+WINDOW = 1 << 20
+EXPECTED = "a file of a COLMAP model"
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,37 +114,53 @@ def read_cameras(folder: Path) -> dict[str, Camera]:
 
 def safe_name(name: str) -> bool:
     """Whether a name from a file stays inside the folder it is relative to."""
-    path = PurePosixPath(name)
-    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and name.isprintable()
+    path, windows = PurePosixPath(name), PureWindowsPath(name)
+    inside = not path.is_absolute() and not windows.anchor and ".." not in windows.parts
+    return bool(path.parts) and inside and name.isprintable()
 
 
 class _Binary:
-    """Reads little-endian records from a file's bytes; InputError where they end."""
+    """Reads little-endian records from a file, a window of it at a time; InputError where it ends."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.data = path.read_bytes()
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path, self.file = path, file
+        self.size = os.fstat(file.fileno()).st_size
+        self.window, self.start = b"", 0
         self.position = 0
         self.doing = "its header"
 
+    def _at(self, size: int) -> int:
+        """Where in the window the position is; `size` bytes from there on are in it, as far as the file has them."""
+        if not self.start <= self.position <= self.position + size <= self.start + len(self.window):
+            self.file.seek(self.position)
+            self.window, self.start = self.file.read(max(size, WINDOW)), self.position
+        return self.position - self.start
+
     def read(self, layout: struct.Struct) -> tuple[float, ...]:
-        start = self.position
-        self.skip(layout.size)
-        return layout.unpack_from(self.data, start)
+        self._require(layout.size)
+        at = self._at(layout.size)
+        values = layout.unpack_from(self.window, at)
+        self.position += layout.size
+        return values
 
     def skip(self, size: int) -> None:
-        if size > len(self.data) - self.position:
-            raise InputError(
-                f"{self.path}: truncated or corrupt: its {len(self.data)} bytes end inside {self.doing}; "
-                "copy the file again or export the model anew"
-            )
+        self._require(size)
         self.position += size
 
+    def _require(self, size: int) -> None:
+        if size > self.size - self.position:
+            raise InputError(
+                f"{self.path}: truncated or corrupt: its {self.size} bytes end inside {self.doing}; "
+                "copy the file again or export the model anew"
+            )
+
     def name(self) -> str:
-        end = self.data.find(b"\0", self.position, self.position + MAX_NAME_BYTES)
+        start = self._at(min(MAX_NAME_BYTES, self.size - self.position))
+        end = self.window.find(b"\0", start, start + MAX_NAME_BYTES)
         if end < 0:
             raise corrupt(self.path, f"{self.doing} has a name without an end")
-        raw, self.position = self.data[self.position : end], end + 1
+        raw = self.window[start:end]
+        self.position += len(raw) + 1
         try:
             return raw.decode("utf-8")
         except UnicodeDecodeError:
@@ -144,14 +170,14 @@ class _Binary:
         """The records that the file says it has, each of at least `least` bytes, in turn."""
         (count,) = self.read(struct.Struct("<Q"))
         number = int(count)
-        if number * least > len(self.data):
+        if number * least > self.size:
             self.doing = f"the {number} {what}s that its header announces"
             self.skip(number * least)
         for index in range(number):
             self.doing = f"{what} {index + 1} of {number}"
             yield index
-        if self.position != len(self.data):
-            extra = len(self.data) - self.position
+        if self.position != self.size:
+            extra = self.size - self.position
             raise corrupt(self.path, f"{extra} bytes follow the last of its {number} {what}s")
 
 
@@ -167,7 +193,7 @@ def _is_model(folder: Path) -> bool:
 def _file(folder: Path, stem: str) -> Path | None:
     for extension in (".bin", ".txt"):
         path = folder / (stem + extension)
-        if path.is_file():
+        if is_file(path):
             return path
     return None
 
@@ -185,7 +211,7 @@ def _claimed_images(folder: Path) -> int:
     if path is None:
         return -1
     if path.suffix == ".bin":
-        with open(path, "rb") as file:
+        with open_input(path, EXPECTED) as file:
             return int.from_bytes(file.read(8), "little")
     return sum(1 for _ in _image_lines(path))
 
@@ -201,16 +227,18 @@ def _read_cameras(folder: Path) -> dict[int, Lens]:
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
-    file, layout, known = _Binary(path), struct.Struct("<IiQQ"), models()
-    for _ in file.count("camera", layout.size):
-        key, model, width, height = (int(value) for value in file.read(layout))
-        if model not in known:
-            raise InputError(
-                f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
-                f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
-            )
-        name, parameters = known[model]
-        yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
+    layout, known = struct.Struct("<IiQQ"), models()
+    with open_input(path, EXPECTED) as opened:
+        file = _Binary(path, opened)
+        for _ in file.count("camera", layout.size):
+            key, model, width, height = (int(value) for value in file.read(layout))
+            if model not in known:
+                raise InputError(
+                    f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
+                    f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
+                )
+            name, parameters = known[model]
+            yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
@@ -233,7 +261,7 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[ModelImage]:
             raise corrupt(path, f"image {name} is there twice")
         quaternion, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
         norm = math.hypot(*pose[:4])
-        if not (0.5 < norm < 2 and np.isfinite(translation).all()):
+        if not (0.5 < norm < 2 and (np.abs(translation) < MAX_NUMBER).all()):
             raise corrupt(path, f"image {name} has the pose {list(pose)}, expected a unit quaternion, finite numbers")
         images[name] = ModelImage(name, lenses[camera], rotation_from_quaternion(quaternion / norm), translation)
     if not images:
@@ -242,13 +270,15 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[ModelImage]:
 
 
 def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
-    file, head, count = _Binary(path), struct.Struct("<I7dI"), struct.Struct("<Q")
-    for _ in file.count("image", head.size + 1 + count.size):
-        _, *pose, camera = file.read(head)
-        name = file.name()
-        (observations,) = file.read(count)
-        file.skip(int(observations) * OBSERVATION_BYTES)
-        yield name, int(camera), tuple(pose)
+    head, count = struct.Struct("<I7dI"), struct.Struct("<Q")
+    with open_input(path, EXPECTED) as opened:
+        file = _Binary(path, opened)
+        for _ in file.count("image", head.size + 1 + count.size):
+            _, *pose, camera = file.read(head)
+            name = file.name()
+            (observations,) = file.read(count)
+            file.skip(int(observations) * OBSERVATION_BYTES)
+            yield name, int(camera), tuple(pose)
 
 
 def _image_lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -271,28 +301,33 @@ def _text_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
 
 def _read_points(folder: Path) -> tuple[Float64, Float32]:
     path = _require(folder, "points3D")
-    rows = list(_binary_points(path) if path.suffix == ".bin" else _text_points(path))
-    table = np.array(rows, np.float64).reshape(-1, 6)
-    good = np.isfinite(table).all(axis=1) & ((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all(axis=1)
+    values = array("d")  # a list of tuples would take six times the memory
+    for row in _binary_points(path) if path.suffix == ".bin" else _text_points(path):
+        values.extend(row)
+    table = np.frombuffer(values, np.float64).reshape(-1, 6) if values else np.empty((0, 6))
+    near = (np.abs(table[:, :3]) < MAX_NUMBER).all(axis=1)
+    good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all(axis=1)
     if not good.all():
         index = int(np.argmin(good))
-        found = f"point {index + 1} of {len(rows)} has the position and colour {table[index].tolist()}"
+        found = f"point {index + 1} of {len(table)} has the position and colour {table[index].tolist()}"
         raise corrupt(path, f"{found}, expected finite numbers and colours 0 to 255")
     return np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3:] / 255, np.float32)
 
 
 def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
-    file, layout = _Binary(path), struct.Struct("<Q3d3BdQ")
-    for _ in file.count("point", layout.size):
-        _, *values, _, track = file.read(layout)
-        file.skip(int(track) * TRACK_BYTES)
-        yield tuple(values)
+    layout = struct.Struct("<Q3d3BdQ")
+    with open_input(path, EXPECTED) as opened:
+        file = _Binary(path, opened)
+        for _ in file.count("point", layout.size):
+            _, *values, _, track = file.read(layout)
+            file.skip(int(track) * TRACK_BYTES)
+            yield tuple(values)
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
     def parse(words: list[str]) -> tuple[float, ...]:
         _, x, y, z, red, green, blue, _ = words[:8]
-        return float(x), float(y), float(z), int(red), int(green), int(blue)
+        return float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue))
 
     for number, line in _lines(path):
         yield _parsed(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK", parse, line.split(maxsplit=8))
@@ -300,20 +335,24 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
     """Line numbers and lines, without comments."""
-    try:
-        with open(path, encoding="utf-8") as file:
-            for number, line in enumerate(file, 1):
+    with open_input(path, EXPECTED) as opened:
+        file, number = io.TextIOWrapper(opened, encoding="utf-8"), 0
+        try:
+            while line := file.readline(MAX_LINE):
+                number += 1
+                if len(line) == MAX_LINE:
+                    raise corrupt(path, f"line {number} has no end")
                 text = line.strip()
                 if not text.startswith("#") and (text or keep_empty):
                     yield number, text
-    except UnicodeDecodeError:
-        raise corrupt(path, "is not text in UTF-8") from None
+        except UnicodeDecodeError:
+            raise corrupt(path, "is not text in UTF-8") from None
 
 
 def _parsed(path: Path, number: int, expected: str, parse: Callable[[list[str]], Value], words: list[str]) -> Value:
     try:
         return parse(words)
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, OverflowError):
         raise InputError(f"{path}: line {number} does not read as {expected}; is the file cut or damaged?") from None
 
 

@@ -12,10 +12,18 @@ class ClsplatError(Exception):
     exit_status = 1
 
 
+def plain(text: str) -> str:
+    """`text` as one line that any terminal shows as it is: names in hostile files may hold anything."""
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+
+
 class InputError(ClsplatError):
-    """A file, folder or argument is wrong (exit status 2). The message names it, and what was expected."""
+    """A file, folder or argument is wrong (exit status 2). The message, one line, names it, and what was expected."""
 
     exit_status = 2
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(plain(message))
 
 
 class DeviceError(InputError):

@@ -1,16 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing files so that a crash, Ctrl-C or a full disk leaves the previous file whole."""
+"""Writing files so that a crash, Ctrl-C or a full disk leaves the previous file whole; opening files of others."""
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from clsplat.errors import InputError
 
 TEMPORARY_SUFFIX = ".clsplat-tmp"
+MAX_DOCUMENT = 32 << 20
+"""Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
 
 
 @contextmanager
@@ -54,3 +60,53 @@ def _sync_folder(folder: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+def is_file(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a regular file; False, and no exception, for a name that no file can have."""
+    try:
+        return stat.S_ISREG(Path(path).stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+@contextmanager
+def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
+    """Open a file to read it; `expected` ends the message of the InputError for one that is missing, a folder, or
+    anything else that is no regular file, such as a pipe, which nobody may write to. Also where reading fails."""
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise InputError(f"{path}: is a folder, expected {expected}")
+        if not stat.S_ISREG(mode):
+            raise InputError(f"{path}: is no regular file, expected {expected}")
+        file = open(path, "rb")  # noqa: SIM115  # closed below
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file, expected {expected}") from None
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}), expected {expected}") from None
+    with file:
+        try:
+            yield file
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}), expected {expected}") from None
+
+
+def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT) -> str:
+    """The text of a file in UTF-8 of at most `limit` bytes. Raises InputError as `open_input`."""
+    with open_input(path, expected) as file:
+        data = file.read(limit + 1)
+    if len(data) > limit:
+        raise InputError(f"{path}: has more than {limit >> 20} MiB, expected {expected}")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text in UTF-8 (byte {error.start}), expected {expected}") from None
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The value. Raises ValueError for whatever does not parse, nested too deeply too."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None

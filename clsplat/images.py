@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import TEMPORARY_SUFFIX
+from clsplat.files import TEMPORARY_SUFFIX, is_file
 
 Float32 = NDArray[np.float32]
 Metadata = Mapping[str, str | int | float]
@@ -32,15 +32,26 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp",
 
 CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+MAX_PIXELS = 1 << 28
+FREE_FLOATS, FLOATS_A_BYTE = 48 << 20, 4096
+"""A picture may have so many channel values whatever its file's length is, and so many for each byte of it: more than
+any real picture, compressed, as deflate makes at most 1032 bytes of one."""
 # libjpeg's notes about data that it can do without; every other message means that pixels are lost
 HARMLESS = ("extraneous bytes",)
 
 
-def find_images(folder: Path) -> list[Path]:
-    """All pictures (by extension) under `folder`, sub-folders included, sorted; hidden files and folders left out."""
+def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
+    """All pictures (by extension) under `folder`, if `deep` with its sub-folders, sorted; hidden files and folders are
+    left out. Links to folders are followed, to each folder once."""
     found: list[Path] = []
+    seen: set[tuple[int, int]] = set()
     for root, folders, files in os.walk(folder, followlinks=True):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        status = Path(root).stat()
+        if (status.st_dev, status.st_ino) in seen:
+            folders.clear()
+            continue
+        seen.add((status.st_dev, status.st_ino))
+        folders[:] = sorted(name for name in folders if deep and not name.startswith("."))
         found += [
             path
             for path in (Path(root, name) for name in files)
@@ -51,7 +62,7 @@ def find_images(folder: Path) -> list[Path]:
 
 def require_images(paths: Iterable[Path], listed_in: Path) -> None:
     """Raise InputError that names the files of `paths` that do not exist; `listed_in` is what lists them."""
-    if missing := [path for path in paths if not path.is_file()]:
+    if missing := [path for path in paths if not is_file(path)]:
         raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {name_all(missing)}")
 
 
@@ -92,7 +103,7 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
     if source.format_name() == "png":
         _check_png_is_whole(path)
     pixels = source.read_image(oiio.FLOAT)
-    reason = source.geterror()
+    reason = error_of(source)
     source.close()
     if pixels is None or (reason and not any(harmless in reason for harmless in HARMLESS)):
         raise InputError(f"{path}: does not decode: {_one_line(reason)}; copy the picture again or leave it out")
@@ -184,14 +195,45 @@ def unassociate(image: Float32) -> Float32:
 
 
 def _open(path: Path) -> Any:
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{path}: no such image file")
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), hints)
+    return open_image(path, hints)
+
+
+def open_image(path: Path, hints: Any = None) -> Any:
+    """OpenImageIO's input of a file, whose header makes sense. Raises InputError."""
+    try:
+        name = str(path)
+        source = oiio.ImageInput.open(name, hints) if hints is not None else oiio.ImageInput.open(name)
+    except UnicodeEncodeError:
+        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it") from None
     if source is None:
-        raise InputError(f"{path}: does not decode: {_one_line(oiio.geterror())}; expected an image")
+        raise InputError(f"{path}: does not decode: {_one_line(error_of(oiio))}; expected an image")
+    try:
+        spec = source.spec()
+        _ = spec.channelnames
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: does not decode: the names of its channels are no text") from None
+    shown = max(spec.width, 0) * max(spec.height, 0), max(spec.full_width, 0) * max(spec.full_height, 0)
+    floats = max(shown) * spec.nchannels
+    if spec.depth > 1 or min(spec.width, spec.height, spec.full_width, spec.full_height) < 1:
+        raise InputError(f"{path}: is {spec.width} x {spec.height} x {spec.depth} pixels, expected a flat picture")
+    if max(shown) > MAX_PIXELS or floats > max(FREE_FLOATS, FLOATS_A_BYTE * path.stat().st_size):
+        raise InputError(
+            f"{path}: says that it is {spec.width} x {spec.height} pixels of {spec.nchannels} channels, shown as "
+            f"{spec.full_width} x {spec.full_height}, in {path.stat().st_size} bytes; is it damaged?"
+        )
     return source
+
+
+def error_of(source: Any) -> str:
+    """What OpenImageIO says went wrong."""
+    try:
+        return str(source.geterror())
+    except UnicodeDecodeError:
+        return "in words that are no text"
 
 
 def _one_line(reason: str) -> str:

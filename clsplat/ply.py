@@ -19,12 +19,16 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError
-from clsplat.files import atomic_writer
+from clsplat.errors import InputError, plain
+from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
 BLOCK_ROWS = 1 << 15
 MAX_HEADER_LINES = 10_000
+MAX_LINE_BYTES = 1 << 20
+MAX_BLOCK_BYTES, MAX_BLOCK_WORDS = 1 << 26, 1 << 21
+MAX_NUMBER_BYTES = 128
+"""The longest number in text, as a row of them is made an array whose elements have the width of the widest."""
 
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -80,22 +84,13 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     that are not finite, no Gaussians, no such file.
     """
     path = Path(path)
-    try:
-        with open(path, "rb") as file:
-            header = read_header(file, path)
-            vertex, skipped = _vertex_element(header, path)
-            rest = _check_properties(vertex, path)
-            if vertex.count == 0:
-                raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
-            if header.format == "ascii":
-                blocks = _ascii_blocks(file, header, vertex, skipped, path)
-            else:
-                blocks = _binary_blocks(file, header, vertex, skipped, path)
-            return _assemble(blocks, vertex.count, rest, path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file, expected a 3DGS PLY") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a folder, expected a 3DGS PLY") from None
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+        vertex, _ = _vertex_element(header, path)
+        rest = _check_properties(vertex, path)
+        if vertex.count == 0:
+            raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
+        return _assemble(read_vertices(file, header, path, "Gaussian"), vertex.count, rest, path)
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians, *, sh_degree: int | None = None) -> None:
@@ -191,11 +186,6 @@ def _check_properties(vertex: Element, path: Path) -> int:
     if missing:
         noun = "property" if len(missing) == 1 else "properties"
         raise InputError(f"{path}: PLY lacks the {noun} {' '.join(missing)}, expected a 3DGS model")
-    double = sorted({name for name in names if names.count(name) > 1})
-    if double:
-        raise InputError(f"{path}: PLY has the property {double[0]} twice")
-    if vertex.has_list:
-        raise InputError(f"{path}: PLY has a list property in its vertices, expected numbers only")
     rest = sum(name.startswith("f_rest_") for name in names)
     counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 1)]
     if rest not in counts:
@@ -209,27 +199,43 @@ def _check_properties(vertex: Element, path: Path) -> int:
 Block = dict[str, NDArray[Any]]
 
 
+def read_vertices(file: BinaryIO, header: Header, path: Path, what: str) -> Iterator[Block]:
+    """Columns of the vertices by name, a block of rows at a time; `what` a vertex is, for messages.
+
+    That the file has as many as its header says is checked before the first block, binary files to the byte and ascii
+    ones as far as their length can tell, so that `count` rows may be allocated then. Raises InputError.
+    """
+    vertex, skipped = _vertex_element(header, path)
+    names = [name for name, _ in vertex.properties]
+    if double := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"{path}: PLY has the property {double} twice")
+    if vertex.has_list:
+        raise InputError(f"{path}: PLY has a list property in its vertices, expected numbers only")
+    read = _ascii_blocks if header.format == "ascii" else _binary_blocks
+    return read(file, header, vertex, skipped, path, what)
+
+
 def _binary_blocks(
-    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path
+    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path, what: str
 ) -> Iterator[Block]:
-    """Columns by name, a block of rows at a time. The sizes are checked before anything is allocated for them."""
     start = header.size
     for element in skipped:
         if element.has_list:
             raise InputError(f"{path}: PLY has lists (element {element.name!r}) before its vertices, not supported")
-        start += element.count * header.row_type(element).itemsize
+        start += element.count * sum(np.dtype(code).itemsize for _, code in element.properties)
     row = header.row_type(vertex)
     need, have = vertex.count * row.itemsize, max(0, os.fstat(file.fileno()).st_size - start)
     if have < need:
         whole = have // row.itemsize
         raise InputError(
-            f"{path}: truncated: {vertex.count} Gaussians need {need} bytes, {have} are there ({whole} Gaussians)"
+            f"{path}: truncated: {vertex.count} {what}s need {need} bytes, {have} are there ({whole} {what}s)"
         )
     if have > need and header.elements[-1] is vertex:
-        warnings.warn(f"{path}: {have - need} bytes after the last Gaussian ignored", stacklevel=4)
+        warnings.warn(plain(f"{path}: {have - need} bytes after the last {what} ignored"), stacklevel=4)
     file.seek(start)
-    for first in range(0, vertex.count, BLOCK_ROWS):
-        count = min(BLOCK_ROWS, vertex.count - first)
+    block = min(BLOCK_ROWS, max(MAX_BLOCK_BYTES // max(row.itemsize, 1), 1))
+    for first in range(0, vertex.count, block):
+        count = min(block, vertex.count - first)
         data = file.read(count * row.itemsize)
         if len(data) != count * row.itemsize:
             raise InputError(f"{path}: truncated while it was read")
@@ -237,30 +243,46 @@ def _binary_blocks(
         yield {name: rows[name] for name, _ in vertex.properties}
 
 
+def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
+    """Lines that are not empty. Raises InputError for one too long to be a row."""
+    while line := file.readline(MAX_LINE_BYTES + 1):
+        if len(line) > MAX_LINE_BYTES:
+            raise InputError(f"{path}: has a line of more than {MAX_LINE_BYTES} bytes, expected rows of numbers")
+        if not line.isspace():
+            yield line
+
+
 def _ascii_blocks(
-    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path
+    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path, what: str
 ) -> Iterator[Block]:
-    """Columns by name as float64, a block of lines at a time."""
-    lines = (line for line in file if not line.isspace())
+    """float64. A row is at least a character and a blank for each property."""
+    lines = _text_lines(file, path)
+    least, have = 2 * vertex.count * len(vertex.properties) - 1, os.fstat(file.fileno()).st_size - header.size
+    too_many = have < least
     for element in skipped:
         for _ in islice(lines, element.count):
             pass
     width = len(vertex.properties)
-    for first in range(0, vertex.count, BLOCK_ROWS):
-        count = min(BLOCK_ROWS, vertex.count - first)
+    block = min(BLOCK_ROWS, max(MAX_BLOCK_WORDS // max(width, 1), 1))
+    for first in range(0, vertex.count, block):
+        count = min(block, vertex.count - first)
         rows = [line.split() for line in islice(lines, count)]
         for index, words in enumerate(rows):
             if len(words) != width:
-                raise InputError(f"{path}: Gaussian {first + index} has {len(words)} values, expected {width}")
+                raise InputError(f"{path}: {what} {first + index} has {len(words)} values, expected {width}")
+            if max(map(len, words), default=0) > MAX_NUMBER_BYTES:
+                raise InputError(f"{path}: {what} {first + index} has a value that is no number")
         if len(rows) < count:
-            raise InputError(f"{path}: truncated: {vertex.count} Gaussians expected, {first + len(rows)} are there")
+            raise InputError(f"{path}: truncated: {vertex.count} {what}s expected, {first + len(rows)} are there")
+        if too_many:
+            raise InputError(f"{path}: truncated: {vertex.count} {what}s expected, {have} bytes are too few for them")
         try:
-            table = np.array(rows, dtype="S").astype(np.float64)
+            table = np.array(rows, dtype="S").astype(np.float64).reshape(count, width)
         except ValueError as error:
-            raise InputError(f"{path}: a value after Gaussian {first} is no number ({error})") from None
+            raise InputError(f"{path}: a value after {what} {first} is no number ({error})") from None
         yield {name: table[:, index] for index, (name, _) in enumerate(vertex.properties)}
     if header.elements[-1] is vertex and next(lines, None) is not None:
-        warnings.warn(f"{path}: text after the last Gaussian ignored", stacklevel=4)
+        warnings.warn(plain(f"{path}: text after the last {what} ignored"), stacklevel=4)
 
 
 def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gaussians:

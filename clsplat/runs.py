@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import re
 import sys
@@ -14,6 +15,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
 import tomli_w
@@ -21,8 +23,8 @@ from numpy.typing import NDArray
 
 import clsplat
 from clsplat.config import TrainConfig
-from clsplat.errors import ClsplatError, InputError
-from clsplat.files import TEMPORARY_SUFFIX, atomic_write, atomic_writer
+from clsplat.errors import ClsplatError, InputError, plain
+from clsplat.files import TEMPORARY_SUFFIX, atomic_write, atomic_writer, open_input, parse_json, read_document
 from clsplat.gaussians import Gaussians
 
 if sys.version_info >= (3, 11):
@@ -31,8 +33,17 @@ else:
     import tomli as tomllib
 
 KEPT_CHECKPOINTS = 2
+MAX_SETTINGS, MAX_METRICS, MAX_LINE = 1 << 20, 64 << 20, 1 << 16
+"""Bytes of config.toml, of metrics.jsonl, hundreds of times what the longest training writes, and of a line of it."""
 STATE_KEY = "state.json"
 """The member of a checkpoint that holds its state, as JSON bytes; no array may have this name."""
+
+NPY_MAGIC = b"\x93NUMPY\x01\x00"
+NPY_HEADER = re.compile(
+    r"\{'descr': '([<>|][biufc]\d{1,2})', 'fortran_order': (False|True), "
+    r"'shape': \(((?:\d{1,18}(?:, \d{1,18}){0,7},?)?)\), \} *\n"
+)
+"""What np.save writes before an array of numbers."""
 
 Arrays = dict[str, NDArray[Any]]
 T = TypeVar("T")
@@ -113,11 +124,11 @@ class Run:
         From eval.json, which is written after the model: a run that was resumed and stopped has later metrics. An
         older eval.json is of the model before, as when the evaluation was interrupted.
         """
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ValueError, InputError):
             if self.eval_path.stat().st_mtime_ns < self.model_path.stat().st_mtime_ns:
                 raise ValueError("of an earlier model")
-            record = json.loads(self.eval_path.read_text("utf-8"))
-            if isinstance(record, dict) and isinstance(record.get("step"), int):
+            record = parse_json(read_document(self.eval_path, "the evaluation of a run"))
+            if isinstance(record, dict) and type(record.get("step")) is int:
                 return record
         return next(reversed(self.read_metrics()), {})
 
@@ -144,11 +155,16 @@ class Run:
             atomic_write(self.metrics_path, "".join(line + "\n" for line in kept).encode())
 
     def _metrics_lines(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        with suppress(FileNotFoundError):
-            for line in self.metrics_path.read_text("utf-8", errors="replace").splitlines():
+        if not self.metrics_path.exists():
+            return
+        with open_input(self.metrics_path, "the metrics of a run") as file:
+            if (size := os.fstat(file.fileno()).st_size) > MAX_METRICS:
+                raise InputError(f"{self.metrics_path}: has {size} bytes, expected at most {MAX_METRICS}")
+            while data := file.readline(MAX_LINE):
                 with suppress(ValueError):
-                    record = json.loads(line)
-                    if isinstance(record, dict):
+                    line = data.decode("utf-8").rstrip("\r\n")
+                    record = parse_json(line)
+                    if isinstance(record, dict) and type(record.get("step", 0)) in (int, float):
                         yield line, record
 
     def save_checkpoint(self, step: int, arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Path:
@@ -193,7 +209,7 @@ class Run:
                 break
             except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly anything for a flipped bit
                 why = str(error) or type(error).__name__
-                warnings.warn(f"{path}: checkpoint is damaged and was passed over ({why})", stacklevel=2)
+                warnings.warn(plain(f"{path}: checkpoint is damaged and was passed over ({why})"), stacklevel=2)
         if found and checkpoint is None:
             raise InputError(f"{self.checkpoints_path}: no checkpoint there is whole, use --overwrite to start again")
         if self.resuming:
@@ -211,27 +227,54 @@ def _digest(array: NDArray[Any]) -> str:
 
 
 def _read_checkpoint(path: Path) -> Checkpoint:
-    """Raises all manner of things for a file that is not whole."""
-    with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-        arrays: Arrays = {name: archive[name] for name in archive.files}
-    record = json.loads(arrays.pop(STATE_KEY).tobytes())
+    """Raises ValueError, InputError or what zipfile does where it is not as `save_checkpoint` makes it.
+
+    Not by np.load, which takes an array's size from its header, and unpacks what was packed.
+    """
+    arrays: Arrays = {}
+    with open_input(path, "a checkpoint") as file, ZipFile(file) as archive:
+        for member in archive.infolist():
+            name = member.filename.removesuffix(".npy")
+            if member.compress_type != ZIP_STORED or name == member.filename or name in arrays:
+                raise ValueError(f"its member {member.filename[:80]!r} is none of a checkpoint's")
+            arrays[name] = _array(archive.read(member), name)
+    record = parse_json(arrays.pop(STATE_KEY).tobytes())
+    if not isinstance(record, dict) or type(step := record.get("step")) is not int or step < 0:
+        raise ValueError("its state names no step")
+    if not isinstance(state := record.get("state"), dict):
+        raise ValueError("its state is none")
     digests = record.get("sha256")  # runs of earlier versions have none
     if digests is not None:
-        if arrays.keys() != digests.keys():
-            raise ValueError(f"it has not the arrays it was written with: {min(arrays.keys() ^ digests.keys())}")
+        if not isinstance(digests, dict) or arrays.keys() != digests.keys():
+            raise ValueError("it has not the arrays it was written with")
         for name, array in arrays.items():
             if _digest(array) != digests[name]:
                 raise ValueError(f"{name} is not what was written: its sha256 differs")
-    return Checkpoint(int(record["step"]), arrays, record["state"])
+    return Checkpoint(step, arrays, state)
+
+
+def _array(data: bytes, name: str) -> NDArray[Any]:
+    """An array of numbers as np.save writes it. Raises ValueError."""
+    length = int.from_bytes(data[8:10], "little")
+    text = data[10 : 10 + length].decode("latin-1")
+    match = NPY_HEADER.fullmatch(text) if data[:8] == NPY_MAGIC else None
+    if match is None:
+        raise ValueError(f"its member {name[:80]!r} is no array of numbers")
+    kind, shape = np.dtype(match[1]), tuple(int(size) for size in match[3].split(",") if size.strip())
+    body = data[10 + length :]
+    if math.prod(shape) * kind.itemsize != len(body):
+        raise ValueError(f"its array {name[:80]!r} has {len(body)} bytes, expected {shape} of {kind}")
+    array = np.frombuffer(bytearray(body), kind)  # of its own, to be written to
+    return array.reshape(shape, order="F" if match[2] == "True" else "C")
 
 
 def is_run(path: Path) -> bool:
     """Whether the folder holds a config.toml that clsplat wrote."""
     try:
-        with open(path / "config.toml", encoding="utf-8", errors="replace") as file:
-            return any(line.startswith("clsplat = ") for line in file)
-    except OSError:
+        text = read_document(path / "config.toml", "the settings of a run", MAX_SETTINGS)
+    except InputError:
         return False
+    return any(line.startswith("clsplat = ") for line in text.split("\n"))
 
 
 def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
@@ -280,14 +323,18 @@ def config_text(config: TrainConfig, scene: Path | None) -> str:
 def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
     """The configuration and the scene's path. Raises InputError naming the file and the key that is wrong."""
     try:
-        document = tomllib.loads(path.read_text("utf-8"))
-    except (ValueError, OSError) as error:
+        document = tomllib.loads(read_document(path, "the settings of a run", MAX_SETTINGS))
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as TOML ({error})") from None
     for key in document:
         if key not in ("clsplat", "scene", "train"):
             raise InputError(f"{path}: unknown key {key!r}, expected clsplat, scene or train")
     scene = document.get("scene")
     config = _from_table(TrainConfig, document.get("train", {}), path, "train")
+    try:
+        config.check()
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     return config, Path(scene) if isinstance(scene, str) else None
 
 
@@ -317,8 +364,8 @@ def _value(kind: Any, value: Any, what: str) -> Any:
     if get_origin(kind) is tuple:
         if isinstance(value, list):
             return tuple(_value(get_args(kind)[0], item, what) for item in value)
-    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300:
         return float(value)
-    elif type(value) is kind:
+    elif type(value) is kind and not (kind is int and abs(value) >= 1 << 62):
         return value
     raise InputError(f"{what} is {value!r}, expected {getattr(kind, '__name__', kind)}")

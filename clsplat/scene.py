@@ -292,7 +292,7 @@ def _read_transforms(path: Path, kind: Kind, heard: list[str]) -> transforms.Tra
         data = transforms.read_transforms(listed_in)
     heard += data.warnings
     parents = {frame.path.parent for frame in data.frames}
-    present = [file for parent in parents for file in find_images(parent) if file.parent == parent]
+    present = [file for parent in parents for file in find_images(parent, deep=False)]
     _warn_of_unlisted(present, data.frames, listed_in, heard)
     return data
 

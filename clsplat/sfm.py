@@ -21,6 +21,7 @@ from typing import IO, Any, Literal
 
 from clsplat import sfm_photos
 from clsplat.errors import ClsplatError, InputError
+from clsplat.files import parse_json, read_document
 
 Progress = Callable[[str, float | None], None]
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -151,8 +152,22 @@ def _ignore(text: str, fraction: float | None) -> None:
 
 def unregistered(output: Path) -> list[str]:
     """Names of the photos that have no camera in a result of `reconstruct`."""
-    names: list[str] = json.loads((output / RECORD).read_text())["unregistered"]
+    names = _record(output).get("unregistered")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{output / RECORD}: has no list 'unregistered', expected a result of sfm; make it anew")
     return names
+
+
+def _record(output: Path) -> dict[str, Any]:
+    """What a result was made from. Raises InputError."""
+    path, expected = output / RECORD, "the record of a result of sfm"
+    try:
+        record = parse_json(read_document(path, expected))
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON ({error}), expected {expected}") from None
+    if not isinstance(record, dict):
+        raise InputError(f"{path}: holds no JSON object, expected {expected}")
+    return record
 
 
 def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: bool) -> bool:
@@ -162,8 +177,8 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
     if not output.is_dir():
         raise InputError(f"{output}: is a file, expected a folder for the scene or a new name")
     try:
-        record = json.loads((output / RECORD).read_text())
-    except (OSError, ValueError):
+        record = _record(output)
+    except InputError:
         if any(output.iterdir()):
             raise InputError(f"{output}: is not empty and not a result of sfm, expected a new folder") from None
         return False

@@ -18,6 +18,8 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
+from clsplat.files import is_file
+from clsplat.images import error_of, open_image
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 """What pycolmap's wheel reads and writes; its OpenImageIO has no WebP, JPEG 2000 or HEIF."""
@@ -57,6 +59,8 @@ def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path],
             extension = Path(name).suffix.lower()
             if name.startswith("."):
                 continue
+            if extension in EXTENSIONS and not name.isprintable():
+                raise InputError(f"{here / name}: has a name that a scene cannot list; rename it")
             if extension in EXTENSIONS:
                 photos.append(here / name)
             elif extension in OTHER_IMAGES:
@@ -106,14 +110,14 @@ def stage_photos(
 
 
 def _stage(folder: Path, target: Path, path: Path) -> Photo:
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        raise InputError(f"{path}: cannot be decoded as an image: {_last_line(oiio.geterror())}")
+    if not is_file(path):
+        raise InputError(f"{path}: cannot be decoded as an image: is no regular file")
+    source = open_image(path)
     try:
         spec = source.spec()
         pixels = source.read_image(spec.format)
         # a truncated JPEG still gives pixels, grey at its end, and only an error text says so
-        trouble = source.geterror()
+        trouble = error_of(source)
     finally:
         source.close()
     if pixels is None or trouble:

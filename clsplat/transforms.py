@@ -9,7 +9,6 @@ the scene in its own unit cube, touch no pose (they only bound the volume of ran
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from clsplat import ply
 from clsplat.errors import InputError
+from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.images import EXTENSIONS, image_size, require_images
 from clsplat.undistort import Lens, check_lens
 
@@ -30,8 +30,11 @@ Float64 = NDArray[np.float64]
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 """instant-ngp's defaults: its position is scale times the file's, plus offset."""
+MAX_NUMBER = 1e30
+"""Larger ones are damage; their squares are still finite."""
 PERSPECTIVE = ("", "PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE = ("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+RGB = ("red", "green", "blue")
 EXPORT_AGAIN = "export the data set anew or add it"
 
 
@@ -78,6 +81,8 @@ def read_transforms(path: Path) -> Transforms:
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{path}: has no 'frames' (a list of pictures with their poses); {EXPORT_AGAIN}")
     readers = [_Keys(path, index, frame, document) for index, frame in enumerate(frames)]
+    for keys in readers:
+        _inside(path.parent, keys.text("file_path"), keys.where)
     files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
     require_images(files, path)
 
@@ -90,10 +95,11 @@ def read_transforms(path: Path) -> Transforms:
         rotation, translation = _pose(keys)
         name = _plain(listed) + file.name[len(PurePosixPath(_plain(listed)).name) :]  # with the extension found
         result.frames.append(Frame(name, file, lens, rotation, translation, split))
-    names = [frame.name for frame in result.frames]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{path}: lists {twice} twice, expected each picture once; remove one of the frames")
+    seen: set[str] = set()
+    for frame in result.frames:
+        if frame.name in seen:
+            raise InputError(f"{path}: lists {frame.name} twice, expected each picture once; remove one of the frames")
+        seen.add(frame.name)
     if any("mask_path" in frame for frame in frames):
         result.warnings.append(f"{path}: 'mask_path' is ignored, masks are not supported")
     result.box = _ngp_box(_Keys(path, None, {}, document))
@@ -143,22 +149,24 @@ class _Keys:
         value = self.get(key)
         if value is None:
             return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
             raise InputError(f"{self.where}: '{key}' is {_short(value)}, expected a number")
         return float(value)
 
 
 def _short(value: object) -> str:
-    return repr(value)[:60]
+    try:
+        return repr(value)[:60]
+    except ValueError:  # an integer of thousands of digits
+        return "an endless number"
 
 
 def _load(path: Path) -> dict[str, Any]:
+    expected = "a transforms.json"
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file, expected a transforms.json") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not JSON: {error}; expected a transforms.json") from None
+        document = parse_json(read_document(path, expected))
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON: {error}; expected {expected}") from None
     if not isinstance(document, dict):
         raise InputError(f"{path}: holds no JSON object, expected one with 'frames'")
     return document
@@ -173,13 +181,24 @@ def _plain(listed: str) -> str:
 def _find_file(folder: Path, listed: str) -> Path:
     """The picture; one that does not exist is returned as it is listed."""
     path = Path(os.path.normpath(folder / listed.replace("\\", "/")))
-    if path.is_file():
+    if is_file(path) or not path.name:
         return path
     for extension in (*EXTENSIONS, *(extension.upper() for extension in EXTENSIONS)):
         candidate = path.with_name(path.name + extension)
-        if candidate.is_file():
+        if is_file(candidate):
             return candidate
     return path
+
+
+def _inside(folder: Path, listed: str, where: str) -> None:
+    """Raise InputError for the name of a file that is not below the folder of the file that lists it."""
+    root = folder.absolute()  # not resolve: a link in the scene's folder may lead anywhere
+    path = Path(os.path.normpath(root / listed.replace("\\", "/")))
+    if not listed.isprintable() or not path.is_relative_to(os.path.normpath(root)):
+        raise InputError(
+            f"{where}: {_short(listed)} is no path inside the scene's folder {folder}; move what it names into it, or "
+            "put a link there"
+        )
 
 
 def _held_out(document: dict[str, Any]) -> set[str] | None:
@@ -253,9 +272,9 @@ def _pose(keys: _Keys) -> tuple[Float64, Float64]:
         raise InputError(f"{keys.where}: has no 'transform_matrix' (the 4 x 4 pose); {EXPORT_AGAIN}")
     try:
         matrix = np.array(given, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
-    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+    if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < MAX_NUMBER).all():
         raise InputError(f"{keys.where}: 'transform_matrix' is {_short(given)}, expected 4 x 4 finite numbers")
     # A scaled camera object leaves its scale in the matrix; a camera has none.
     determinant = float(np.linalg.det(matrix[:3, :3]))
@@ -278,19 +297,20 @@ def _ngp_box(keys: _Keys) -> tuple[Float64, Float64] | None:
     try:
         shift = np.broadcast_to(np.array(NGP_OFFSET if offset is None else offset, np.float64), 3)
         factor = float(NGP_SCALE if scale is None else scale)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{keys.where}: 'scale' or 'offset' is not of numbers, expected one and three") from None
-    if not (factor > 0 and np.isfinite(shift).all()):
+    if not (1 / MAX_NUMBER < factor < MAX_NUMBER and (np.abs(shift) < MAX_NUMBER).all()):
         raise InputError(f"{keys.where}: 'scale' is {factor}, 'offset' {shift.tolist()}, expected a scale above 0")
     return (0.5 - side / 2 - shift) / factor, (0.5 + side / 2 - shift) / factor
 
 
 def _read_points(path: Path, document: dict[str, Any], result: Transforms) -> None:
     listed = document.get("ply_file_path")
-    if not isinstance(listed, str):
+    if not isinstance(listed, str) or not listed:
         return
-    cloud = path.parent / listed
-    if cloud.is_file():
+    _inside(path.parent, listed, f"{path}: 'ply_file_path'")
+    cloud = path.parent / listed.replace("\\", "/")
+    if is_file(cloud):
         result.points, result.colors = read_point_cloud(cloud)
     else:
         result.warnings.append(f"{path}: its points 'ply_file_path' are missing: {cloud}; using random ones")
@@ -301,34 +321,28 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
 
     Raises InputError for a file that is none, cut short, without x y z, or with positions that are not finite.
     """
-    with open(path, "rb") as file:
+    with open_input(path, "a PLY of points") as file:
         header = ply.read_header(file, path)
         vertex = header.elements[0] if header.elements else None
         if vertex is None or vertex.name != "vertex" or vertex.has_list:
             raise InputError(f"{path}: begins with no plain vertices, expected a point cloud")
-        names = [name for name, _ in vertex.properties]
-        if missing := [name for name in "xyz" if name not in names]:
+        kinds = dict(vertex.properties)
+        if missing := [name for name in "xyz" if name not in kinds]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
-        body = file.read()
-    if header.format == "ascii":
-        rows = body.split(b"\n")[: vertex.count]
-        try:
-            table = np.array([row.split()[: len(names)] for row in rows], np.float64).reshape(vertex.count, len(names))
-        except ValueError:
-            raise InputError(f"{path}: truncated or corrupt: has not {vertex.count} whole rows") from None
-        columns = dict(zip(names, table.T, strict=True))
-    else:
-        kind = header.row_type(vertex)
-        if len(body) < vertex.count * kind.itemsize:
-            raise InputError(f"{path}: truncated: {len(body)} bytes of points, expected {vertex.count * kind.itemsize}")
-        records = np.frombuffer(body, kind, vertex.count)
-        columns = {name: records[name] for name in names}
-    points = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)
+        coloured = all(name in kinds for name in RGB)
+        parts = [(np.empty((0, 3)), np.empty((0, 3), np.float32))]
+        for block in ply.read_vertices(file, header, path, "point"):
+            points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
+            colors = np.full(points.shape, 0.5, np.float32)
+            if coloured:
+                with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, refused below
+                    colors = np.stack([block[name] for name in RGB], axis=1).astype(np.float32)
+            parts.append((points, colors))
+    points, colors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     if not np.isfinite(points).all():
         raise InputError(f"{path}: holds positions that are not finite")
-    colors = np.full(points.shape, 0.5, np.float32)
-    if all(name in columns for name in ("red", "green", "blue")):
-        integer = dict(vertex.properties)["red"][0] in "iu"
-        colors = np.stack([columns[name] for name in ("red", "green", "blue")], axis=1).astype(np.float32)
-        colors = np.clip(colors / np.float32(255 if integer else 1), 0, 1)
+    if not np.isfinite(colors).all():
+        raise InputError(f"{path}: holds colours that are not finite")
+    if coloured:
+        colors = np.clip(colors / np.float32(255 if kinds["red"][0] in "iu" else 1), 0, 1)
     return points, colors

@@ -155,7 +155,7 @@ def test_frames_that_are_wrong_are_named(tmp_path: Path, keys: dict[str, Any], f
 
 def test_not_json(tmp_path: Path) -> None:
     path = tmp_path / "transforms.json"
-    for text, found in (("{", "is not JSON"), ("[1]", "holds no JSON object"), ("\xff", "is not JSON")):
+    for text, found in (("{", "is not JSON"), ("[1]", "holds no JSON object"), ("\xff", "is not text in UTF-8")):
         path.write_bytes(text.encode("latin-1"))
         with pytest.raises(InputError, match=found):
             read_transforms(path)

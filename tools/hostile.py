@@ -1,0 +1,355 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The readers of files that others made, a valid file for each, and ways to spoil it; see `stress_files.py`."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from spoilers import MOST_BYTES, SPOILERS, spoil_place
+
+from clsplat import colmap, ply, runs, sfm, sfm_photos, transforms
+from clsplat.config import TrainConfig
+from clsplat.gaussians import Gaussians
+from clsplat.images import image_size, read_image, write_image
+from clsplat.scene import load_scene
+
+
+@dataclass(frozen=True)
+class Reader:
+    """make(folder) writes valid files; read(folder) reads them as the product does; files: those that are spoilt;
+    kinds: how, of SPOILERS; weight: its share of the cases."""
+
+    name: str
+    make: Callable[[Path], None]
+    read: Callable[[Path], object]
+    files: tuple[str, ...]
+    kinds: tuple[str, ...]
+    weight: float = 1.0
+
+
+# Valid files
+
+
+def _gaussians() -> Gaussians:
+    rng = np.random.default_rng(0)
+    arrays = [rng.standard_normal(shape).astype(np.float32) for shape in ((7, 3), (7, 4), (7, 3), (7,), (7, 4, 3))]
+    return Gaussians(*arrays)
+
+
+def make_ply(folder: Path, form: str = "binary_little_endian") -> None:
+    """model.ply, SH degree 1, 7 Gaussians."""
+    path = folder / "model.ply"
+    ply.write(path, _gaussians())
+    head, mark, body = path.read_bytes().partition(b"end_header\n")
+    head = head.replace(b"binary_little_endian", form.encode())
+    table = np.frombuffer(body, "<f4").reshape(7, -1)
+    if form == "ascii":
+        body = "".join(" ".join(map(repr, map(float, row))) + "\n" for row in table).encode()
+    elif form == "binary_big_endian":
+        body = table.astype(">f4").tobytes()
+    path.write_bytes(head + mark + body)
+
+
+def make_cloud(folder: Path, form: str) -> None:
+    """cloud.ply, points with colours."""
+    rows = [(0.1 * i, -0.2 * i, 1.0, 10 * i, 255 - i, 7) for i in range(9)]
+    kinds = [("float", name) for name in "xyz"] + [("uchar", name) for name in ("red", "green", "blue")]
+    lines = ["ply", f"format {form} 1.0", "element vertex 9"] + [f"property {kind} {name}" for kind, name in kinds]
+    if form == "ascii":
+        body = "".join(" ".join(map(str, row)) + "\n" for row in rows).encode()
+    else:
+        body = b"".join(struct.pack("<3f3B", *row) for row in rows)
+    (folder / "cloud.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + body)
+
+
+PICTURES = ("a.png", "b.png", "sub/c.png")
+
+
+def _picture(path: Path, width: int = 12, height: int = 9, channels: int = 3) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, np.random.default_rng(1).random((height, width, channels)).astype(np.float32))
+
+
+def make_colmap_text(folder: Path) -> None:
+    """A COLMAP model as text beside its pictures."""
+    sparse = folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    cameras = "# comment\n1 PINHOLE 12 9 11.5 11 6 4.5\n2 OPENCV 12 9 11.5 11 6 4.5 0.01 -0.002 0.001 0.0005\n"
+    (sparse / "cameras.txt").write_text(cameras)
+    lines = [
+        f"{index + 1} 1 0 0 0 {0.1 * index} 0 {2 + index} {1 + index % 2} {name}\n1.5 2.5 -1 3.5 4.5 1\n"
+        for index, name in enumerate(PICTURES)
+    ]
+    (sparse / "images.txt").write_text("".join(lines))
+    points = "".join(f"{i + 1} {0.1 * i} 0.2 {3 + i} 10 200 30 0.5 1 0 2 1\n" for i in range(6))
+    (sparse / "points3D.txt").write_text(points)
+    for name in PICTURES:
+        _picture(folder / "images" / name)
+
+
+def make_colmap_binary(folder: Path) -> None:
+    """The same, binary."""
+    make_colmap_text(folder)
+    sparse = folder / "sparse" / "0"
+    for path in sparse.glob("*.txt"):
+        path.unlink()
+    cameras = struct.pack("<Q", 2) + struct.pack("<IiQQ4d", 1, 1, 12, 9, 11.5, 11, 6, 4.5)
+    cameras += struct.pack("<IiQQ8d", 2, 4, 12, 9, 11.5, 11, 6, 4.5, 0.01, -0.002, 0.001, 0.0005)
+    (sparse / "cameras.bin").write_bytes(cameras)
+    images = struct.pack("<Q", 3)
+    for index, name in enumerate(PICTURES):
+        images += struct.pack("<I7dI", index + 1, 1, 0, 0, 0, 0.1 * index, 0, 2 + index, 1 + index % 2)
+        images += name.encode() + b"\0" + struct.pack("<Q2dq", 1, 1.5, 2.5, -1)
+    (sparse / "images.bin").write_bytes(images)
+    points = struct.pack("<Q", 6)
+    for i in range(6):
+        points += struct.pack("<Q3d3BdQ2i", i + 1, 0.1 * i, 0.2, 3 + i, 10, 200, 30, 0.5, 1, 1, 0)
+    (sparse / "points3D.bin").write_bytes(points)
+
+
+def _frames(names: tuple[str, ...]) -> list[dict[str, Any]]:
+    return [
+        {"file_path": name, "transform_matrix": [[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 2.0 + i], [0, 0, 0, 1]]}
+        for i, name in enumerate(names)
+    ]
+
+
+def make_transforms(folder: Path) -> None:
+    """A transforms.json of nerfstudio's kind, with points and a split, and keys of instant-ngp."""
+    for name in PICTURES:
+        _picture(folder / "images" / name)
+    make_cloud(folder, "ascii")
+    document = {
+        "fl_x": 11.5,
+        "fl_y": 11.0,
+        "cx": 6.0,
+        "cy": 4.5,
+        "w": 12,
+        "h": 9,
+        "k1": 0.01,
+        "p1": 0.001,
+        "aabb_scale": 4,
+        "camera_model": "OPENCV",
+        "ply_file_path": "cloud.ply",
+        "scale": 0.33,
+        "offset": [0.5, 0.5, 0.5],
+        "frames": _frames(tuple(f"images/{name}" for name in PICTURES)),
+        "test_filenames": ["images/a.png"],
+    }
+    (folder / "transforms.json").write_text(json.dumps(document, indent=1))
+
+
+def make_blender(folder: Path) -> None:
+    """transforms_train.json and transforms_test.json."""
+    for split, names in (("train", ("a", "b")), ("test", ("c",))):
+        for name in names:
+            _picture(folder / split / f"{name}.png", channels=4)
+        listed = {"camera_angle_x": 0.7, "frames": _frames(tuple(f"./{split}/{name}" for name in names))}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(listed))
+
+
+FORMATS = ("png", "jpg", "exr", "tif", "bmp", "hdr", "tga", "ppm", "webp")
+
+
+def make_image(folder: Path, extension: str) -> None:
+    """One picture, with an EXIF orientation where the format has it."""
+    import OpenImageIO as oiio  # as clsplat.images writes PNG and EXR alone
+
+    pixels = np.random.default_rng(2).random((19, 23, 3)).astype(np.float32)
+    spec = oiio.ImageSpec(23, 19, 3, oiio.FLOAT if extension in ("exr", "hdr") else oiio.UINT8)
+    spec.attribute("Orientation", 6)
+    path = folder / f"picture.{extension}"
+    output = oiio.ImageOutput.create(str(path))
+    if output is None or not output.open(str(path), spec) or not output.write_image(pixels) or not output.close():
+        raise RuntimeError(f"{path}: cannot be written: {oiio.geterror()}")
+
+
+def make_run(folder: Path) -> None:
+    """A run with metrics, an evaluation, two checkpoints and no model."""
+    run = runs.Run.create(folder / "run", TrainConfig(iterations=10))
+    for step in (1, 2):
+        run.append_metrics({"step": step, "loss": 0.1, "seconds": 0.5 * step})
+        arrays = {"parameters/means": np.ones((4, 3), np.float32), "statistics/seen": np.zeros(4, np.float32)}
+        state = {"rng": np.random.default_rng(0).bit_generator.state, "queue": [1, 2]}
+        run.save_checkpoint(step, arrays, state)
+    run.write_eval({"step": 2, "psnr": 20.0})
+    (folder / "run" / "model.ply").write_bytes(b"ply\n")
+
+
+def make_photos(folder: Path) -> None:
+    """Photos for structure from motion."""
+    for name in ("a.png", "b.png"):
+        _picture(folder / "photos" / name)
+    make_image(folder / "photos", "jpg")
+
+
+def make_record(folder: Path) -> None:
+    """A result of structure from motion, as far as it is looked at before it is used again."""
+    make_photos(folder)
+    make_colmap_binary(folder)
+    (folder / "sfm.json").write_text(json.dumps({"fingerprint": "0", "photos": 3, "unregistered": ["c.png"]}))
+
+
+# Readers
+
+
+def read_scene(folder: Path) -> None:
+    """Everything of a scene that is looked at before training: cameras, points, every picture."""
+    scene = load_scene(folder)
+    scene.check_pictures()
+    for view in scene.views:
+        view.load()
+        inside(folder, view.path)
+    _ = scene.extent
+
+
+def inside(folder: Path, path: Path) -> None:
+    """Fails where a scene's picture is not below its folder, by its name: links were made by who owns the folder."""
+    if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder)):
+        raise AssertionError(f"reads {path}, outside {folder}")
+
+
+def read_picture(folder: Path, extension: str) -> None:
+    """Size and pixels."""
+    path = folder / f"picture.{extension}"
+    image_size(path)
+    image = read_image(path)
+    if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] not in (3, 4) or not np.isfinite(image).all():
+        raise AssertionError(f"image {image.dtype} {image.shape}")
+
+
+def read_run(folder: Path) -> None:
+    """Settings, metrics and evaluation."""
+    run = runs.Run.open(folder / "run")
+    run.config.check()
+    run.read_metrics()
+    run.model_record()
+    run.truncate_metrics(1)
+
+
+def read_checkpoint(folder: Path) -> None:
+    """The checkpoint that training goes on from."""
+    path = folder / "run"
+    checkpoint = runs.Run(path, TrainConfig(), None, resuming=True).load_latest_checkpoint()
+    if checkpoint is not None:
+        total = sum(array.nbytes for array in checkpoint.arrays.values())
+        if total > MOST_BYTES:
+            raise AssertionError(f"{total} bytes of arrays")
+
+
+def read_photos(folder: Path) -> None:
+    """What structure from motion does before it starts pycolmap."""
+    photos, _ = sfm_photos.find_photos(folder / "photos")
+    sfm_photos.stage_photos(folder / "photos", photos, folder / "staged", lambda _: None, 1)
+
+
+def read_record(folder: Path) -> None:
+    """Whether a result of structure from motion can be used again."""
+    sfm._is_finished(folder, folder / "photos", "0", overwrite=False)  # noqa: SLF001
+    sfm.unregistered(folder)
+
+
+BYTES = ("flip", "truncate", "numbers", "insert", "remove", "repeat", "append", "zeros", "swap")
+LINES = ("words", "lines", "text")
+PLACES = ("places",)
+SPARSE = tuple(f"sparse/0/{stem}" for stem in ("cameras", "images", "points3D"))
+BINARY_FILES, TEXT_FILES = tuple(f"{name}.bin" for name in SPARSE), tuple(f"{name}.txt" for name in SPARSE)
+
+
+def _model(folder: Path) -> None:
+    colmap.read_model(folder / "sparse" / "0")
+    colmap.read_cameras(folder)
+
+
+_ALL = (
+    Reader("ply", make_ply, lambda f: ply.read(f / "model.ply"), ("model.ply",), (*BYTES, *LINES, *PLACES), 4),
+    Reader(
+        "ply-big",
+        partial(make_ply, form="binary_big_endian"),
+        lambda f: ply.read(f / "model.ply"),
+        ("model.ply",),
+        (*BYTES, *LINES),
+    ),
+    Reader(
+        "ply-ascii",
+        partial(make_ply, form="ascii"),
+        lambda f: ply.read(f / "model.ply"),
+        ("model.ply",),
+        (*BYTES, *LINES),
+        2,
+    ),
+    *(
+        Reader(
+            f"cloud-{form[:6]}",
+            partial(make_cloud, form=form),
+            lambda f: transforms.read_point_cloud(f / "cloud.ply"),
+            ("cloud.ply",),
+            (*BYTES, *LINES, *PLACES),
+            2,
+        )
+        for form in ("ascii", "binary_little_endian")
+    ),
+    Reader("colmap-bin", make_colmap_binary, _model, BINARY_FILES, (*BYTES, *PLACES), 4),
+    Reader("colmap-txt", make_colmap_text, _model, TEXT_FILES, (*BYTES, *LINES, *PLACES), 4),
+    Reader("scene-bin", make_colmap_binary, read_scene, BINARY_FILES, BYTES, 1),
+    Reader("scene-txt", make_colmap_text, read_scene, TEXT_FILES, (*LINES, *PLACES), 1),
+    Reader("scene-places", make_colmap_text, read_scene, tuple(f"images/{name}" for name in PICTURES), PLACES, 0.5),
+    Reader("transforms", make_transforms, read_scene, ("transforms.json",), (*BYTES, *LINES, "json", *PLACES), 4),
+    Reader(
+        "blender",
+        make_blender,
+        read_scene,
+        ("transforms_train.json", "transforms_test.json"),
+        (*BYTES, *LINES, "json", *PLACES),
+        2,
+    ),
+    *(
+        Reader(
+            f"image-{extension}",
+            partial(make_image, extension=extension),
+            partial(read_picture, extension=extension),
+            (f"picture.{extension}",),
+            BYTES,
+        )
+        for extension in FORMATS
+    ),
+    Reader("config", make_run, read_run, ("run/config.toml",), (*BYTES, *LINES, *PLACES), 3),
+    Reader("records", make_run, read_run, ("run/metrics.jsonl", "run/eval.json"), (*BYTES, *LINES, "json", *PLACES), 3),
+    Reader(
+        "checkpoint",
+        make_run,
+        read_checkpoint,
+        ("run/checkpoints/step-0000002.npz", "run/checkpoints/step-0000001.npz"),
+        (*BYTES, "archive", *PLACES),
+        3,
+    ),
+    Reader("photos", make_photos, read_photos, ("photos/a.png", "photos/picture.jpg"), (*BYTES, *PLACES), 1),
+    Reader("record", make_record, read_record, ("sfm.json",), (*BYTES, *LINES, "json", *PLACES), 1),
+)
+READERS = {reader.name: reader for reader in _ALL}
+
+
+def spoil(reader: Reader, folder: Path, rng: random.Random) -> str:
+    """Spoil one or two of the reader's files in one to three ways; says how."""
+    said = []
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        path = folder / rng.choice(reader.files)
+        kind = rng.choice(reader.kinds)
+        if not path.is_file() or path.is_symlink() or path.stat().st_size > MOST_BYTES:
+            continue
+        said.append(f"{kind} of {path.relative_to(folder)}")
+        if kind == "places":
+            spoil_place(path, folder, rng)
+            continue
+        data = path.read_bytes()
+        path.write_bytes(SPOILERS[kind](data, rng))
+    return "; ".join(said)

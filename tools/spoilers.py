@@ -1,0 +1,364 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ways to spoil a file: each takes its bytes and a source of random numbers and gives other bytes; see `hostile.py`."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import os
+import random
+import re
+import struct
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+MOST_BYTES = 1 << 24
+"""Larger ones, as some spoilers make them, are not spoilt further."""
+
+NUMBERS = (
+    *("0", "-1", "-0", "1", "2", "255", "256", "65536", "4294967295", "2147483648", "-2147483649", "1000000000"),
+    *("18446744073709551615", "9223372036854775808", "9" * 400, "9" * 5000, "1e308", "1e999", "-1e999", "1e-320"),
+    *(
+        "nan",
+        "NaN",
+        "inf",
+        "-Infinity",
+        "0x10",
+        "1_000",
+        "\u0663",
+        "\uff11",
+        "1.5",
+        "1.",
+        ".5",
+        "+3",
+        "1e",
+        "",
+        "-",
+        "true",
+    ),
+)
+WORDS = (
+    *("../../etc/passwd", "/etc/passwd", "images/../../../x.png", "..", ".", "./a.png", "a.png", "images//a.png", "~"),
+    *("C:\\\\Windows\\\\x.png", "..\\\\..\\\\x.png", "//host/share/x.png", "/dev/zero", "/dev/stdin", "/proc/self/mem"),
+    *(
+        "a\u0000b.png",
+        "\u202egnp.a",
+        "\ufeff",
+        "\U0001f4a9.png",
+        "e\u0301.png",
+        "caf\u00e9.png",
+        "x" * 300,
+        "y/" * 3000,
+        " ",
+        "",
+    ),
+    *("PINHOLE", "OPENCV", "EQUIRECTANGULAR", "FULL_OPENCV", "null", "[]", "{}", "list", "property list uchar int x"),
+    *("element vertex 99999999999", "end_header", "\\ud800", "\\u0000", "%s%n", "{name}", "a\nb", "a\rb", "\x1b[31m"),
+)
+VALUES: tuple[Any, ...] = (
+    *(None, True, False, 0, -1, 1, 2, 3.5, -0.0, 1e308, -1e308, 1e-320, math.nan, math.inf, 10**30, 10**400, 2**63),
+    *("", "a", "1", "nan", [], {}, [[]], [None], [1, 2, 3], [1, "a"], {"a": 1}, [1] * 1000, [[1, 2], [3]], [10**400]),
+    *([[1, 0, 0, 0]] * 4, [[0] * 4] * 4, [["1"] * 4] * 4, [[math.nan] * 4] * 4, [[1e200] * 4] * 4, [[[1]] * 4] * 4),
+)
+
+
+def _flip(data: bytes, rng: random.Random) -> bytes:
+    spoilt = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 4, 16)) if spoilt else 0):
+        # headers are short and decide the most
+        at = rng.randrange(min(len(spoilt), 64)) if rng.random() < 0.3 else rng.randrange(len(spoilt))
+        spoilt[at] = rng.choice((spoilt[at] ^ (1 << rng.randrange(8)), 0, 255, rng.randrange(256)))
+    return bytes(spoilt)
+
+
+def _numbers(data: bytes, rng: random.Random) -> bytes:
+    """A number of 2, 4 or 8 bytes, of either order, becomes one that hurts."""
+    order, letter = rng.choice("<>"), rng.choice("hHiIqQfd")
+    size = struct.calcsize(letter)
+    if letter in "fd":
+        value: float = rng.choice((math.nan, math.inf, -math.inf, 0.0, -0.0, 1e30, -1e30, 1e-40, 3e38))
+    else:
+        bits = 8 * size
+        wide = rng.choice((0, 1, 2, (1 << bits) - 1, (1 << (bits - 1)) - 1, 1 << (bits - 1), 1 << (bits // 2), 100_000))
+        value = wide % (1 << bits)
+        value -= (1 << bits) if letter.islower() and value >= 1 << (bits - 1) else 0
+    limit = max(len(data) - size + 1, 1)
+    at = rng.randrange(min(limit, 128)) if rng.random() < 0.5 else rng.randrange(limit)
+    if rng.random() < 0.7:
+        at -= at % min(size, 4)
+    return data[:at] + struct.pack(order + letter, value) + data[at + size :]
+
+
+def _cut(data: bytes, rng: random.Random) -> tuple[int, int]:
+    start = rng.randrange(len(data) + 1)
+    return start, min(start + rng.choice((1, 1, 2, 4, 8, 24, 100)), len(data))
+
+
+def _truncate(data: bytes, rng: random.Random) -> bytes:
+    return data[: rng.choice((0, 1, len(data) - 1, rng.randrange(len(data) + 1), rng.randrange(len(data) + 1)))]
+
+
+def _insert(data: bytes, rng: random.Random) -> bytes:
+    at = rng.randrange(len(data) + 1)
+    return data[:at] + rng.randbytes(rng.choice((1, 2, 4, 64))) + data[at:]
+
+
+def _remove(data: bytes, rng: random.Random) -> bytes:
+    start, stop = _cut(data, rng)
+    return data[:start] + data[stop:]
+
+
+def _repeat(data: bytes, rng: random.Random) -> bytes:
+    start, stop = _cut(data, rng)
+    return data[:stop] + data[start:stop] * rng.choice((1, 1, 2, 1000)) + data[stop:]
+
+
+def _append(data: bytes, rng: random.Random) -> bytes:
+    return data + rng.choice((b"\0", b"\n", b"x", b"\0" * 5000, data, rng.randbytes(100)))
+
+
+def _zeros(data: bytes, rng: random.Random) -> bytes:
+    start, stop = _cut(data, rng)
+    return data[:start] + rng.choice((b"\0", b"\xff")) * (stop - start) + data[stop:]
+
+
+def _swap(data: bytes, rng: random.Random) -> bytes:
+    a, b = sorted((rng.randrange(len(data) + 1), rng.randrange(len(data) + 1)))
+    return data[b:] + data[a:b] + data[:a]
+
+
+def _words(data: bytes, rng: random.Random) -> bytes:
+    """A number or a word becomes another."""
+    text = data.decode("latin-1")
+    found = list(re.finditer(r"-?[0-9][0-9.eE+-]*|[A-Za-z_./][\w./-]*", text))
+    if not found:
+        return data
+    for match in sorted(rng.sample(found, min(rng.choice((1, 1, 2)), len(found))), key=lambda m: -m.start()):
+        choice = rng.choice(NUMBERS if rng.random() < 0.6 else WORDS)
+        text = text[: match.start()] + choice.encode("utf-8").decode("latin-1") + text[match.end() :]
+    return text.encode("latin-1")
+
+
+def _lines(data: bytes, rng: random.Random) -> bytes:
+    """A line goes, comes twice, changes place or becomes another's."""
+    lines = data.split(b"\n")
+    at, other = rng.randrange(len(lines)), rng.randrange(len(lines))
+    kind = rng.randrange(5)
+    if kind == 0:
+        del lines[at]
+    elif kind == 1:
+        lines.insert(other, lines[at])
+    elif kind == 2:
+        lines[at], lines[other] = lines[other], lines[at]
+    elif kind == 3:
+        lines[at] = b""
+    else:
+        lines = lines[:at] + [lines[at]] * 1000 + lines[at:]
+    return b"\n".join(lines)
+
+
+def _text(data: bytes, rng: random.Random) -> bytes:
+    """What an editor or a bad transfer does to a text, and what is deeply nested or very long."""
+    at = rng.randrange(len(data) + 1)
+    kind = rng.randrange(11)
+    if kind == 0:
+        return b"\xef\xbb\xbf" + data
+    if kind == 1:
+        return data.replace(b"\n", b"\r\n")
+    if kind == 2:
+        return data.replace(b"\n", b"\r")
+    if kind == 3:
+        return data.decode("latin-1").encode("utf-16")
+    if kind == 4:
+        return data[:at] + b"\xff\xfe\xc3" + data[at:]
+    if kind == 5:
+        return data[:at] + rng.choice((b"[", b"{", b'{"a":', b"(")) * rng.choice((100, 3000, 100_000)) + data[at:]
+    if kind == 6:
+        return data[:at] + rng.choice((b"x", b" ", b"9", b"\t", b"0", b"#", b"a.")) * 1_000_000 + data[at:]
+    if kind == 7:
+        return data[:at] + rng.choice(WORDS).encode() + data[at:]
+    if kind == 8:
+        return b"[" * 50_000 + b"]" * 50_000
+    if kind == 9:
+        return data.replace(b" ", rng.choice((b"\0", b"\x0b", b"\xc2\xa0", b"")))
+    return b"x = " + rng.choice((b"[" * 5000 + b"]" * 5000, b"9" * 10_000, b"{a=" * 1000 + b"1" + b"}" * 1000))
+
+
+def _json(data: bytes, rng: random.Random) -> bytes:
+    """A value anywhere in the document becomes another, a key goes, or a list is repeated."""
+    try:
+        first, _, rest = data.partition(b"\n") if data.count(b"\n{") else (data, b"", b"")
+        document = json.loads(first)
+    except (ValueError, RecursionError):
+        return data
+    nodes: list[tuple[Any, Any]] = []
+
+    def walk(node: Any) -> None:
+        pairs = (
+            list(node.items()) if isinstance(node, dict) else list(enumerate(node)) if isinstance(node, list) else []
+        )
+        for key, value in pairs:
+            nodes.append((node, key))
+            walk(value)
+
+    walk(document)
+    if not nodes:
+        return data
+    node, key = rng.choice(nodes)
+    kind = rng.randrange(6)
+    if kind == 0 and isinstance(node, dict):
+        del node[key]
+    elif kind == 1 and isinstance(node, list):
+        node.extend(list(node) * rng.choice((1, 50)))
+    elif kind == 2:
+        node[key] = rng.choice(WORDS)
+    elif kind == 3:
+        node[key] = [node[key]]
+    else:
+        node[key] = rng.choice(VALUES)
+    try:
+        return json.dumps(document).encode() + (b"\n" + rest if rest else b"")
+    except (ValueError, RecursionError):
+        return data
+
+
+class _Mark:
+    """What a pickle calls when it is loaded: a reader that does so is caught."""
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return (_unpickled, ("a pickle was loaded",))
+
+
+def _unpickled(text: str) -> None:
+    raise AssertionError(text)
+
+
+def _archive(data: bytes, rng: random.Random) -> bytes:
+    """A member of a checkpoint becomes another: a claim of a huge array, a pickle, a bomb, a state that is none."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = [(info.filename, archive.read(info)) for info in archive.infolist()]
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, RuntimeError, EOFError):
+        return data
+    if not members:
+        return data
+    at = rng.randrange(len(members))
+    name, content = members[at]
+    kind = rng.randrange(9)
+    compression = zipfile.ZIP_STORED
+    if kind == 0:
+        shape = rng.choice(((10**12,), (2**62, 4), (-1,), (0, 5), (3, 10**9), (), (1,) * 40, (10**400,)))
+        content = _npy_claim(f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape!r}, }}", b"\0" * 48)
+    elif kind == 1:
+        buffer = io.BytesIO()
+        np.save(buffer, np.array([_Mark(), {}], object), allow_pickle=True)
+        content = buffer.getvalue()
+    elif kind == 2:
+        descr = rng.choice(
+            ("'|O'", "'<f9'", "'<V99999999'", "[('a', '<f4')]", "'<U1000000000'", "None", "'<c16'", "'<M8[s]'")
+        )
+        content = _npy_claim(f"{{'descr': {descr}, 'fortran_order': False, 'shape': (4, 3), }}", b"\0" * 48)
+    elif kind == 3:
+        name = rng.choice(
+            ("../../x.npy", "/etc/passwd", "parameters/means.npy", "state.json.npy", "x" * 70_000, "", "a")
+        )
+    elif kind == 4:
+        compression = zipfile.ZIP_DEFLATED
+        zeros = np.zeros(rng.choice((10, 60_000_000)), np.float32)
+        buffer = io.BytesIO()
+        np.save(buffer, zeros)
+        content = buffer.getvalue()
+    elif kind == 5:
+        name = "state.json.npy"
+        text = rng.choice(
+            (b"", b"{", b"[" * 100_000, b"null", b"[]", b'{"step": 1e999, "state": {}}', b'{"step": "x"}')
+        )
+        other = rng.choice(
+            (
+                text,
+                b'{"step": NaN, "state": 3}',
+                b'{"step": ' + b"9" * 6000 + b', "state": {}}',
+                b'{"step": -5, "state": []}',
+            )
+        )
+        buffer = io.BytesIO()
+        np.save(buffer, np.frombuffer(other, np.uint8))
+        content = buffer.getvalue()
+        members = [member for member in members if member[0] != name]
+        at = 0
+    elif kind == 6:
+        content = _npy_claim("{'descr': " + "(" * rng.choice((50, 5000)) + "'<f4', 'fortran_order': False}", b"")
+    elif kind == 7:
+        content = _numbers(content, rng)
+    else:
+        members = members * rng.choice((2, 200))
+    if members:
+        members[min(at, len(members) - 1)] = (name, content)
+    if kind == 5:
+        members.append((name, content))
+    buffer = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(buffer, "w", compression) as archive:
+        warnings.simplefilter("ignore")  # names that come twice
+        for each, body in members:
+            archive.writestr(each[:65_000] or "empty", body)
+    return buffer.getvalue()
+
+
+def _npy_claim(header: str, body: bytes) -> bytes:
+    encoded = header.encode() + b"\n"
+    return b"\x93NUMPY\x02\x00" + struct.pack("<I", len(encoded)) + encoded + body
+
+
+def spoil_place(path: Path, folder: Path, rng: random.Random) -> None:
+    """The file becomes a link, a folder, a pipe, or what may not be read; its folder a loop of links."""
+    with contextlib.suppress(OSError):  # names that are there already, or are too long
+        _replace(path, folder, rng)
+
+
+def _replace(path: Path, folder: Path, rng: random.Random) -> None:
+    kind = rng.randrange(8)
+    path.unlink()
+    if kind == 0:
+        path.symlink_to(rng.choice(("/etc/passwd", "/dev/zero", "/dev/null", "/nonexistent", "/proc/self/mem", "/etc")))
+    elif kind == 1:
+        path.symlink_to(path.name)
+    elif kind == 2:
+        path.mkdir()
+    elif kind == 3:
+        os.mkfifo(path)
+    elif kind == 4:
+        for name in ("loop", "loop2", "loop3"):
+            (path.parent / name).symlink_to(rng.choice((".", "..", str(folder))))
+    elif kind == 5:
+        path.symlink_to("../" * rng.randrange(1, 20) + "etc/passwd")
+    elif kind == 6:
+        odd = ("a\nb.png", "\x1b[31m.png", "\udcff.png", "e\u0301.png", "x" * 250 + ".png")
+        (path.parent / rng.choice(odd)).write_bytes(b"")
+    else:
+        with open(path, "wb") as file:  # of no bytes on the disk
+            file.truncate(rng.choice((1 << 20, 1 << 33)))
+
+
+SPOILERS: dict[str, Callable[[bytes, random.Random], bytes]] = {
+    "flip": _flip,
+    "truncate": _truncate,
+    "numbers": _numbers,
+    "insert": _insert,
+    "remove": _remove,
+    "repeat": _repeat,
+    "append": _append,
+    "zeros": _zeros,
+    "swap": _swap,
+    "words": _words,
+    "lines": _lines,
+    "text": _text,
+    "json": _json,
+    "archive": _archive,
+}
