@@ -72,7 +72,10 @@ def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Sub
         np.log(opacities) - np.log1p(-opacities),
         sh,
     )
-    gaussians = Gaussians(*(np.ascontiguousarray(array, np.float32) for array in arrays))
+    means32, quaternions, log_scales, logits, coefficients = (
+        np.ascontiguousarray(array, np.float32) for array in arrays
+    )
+    gaussians = Gaussians(means32, quaternions, log_scales, logits, coefficients)
     return Subject("synthetic", gaussians, camera)
 
 
@@ -83,33 +86,36 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
     if run is not None and (path.is_dir() or path == run.model_path):
         gaussians = Gaussians.load(run.model_path)
         if run.scene is None or not run.scene.exists():
-            return Subject(str(path), gaussians, facing(gaussians, *(size or (1024, 768))))
+            return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
         config = run.config
         scene = load_scene(run.scene, resolution=config.resolution, test_every=config.test_every, progress=progress)
     elif path.suffix.lower() == ".ply":
         gaussians = Gaussians.load(path)
-        return Subject(str(path), gaussians, facing(gaussians, *(size or (1024, 768))))
+        return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
     else:
         scene = load_scene(path, progress=progress)
         if len(scene.points) > 0:
-            gaussians = from_points(scene.points, scene.point_colors, sh_degree=0)
+            gaussians = from_points(scene.points, scene.point_colors, sh_degree=0, origin=scene.origin)
         else:
             points = random_points(TrainConfig().random_points, *scene.bounds, np.random.default_rng(0))
-            gaussians = from_points(*points, sh_degree=0)
+            gaussians = from_points(*points, sh_degree=0, origin=scene.origin)
     view = (scene.train_views or scene.views)[0]
     camera = view.camera.resized(*size) if size else view.camera
     pixels = view.load(camera.width, camera.height)[:, :, :3]
+    camera, gaussians = camera.from_origin(gaussians.origin), replace(gaussians, origin=np.zeros(3))
     return Subject(str(path), gaussians, camera, np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
 
 
-def facing(gaussians: Gaussians, width: int, height: int) -> Camera:
-    """A camera with the world's axes that has nine tenths of the Gaussians in its image."""
+def facing(gaussians: Gaussians, width: int, height: int) -> tuple[Gaussians, Camera]:
+    """The Gaussians, their means counted from where they are, and a camera with the world's axes that has nine tenths
+    of them in its image."""
     low, middle, high = np.quantile(gaussians.means.astype(np.float64), (0.05, 0.5, 0.95), axis=0)
     focal = 0.9 * width
     half = np.maximum(high - middle, middle - low)
     distance = max(float(np.max(2 * focal * half[:2] / (width, height))) + float(half[2]), 0.1)
     position = middle - np.array([0.0, 0.0, distance])
-    return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), -position)
+    camera = Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), -position)
+    return replace(gaussians, origin=np.zeros(3)), camera
 
 
 def bench(

@@ -36,6 +36,12 @@ class Camera:
         centre: Float64 = -self.rotation.T @ self.translation
         return centre
 
+    def from_origin(self, origin: Float64) -> Camera:
+        """The same view, for coordinates of the world that are counted from origin (3,)."""
+        if not origin.any():
+            return self
+        return replace(self, translation=self.translation + self.rotation @ origin)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view on another pixel grid: pixel centres at +0.5 make this a pure scaling."""
         sx, sy = width / self.width, height / self.height

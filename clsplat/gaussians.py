@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 MAX_SH_DEGREE = 3
 
@@ -20,7 +21,8 @@ class Gaussians:
 
     means (N, 3); quaternions (N, 4), w x y z, not normalised; log_scales (N, 3), natural logs of the standard
     deviations; opacity_logits (N,); sh (N, K, 3), K = (degree + 1)^2 real SH coefficients per channel,
-    colour = 0.5 + sum of basis times coefficient. All float32, C-contiguous.
+    colour = 0.5 + sum of basis times coefficient. All float32, C-contiguous. origin (3,) float64: the place in the
+    world that the means count from; 0 but for scenes far from it, which float32 would blur (docs/decisions/0017).
     """
 
     means: Float32
@@ -28,6 +30,7 @@ class Gaussians:
     log_scales: Float32
     opacity_logits: Float32
     sh: Float32
+    origin: Float64 = field(default_factory=lambda: np.zeros(3))
 
     def __len__(self) -> int:
         return len(self.means)
@@ -54,6 +57,8 @@ class Gaussians:
             array: Float32 = getattr(self, name)
             if array.dtype != np.float32 or array.shape != shape:
                 raise ValueError(f"{name} is {array.dtype} {array.shape}, expected float32 {shape}")
+        if self.origin.dtype != np.float64 or self.origin.shape != (3,):
+            raise ValueError(f"origin is {self.origin.dtype} {self.origin.shape}, expected float64 (3,)")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Gaussians:

@@ -22,12 +22,13 @@ NEIGHBOURS = 3
 Float64 = NDArray[np.float64]
 
 
-def from_points(points: ArrayLike, colors: ArrayLike, *, sh_degree: int) -> Gaussians:
+def from_points(points: ArrayLike, colors: ArrayLike, *, sh_degree: int, origin: Float64 | None = None) -> Gaussians:
     """One Gaussian a point.
 
     points (N, 3), world units; colors (N, 3), float in [0, 1] or uint8; sh_degree 0 to 3: the higher coefficients
-    are there and 0. The standard deviation is the root of the mean squared distance to the three nearest other
-    points (fewer where there are fewer; a lone point gets the floor). Opacity 0.1, quaternions 1 0 0 0.
+    are there and 0; origin (3,): where the means count from, the world's own if not given. The standard deviation is
+    the root of the mean squared distance to the three nearest other points (fewer where there are fewer; a lone point
+    gets the floor). Opacity 0.1, quaternions 1 0 0 0.
     Raises InputError for no points or points that are not finite, ValueError for wrong shapes.
     """
     xyz = np.asarray(points, np.float64)
@@ -44,17 +45,19 @@ def from_points(points: ArrayLike, colors: ArrayLike, *, sh_degree: int) -> Gaus
     if not np.isfinite(xyz).all():
         raise InputError(f"point {int(np.argmin(np.isfinite(xyz).all(axis=1)))} is not finite")
 
+    origin = np.zeros(3) if origin is None else origin
     log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), MIN_SQUARED_DISTANCE))
     quaternions = np.zeros((count, 4), np.float32)
     quaternions[:, 0] = 1
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (rgb - 0.5) / SH_C0
     return Gaussians(
-        means=np.ascontiguousarray(xyz, np.float32),
+        means=np.ascontiguousarray(xyz - origin, np.float32),
         quaternions=quaternions,
         log_scales=np.repeat(log_scales.astype(np.float32)[:, None], 3, axis=1),
         opacity_logits=np.full(count, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), np.float32),
         sh=sh,
+        origin=origin,
     )
 
 

@@ -4,6 +4,10 @@
 Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. f_rest is channel-major: all higher
 coefficients of red, then of green, then of blue. Files are streamed in blocks of rows, so that reading or writing
 costs the model's own memory and little more.
+
+Means that count from elsewhere than the world's origin are written in the world, as every tool expects, which rounds
+them; and once more as they are, in an element behind the vertices, with their origin in a comment. Other tools pass
+over both.
 """
 
 from __future__ import annotations
@@ -46,6 +50,9 @@ POSITION = ("x", "y", "z")
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+ORIGIN = ["comment", "clsplat", "origin"]
+LOCAL = "clsplat_local"
+"""The element that has the means as they count from the origin."""
 REQUIRED = (*POSITION, *DC, "opacity", *SCALE, *ROTATION)
 
 
@@ -64,11 +71,13 @@ class Element:
 
 @dataclass
 class Header:
-    """format: "ascii" or a key of BYTE_ORDERS; size: the header's length in bytes, `end_header` included."""
+    """format: "ascii" or a key of BYTE_ORDERS; size: the header's length in bytes, `end_header` included; origin: of
+    the element LOCAL."""
 
     format: str
     elements: list[Element]
     size: int
+    origin: NDArray[np.float64] | None = None
 
     def row_type(self, element: Element) -> np.dtype[Any]:
         """The packed record of one row of a binary file."""
@@ -86,11 +95,14 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     path = Path(path)
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
-        vertex, _ = _vertex_element(header, path)
+        vertex, skipped = _vertex_element(header, path)
         rest = _check_properties(vertex, path)
         if vertex.count == 0:
             raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
-        return _assemble(read_vertices(file, header, path, "Gaussian"), vertex.count, rest, path)
+        gaussians = _assemble(read_vertices(file, header, path, "Gaussian"), vertex.count, rest, path)
+        if header.origin is not None:
+            _count_from(header.origin, gaussians, _local_means(file, header, vertex, skipped, path), path)
+        return gaussians
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians, *, sh_degree: int | None = None) -> None:
@@ -106,15 +118,19 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, sh_degree: int 
     stored, padded = gaussians.sh.shape[1] - 1, (degree + 1) ** 2 - 1
     rest_names = [f"f_rest_{index}" for index in range(3 * padded)]
     names = [*POSITION, "nx", "ny", "nz", *DC, *rest_names, "opacity", *SCALE, *ROTATION]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
-    lines += [f"property float {name}" for name in names] + ["end_header", ""]
+    far, count = bool(gaussians.origin.any()), len(gaussians)
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [" ".join([*ORIGIN, *(repr(float(value)) for value in gaussians.origin)])] if far else []
+    lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
+    lines += [f"element {LOCAL} {count}", *(f"property float {name}" for name in POSITION)] if far else []
+    lines += ["end_header", ""]
     with atomic_writer(path) as file:
         file.write("\n".join(lines).encode("ascii"))
         for start in range(0, len(gaussians), BLOCK_ROWS):
             rows = slice(start, start + BLOCK_ROWS)
             sh = gaussians.sh[rows]
             block = np.zeros((len(sh), len(names)), "<f4")
-            block[:, 0:3] = gaussians.means[rows]
+            block[:, 0:3] = gaussians.means[rows] + gaussians.origin if far else gaussians.means[rows]
             block[:, 6:9] = sh[:, 0]
             rest = block[:, 9 : 9 + 3 * padded]
             for channel in range(3):
@@ -123,6 +139,8 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, sh_degree: int 
             block[:, -7:-4] = gaussians.log_scales[rows]
             block[:, -4:] = gaussians.quaternions[rows]
             file.write(block.data)
+        if far:
+            file.write(np.ascontiguousarray(gaussians.means, "<f4").data)
 
 
 def read_header(file: BinaryIO, path: Path) -> Header:
@@ -131,18 +149,20 @@ def read_header(file: BinaryIO, path: Path) -> Header:
         raise InputError(f"{path}: not a PLY file (it does not begin with a line 'ply')")
     form = ""
     elements: list[Element] = []
+    origin = None
     for _ in range(MAX_HEADER_LINES):
         line = file.readline(4096)
         if not line.endswith(b"\n"):
             break
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
+            origin = _origin(words) if words[:3] == ORIGIN else origin
             continue
         if words == ["end_header"]:
             if form not in ("ascii", *BYTE_ORDERS):
                 expected = "ascii, binary_little_endian or binary_big_endian"
                 raise InputError(f"{path}: PLY header has the format {form or 'missing'!r}, expected {expected}")
-            return Header(form, elements, file.tell())
+            return Header(form, elements, file.tell(), origin)
         try:
             match words:
                 case ["format", name, _]:
@@ -158,6 +178,48 @@ def read_header(file: BinaryIO, path: Path) -> Header:
         except (ValueError, KeyError, IndexError):
             raise InputError(f"{path}: PLY header has a line that is none: {' '.join(words)[:80]!r}") from None
     raise InputError(f"{path}: PLY header is truncated or damaged (no line 'end_header')")
+
+
+def _origin(words: list[str]) -> NDArray[np.float64] | None:
+    """None where the comment is not one of ours after all."""
+    try:
+        origin = np.array([float(word) for word in words[3:]])
+    except ValueError:
+        return None
+    return origin if origin.shape == (3,) and np.isfinite(origin).all() else None
+
+
+def _local_means(
+    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path
+) -> NDArray[np.float32] | None:
+    """The element LOCAL, if it is right behind the vertices. Raises InputError where it is cut."""
+    behind = header.elements[len(skipped) + 1 :]
+    wanted = Element(LOCAL, vertex.count, [(name, "f4") for name in POSITION])
+    if header.format == "ascii" or not behind or behind[0] != wanted:
+        return None
+    before = [*skipped, vertex]
+    file.seek(header.size + sum(element.count * header.row_type(element).itemsize for element in before))
+    row = header.row_type(wanted)
+    data = file.read(vertex.count * row.itemsize)
+    if len(data) != vertex.count * row.itemsize:
+        need = vertex.count * row.itemsize
+        raise InputError(f"{path}: truncated: element {LOCAL} needs {need} bytes, {len(data)} are there")
+    rows = np.frombuffer(data, row)
+    return np.stack([rows[name] for name in POSITION], axis=1).astype(np.float32)
+
+
+def _count_from(
+    origin: NDArray[np.float64], gaussians: Gaussians, local: NDArray[np.float32] | None, path: Path
+) -> None:
+    """Have the means count from the origin: as they were written, unless somebody has moved the vertices since."""
+    world = gaussians.means.astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        means = (world - origin).astype(np.float32)
+        if local is not None:
+            means = np.where((local + origin).astype(np.float32) == world, local, means)
+    if not np.isfinite(means).all():
+        raise InputError(f"{path}: the origin in the comment, {origin}, leaves means that are not finite")
+    gaussians.origin, gaussians.means = origin, np.ascontiguousarray(means)
 
 
 def _count(text: str) -> int:

@@ -260,7 +260,10 @@ class Renderer:
     def render(
         self, gaussians: Gaussians | AnyGaussians, camera: Camera, background: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> RenderResult:
-        """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object."""
+        """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object; of what is
+        on the device the camera has to count from where the means do."""
+        if isinstance(gaussians, Gaussians):
+            camera = camera.from_origin(gaussians.origin)
         on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
         self._background.set(np.asarray(background, np.float32))
         blended = self._rasterizer.forward(on_device, camera, self._background, backward=False).blended

@@ -113,6 +113,7 @@ class Trainer:
         self.step = 0
         self.queue: list[int] = []
         device, initial = self.device, self.given if self.given is not None else self._initial()
+        self.origin = initial.origin
         self._make_plan(len(initial))
         if self.plan.streamed:
             self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
@@ -122,9 +123,9 @@ class Trainer:
     def _initial(self) -> Gaussians:
         scene = self.scene
         if len(scene.points) > 0:
-            return from_points(scene.points, scene.point_colors, sh_degree=0)
-        low, high = scene.bounds
-        return from_points(*random_points(self.config.random_points, low, high, self.rng), sh_degree=0)
+            return from_points(scene.points, scene.point_colors, sh_degree=0, origin=scene.origin)
+        points = random_points(self.config.random_points, *scene.bounds, self.rng)
+        return from_points(*points, sh_degree=0, origin=scene.origin)
 
     def _make_plan(self, count: int) -> None:
         """How so many Gaussians go through the device's memory, with all of their SH coefficients in the end."""
@@ -196,7 +197,7 @@ class Trainer:
         self._raise_sh_degree()
         view, factor = self._next_view(), self.sizes.factor(self.step)
         image = self.photographs.load(view, factor)
-        camera = self.views[view].camera.resized(image.shape[1], image.shape[0])
+        camera = self.views[view].camera.resized(image.shape[1], image.shape[0]).from_origin(self.origin)
         self.background.set(colour := self._background_colour())
 
         planes = target(device, work, image, self.background)
@@ -378,7 +379,7 @@ class Trainer:
         model = download_gaussians(self.parameters)
         full = np.zeros((len(model), (self.config.sh_degree + 1) ** 2, 3), np.float32)
         full[:, : model.sh.shape[1]] = model.sh
-        model.sh = full
+        model.sh, model.origin = full, self.origin
         return model
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

@@ -271,7 +271,7 @@ def test_scene_run_and_model(tmp_path: Path, capsys: Capture) -> None:
 
 def test_facing_camera_sees_the_model() -> None:
     gaussians = measure.synthetic(500, 64, 48).gaussians
-    camera = measure.facing(gaussians, 80, 60)
+    _, camera = measure.facing(gaussians, 80, 60)
     p = gaussians.means @ camera.rotation.T + camera.translation
     pixels = p[:, :2] / p[:, 2:] * camera.fx + (camera.cx, camera.cy)
     seen = (p[:, 2] > camera.near) & (pixels > 0).all(axis=1) & (pixels < (80, 60)).all(axis=1)

@@ -233,7 +233,8 @@ def wild(rng: np.random.Generator, count: int) -> Cases:
     gaussians = made.gaussians()
     everywhere = rng.random(count) < 0.2
     group = rng.integers(0, 5, count)
-    for index, array in enumerate(vars(gaussians).values()):
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    for index, array in enumerate(getattr(gaussians, name) for name in names):
         rows = np.flatnonzero(everywhere | (group == index))
         values = rng.integers(0, 2**32, (len(rows), *array.shape[1:]), np.uint32).view(np.float32)
         special = np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 1e-45, 3.4e38, -3.4e38, 88.0, -104.0], np.float32)
@@ -253,18 +254,18 @@ PROJECTION: Bounds = {
     "extent": 1e-4,
     "colour": 1e-6,
 }
-"""Largest error of any case. position: two floats carry a mean to 2^-44 of its way, and 6e-8 is lost where the part below
-a pixel is stored; a few roundings of that. shape: 3e-5 is what float32 alone may lose before the rotation is refined, and
-there are three such terms. offset: l12 is stored in float32, so that the end of a needle some 700 pixels from its mean
-and 0.55 wide is off by 700 / 0.55 * 2^-24 = 8e-5 from that alone, and shape times the extent of 3.3 comes to it.
-depth, opacity, colour: two to ten roundings of 6e-8. extent: of a budget log2(255 o) of 0.007 the rounding of log2 o,
-of size 8, leaves four digits."""
+"""Largest error of any case. position: two floats carry a mean to 2^-44 of its way, and 6e-8 is lost where the part
+below a pixel is stored; a few roundings of that. shape: 3e-5 is what float32 alone may lose before the rotation is
+refined, and there are three such terms. offset: l12 is stored in float32, so that the end of a needle some 700 pixels
+from its mean and 0.55 wide is off by 700 / 0.55 * 2^-24 = 8e-5 from that alone, and shape times the extent of 3.3 comes
+to it. depth, opacity, colour: two to ten roundings of 6e-8. extent: of a budget log2(255 o) of 0.007 the rounding of
+log2 o, of size 8, leaves four digits."""
 GRADIENT_NORM, GRADIENT_TAIL = 1e-4, 1e-3
 """In norm over a batch, and for the 99.9th percentile of Gaussians. The largest may be any: a gradient can vanish."""
 
 FRAME = 2e-5
-"""Of a pixel's colour outside the band, relative to the frame's brightest: a few dozen roundings of 6e-8, and the ends of
-needles, which are off as said of "offset", there by 64 / 0.55 * 2^-24 = 7e-6."""
+"""Of a pixel's colour outside the band, relative to the frame's brightest: a few dozen roundings of 6e-8, and the ends
+of needles, which are off as said of "offset", there by 64 / 0.55 * 2^-24 = 7e-6."""
 BAND_SHARE = 0.03
 """Of the pixels, those with a decision within 1e-4 of its threshold: in "faint" some 100 Gaussians at each pixel have
 alphas spread evenly over about 1 / 255, of which 2e-4 each are in the band; elsewhere there are a few."""

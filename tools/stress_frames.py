@@ -187,8 +187,8 @@ def compare(device: Device, scene: Scene, rng: np.random.Generator) -> FrameOutc
     for name in GROUPS:
         found, want = getattr(got, name).astype(float), by.parameters[name]
         finite &= bool(np.isfinite(found).all())
-        off = np.sqrt(((found - want).reshape(len(want), -1) ** 2).sum(axis=1))
-        size = np.sqrt((want.reshape(len(want), -1) ** 2).sum(axis=1))
+        inner = tuple(range(1, want.ndim))
+        off, size = np.sqrt(((found - want) ** 2).sum(axis=inner)), np.sqrt((want**2).sum(axis=inner))
         norms[name] = (float((off**2).sum()), float((size**2).sum()))
         each[name] = off[size > 0] / size[size > 0]
     out = error[~band].max(initial=0.0), int(band.size), int(band.sum()), error[band].max(initial=0.0)

@@ -41,9 +41,10 @@ class Gradients:
 
 
 def parameters(gaussians: Gaussians) -> dict[str, Float64]:
-    """The five arrays by name, in float64."""
+    """The five arrays by name, in float64; means in the world."""
     names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-    return {name: np.asarray(getattr(gaussians, name), np.float64) for name in names}
+    arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in names}
+    return {**arrays, "means": arrays["means"] + gaussians.origin}
 
 
 def forward(
