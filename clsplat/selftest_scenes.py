@@ -114,7 +114,8 @@ def _frozen(name: str, model: Gaussians, camera: Camera) -> Frozen:
 
 
 def _gaussians(*arrays: NDArray[np.float64]) -> Gaussians:
-    return Gaussians(*(np.ascontiguousarray(values, np.float32) for values in arrays))
+    means, quaternions, log_scales, opacity_logits, sh = (np.ascontiguousarray(values, np.float32) for values in arrays)
+    return Gaussians(means, quaternions, log_scales, opacity_logits, sh)
 
 
 def _rotation() -> NDArray[np.float64]:

@@ -330,7 +330,9 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
         if missing := [name for name in "xyz" if name not in kinds]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
         coloured = all(name in kinds for name in RGB)
-        parts = [(np.empty((0, 3)), np.empty((0, 3), np.float32))]
+        parts: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = [
+            (np.empty((0, 3)), np.empty((0, 3), np.float32))
+        ]
         for block in ply.read_vertices(file, header, path, "point"):
             points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
             colors = np.full(points.shape, 0.5, np.float32)

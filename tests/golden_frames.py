@@ -1,16 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checksums of frames and gradients of a few tiny scenes: `golden/frames.json`."""
+"""Frames and gradients of a few tiny scenes, and a trained model: checksums for `golden/frames.json`, and all of it for
+`tools/digests.py`."""
 
 from __future__ import annotations
 
 import zlib
+from pathlib import Path
 
 import numpy as np
 import scenes
 from numpy.typing import NDArray
 from pipeline import Pipeline, shaped
+from tiny import short, write_scene
 
 from clsplat.device.context import Device
+from clsplat.gaussians import Gaussians
+from clsplat.rendering import Renderer
+from clsplat.scene import load_scene
+from clsplat.training import train
+
+Array = NDArray[np.float32]
 
 LANES, ITEMS = 8, 1
 """The shape of the gradients: their sums, unlike a frame, depend on it."""
@@ -22,24 +31,43 @@ SCENES = {
 }
 
 
+def arrays_of(device: Device) -> dict[str, dict[str, list[Array]]]:
+    """By scene and name, in the device's own shape: all channels of the frame, the gradients of the parameters and of
+    the means on the image."""
+    return {name: _of(Pipeline.run(device, make())) for name, make in SCENES.items()}
+
+
 def checksums(device: Device) -> dict[str, dict[str, str]]:
-    """By scene and array."""
-    return {name: _of(Pipeline.run(shaped(device, LANES, ITEMS), make())) for name, make in SCENES.items()}
+    """By scene and array, in the golden shape."""
+    found = arrays_of(shaped(device, LANES, ITEMS))
+    return {scene: {name: checksum(parts) for name, parts in arrays.items()} for scene, arrays in found.items()}
 
 
-def _of(run: Pipeline) -> dict[str, str]:
+def _of(run: Pipeline) -> dict[str, list[Array]]:
     camera = run.camera
     d_image = np.random.default_rng(1).random((camera.height, camera.width, 3)) - 0.5
     gradients, screen = run.backward(d_image)
     names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-    arrays = {
+    return {
         "image": [run.frame.blended.image.get()],
         "transmittance": [run.frame.blended.transmittance.get()],
         "gradients": [getattr(gradients, name) for name in names],
         "screen": [screen[run.visible]],
     }
-    return {name: _checksum(parts) for name, parts in arrays.items()}
 
 
-def _checksum(parts: list[NDArray[np.float32]]) -> str:
+def checksum(parts: list[Array]) -> str:
     return f"{zlib.crc32(b''.join(part.tobytes() for part in parts)):08x}"
+
+
+TRAINING = short(iterations=60, density={"every": 10, "start": 10, "stop": 55, "opacity_reset_every": 30})
+"""Warm-up, SH degrees, five densifications and an opacity reset."""
+
+
+def trained(device: Device, folder: Path) -> tuple[Gaussians, float]:
+    """A model trained on the tiny scene, which is written to the folder, and its mean PSNR on the held-out views."""
+    scene = load_scene(folder if folder.exists() else write_scene(folder))
+    model = train(scene, TRAINING, device=device)
+    renderer = Renderer(device)
+    errors = [np.mean((renderer.render(model, view.camera).image - view.load()) ** 2) for view in scene.test_views]
+    return model, float(np.mean(-10 * np.log10(errors)))

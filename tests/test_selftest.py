@@ -259,7 +259,7 @@ def test_a_failure_is_an_error_and_not_remembered(
     untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(BREAK, "blend: before * alpha => before + alpha")
-    with pytest.raises(DeviceError, match="cannot be trusted: blend: image is off by .* clsplat selftest tells more"):
+    with pytest.raises(DeviceError, match=r"cannot be trusted: blend: image is off by .* clsplat selftest tells more"):
         trust.require(default_device, forward=True)
     assert not untrusting.exists()
     monkeypatch.setenv(trust.REGARDLESS, "1")

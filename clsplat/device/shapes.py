@@ -60,6 +60,8 @@ def default_shape(device: cl.Device) -> Shape:
     lanes = 16 if device.native_vector_width_float >= 16 else 8
     if _pocl_version(device) == (3, 0):
         lanes = 8  # its compiler aborts on some float16 built-ins
+    if device.platform.name.strip() == "rusticl":  # with vectors llvmpipe does not come back from the larger kernels
+        return Shape(lanes=1, items=64, chunks=4 * device.max_compute_units)
     return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units)
 
 

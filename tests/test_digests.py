@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""tools/digests.py: what it calls a problem. CI runs the whole of it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from compare import relative_error
+from golden_frames import SCENES, arrays_of
+from pipeline import shaped
+
+from clsplat.device.context import Device
+
+TOOLS = Path(__file__).resolve().parents[1] / "tools"
+sys.path.insert(0, str(TOOLS))
+import digests  # noqa: E402
+from digests import EXPECTED, Row, problems  # noqa: E402
+
+GOOD = Row("A", "8x1", "f", "g8", "m8", True, 20.0, 100)
+ROWS = [GOOD, replace(GOOD, driver="B"), Row("A", "1x64", "f", "g1", "m1", True, 20.1, 101, 5e-7)]
+
+
+def test_no_problem() -> None:
+    assert problems(ROWS) == []
+
+
+@pytest.mark.parametrize(
+    ("index", "change", "words"),
+    [
+        (1, {"frame": "x"}, "B, 8x1: the frame is x, on A, 8x1 it is f"),
+        (2, {"frame": "x"}, "A, 1x64: the frame is x"),
+        (1, {"gradient": "x"}, "B, 8x1: the gradient is x, on A in that shape it is g8"),
+        (2, {"difference": 2e-6}, "A, 1x64: the gradient is 2.0e-06 from that of 8x1"),
+        (2, {"difference": float("nan")}, "A, 1x64: the gradient is nan"),
+        (0, {"repeats": False}, "A, 8x1: two trainings gave two models"),
+        (1, {"model": "x"}, "B, 8x1: the model is x, on A in that shape it is m8"),
+        (2, {"psnr": 18.0}, "A, 1x64: the model has 18.00 dB, that of 8x1 20.00 dB"),
+        (2, {"trouble": "ended with status 1"}, "A, 1x64: ended with status 1"),
+    ],
+)
+def test_a_problem(index: int, change: dict[str, object], words: str) -> None:
+    rows = list(ROWS)
+    rows[index] = replace(rows[index], **change)  # type: ignore[arg-type]
+    assert any(text.startswith(words) for text in problems(rows))
+
+
+def test_a_failure_that_is_expected_has_to_fail() -> None:
+    driver, shape = next(iter(EXPECTED))
+    row = Row(driver, shape, "f", "g", trouble="known")
+    assert problems([*ROWS, row]) == []
+    assert "take it from EXPECTED" in problems([*ROWS, replace(row, trouble="", gradient="g1")])[0]
+
+
+def test_nothing_run() -> None:
+    assert problems([Row("A", "8x1", trouble="no")])[-1] == "nothing was run"
+
+
+def test_tables_have_every_driver() -> None:
+    rows = [*ROWS, Row(*next(iter(EXPECTED)), trouble="known")]
+    assert len(digests.table(rows).splitlines()) == 2 + len(rows)
+    assert "| 8x1 | A; B | `f` | `g8` | `m8`, 20.000 dB |" in digests.summary(rows).splitlines()
+
+
+def test_a_child(tmp_path: Path) -> None:
+    command = [sys.executable, str(TOOLS / "digests.py"), "child", "0", "8x1", str(tmp_path / "arrays.npz")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert set(told) == {"frame", "gradient"}
+    assert (tmp_path / "arrays.npz").exists()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 64), (4, 1), (8, 16), (16, 1)], ids=str)
+def test_gradients_of_two_shapes(shape: tuple[int, int], default_device: Device) -> None:
+    """The order of blending's sums is the shape's: of each parameter group within GRADIENT_BOUND, in norm."""
+    wanted, got = arrays_of(shaped(default_device, 8, 1)), arrays_of(shaped(default_device, *shape))
+    for scene in SCENES:
+        for name in ("gradients", "screen"):
+            for a, b in zip(got[scene][name], wanted[scene][name], strict=True):
+                assert 0 < relative_error(a, b) <= digests.GRADIENT_BOUND
