@@ -31,7 +31,7 @@ SCENES = {
 
 def moved(camera: Camera) -> Camera:
     """A step to the side, up and forward, and a little longer a lens."""
-    return replace(camera, translation=camera.translation + [-0.07, 0.03, -0.05], fx=1.02 * camera.fx)
+    return replace(camera, translation=camera.translation + np.array([-0.07, 0.03, -0.05]), fx=1.02 * camera.fx)
 
 
 def run(device: Device, scene: tuple[Gaussians, Camera], wanted: Features = ALL) -> dict[str, NDArray[np.float32]]:
@@ -132,7 +132,7 @@ def test_behind_the_other_camera(device: Device) -> None:
     gaussians, camera = scenes.one()
     pipeline = Pipeline.run(device, (gaussians, camera))
     rasterizer, frame = pipeline.rasterizer, pipeline.frame
-    passed = replace(camera, translation=camera.translation - [0.0, 0.0, 100.0])
+    passed = replace(camera, translation=camera.translation - np.array([0.0, 0.0, 100.0]))
     after = upload(rasterizer.device, pack_camera(passed))
     wanted = Features.of(("motion",))
     of = (pipeline.gaussians, frame.camera_array, after, frame.projected)
