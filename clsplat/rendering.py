@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,13 +13,14 @@ from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device, open_device
-from clsplat.device.layout import PLAIN_SLOTS, WIDEST_SLOTS, SlotFields
+from clsplat.device.layout import CAMERA, PLAIN_SLOTS, WIDEST_SLOTS, SlotFields
 from clsplat.device.switches import kernel_defines
 from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
 from clsplat.needs import plan_frame
 from clsplat.sh import check_half, coefficients_in_use, needed_degrees
 from clsplat.stages.blend import Blended, blend, blend_grad
+from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
 from clsplat.stages.duplicate import (
     MAX_PAIRS,
     Band,
@@ -137,6 +138,20 @@ class Rasterizer:
             return frame.part
         return self._part(frame.projected, band, tiles_of(frame.camera))
 
+    def channels(self, gaussians: AnyGaussians, frame: Frame, wanted: Features, after: DeviceArray) -> Channels:
+        """What the frame has beside colour; after: the packed camera that motion goes to."""
+        device, work, projected = self.device, self.work, frame.projected
+        rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected)
+        found = None
+        for band in frame.bands:
+            part = self.part(frame, band)
+            found = channels(
+                device, work, wanted, rows, part.lists, projected, frame.blended, frame.camera.height, band
+            )
+            del part  # as in `forward`
+        assert found is not None, "an image has a tile"
+        return found
+
     def _plan(self, projected: Projected, counted: Counted, tiles: tuple[int, int]) -> tuple[Band, ...]:
         if counted.pairs <= self.capacity:
             return (Band(0, tiles[0] * tiles[1]),)
@@ -216,6 +231,19 @@ class RenderResult:
     alpha: Float32
 
 
+@dataclass(frozen=True, eq=False)
+class ChannelResult:
+    """depth, median, first (H, W) float32, along the camera's axis; count, index (H, W) int32, index -1 for nothing;
+    fields: normal and position (H, W, 3), in the world, motion (H, W, 2), in pixels, those that were asked for."""
+
+    depth: Float32
+    fields: dict[str, Float32]
+    median: Float32
+    first: Float32
+    count: NDArray[np.int32]
+    index: NDArray[np.int32]
+
+
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
     """What the settings keep of the SH of a model that is held to be rendered. Raises InputError where a coefficient
     is more than a half holds."""
@@ -248,28 +276,69 @@ class Renderer:
         self._sh: tuple[Gaussians, ShStorage] | None = None
         self._held: AnyGaussians | None = None
         self._planned: tuple[object, ...] | None = None
+        self._after: DeviceArray | None = None
 
     def render(
         self, gaussians: Gaussians | AnyGaussians, camera: Camera, background: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> RenderResult:
         """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object."""
         on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
-        self._background.set(np.asarray(background, np.float32))
-        blended = self._rasterizer.forward(on_device, camera, self._background, backward=False).blended
+        return self._result(self._forward(on_device, camera, background))
+
+    def render_channels(
+        self,
+        gaussians: Gaussians | AnyGaussians,
+        camera: Camera,
+        wanted: Iterable[str] = (),
+        *,
+        after: Camera | None = None,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> tuple[RenderResult, ChannelResult]:
+        """As `render`, with what the view has beside colour (docs/channels.md).
+
+        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None.
+        """
+        of = Features.of(wanted)
+        on_device = self._hold(gaussians, camera, of.floats) if isinstance(gaussians, Gaussians) else gaussians
+        frame = self._forward(on_device, camera, background)
+        if self._after is None:
+            self._after = allocate(self.device, (len(CAMERA),), np.float32)
+        self._after.set(pack_camera(after or camera))
+        found = self._rasterizer.channels(on_device, frame, of, self._after)
         height, width = camera.height, camera.width
-        planes = blended.image.get()[:, :height, :width]
-        alpha: Float32 = np.float32(1) - blended.transmittance.get()[:height, :width]
+        means, whole = (
+            np.ascontiguousarray(array.get()[:, :height, :width].transpose(1, 2, 0))
+            for array in (found.means, found.whole)
+        )
+        fields = {name: means[:, :, at : at + WIDTHS[name]] for name, at in of.offsets.items()}
+        return self._result(frame), ChannelResult(
+            depth=fields.pop("depth")[:, :, 0],
+            fields=fields,
+            median=means[:, :, -2],
+            first=means[:, :, -1],
+            count=whole[:, :, 0],
+            index=whole[:, :, 1],
+        )
+
+    def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:
+        self._background.set(np.asarray(background, np.float32))
+        return self._rasterizer.forward(gaussians, camera, self._background, backward=False)
+
+    def _result(self, frame: Frame) -> RenderResult:
+        height, width = frame.camera.height, frame.camera.width
+        planes = frame.blended.image.get()[:, :height, :width]
+        alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(planes.transpose(1, 2, 0)), alpha)
 
-    def _hold(self, gaussians: Gaussians, camera: Camera) -> AnyGaussians:
+    def _hold(self, gaussians: Gaussians, camera: Camera, features: int = 0) -> AnyGaussians:
         """The model on the device, or on the host if a frame of this size leaves too little room for it."""
         if self._sh is None or self._sh[0] is not gaussians:
             self._sh = self._held = None
             self._sh = (gaussians, held_sh(gaussians, self._rasterizer.config))
         sh = self._sh[1]
-        asked = (len(gaussians), sh.floats, camera.width, camera.height)
+        asked = (len(gaussians), sh.floats, camera.width, camera.height, features)
         if self._planned != asked:
-            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, self._rasterizer.config)
+            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, self._rasterizer.config, features)
             self._rasterizer.follow(plan)
             if plan.streamed or isinstance(self._held, HostGaussians):
                 self._held = None

@@ -15,7 +15,7 @@ from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
 from clsplat.stages.blend import Blended, tile_items
 from clsplat.stages.duplicate import Band
-from clsplat.stages.project import DeviceGaussians, Projected
+from clsplat.stages.project import AnyGaussians, Projected, parts
 from clsplat.stages.ranges import TileLists
 
 WIDTHS = {"depth": 1, "normal": 3, "position": 3, "motion": 2}
@@ -71,28 +71,29 @@ def features(
     device: Device,
     work: Workspace,
     wanted: Features,
-    gaussians: DeviceGaussians,
+    gaussians: AnyGaussians,
     camera_array: DeviceArray,
     after: DeviceArray,
     projected: Projected,
 ) -> DeviceArray:
     """Of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to."""
-    n = gaussians.count
-    rows = work.array("features", (n, wanted.floats))
-    launch_items(
-        device,
-        device.kernels("features", LANES=1, **wanted.defines).features,
-        n,
-        n,
-        camera_array,
-        after,
-        projected.tile_counts,
-        gaussians["means"],
-        gaussians["quaternions"],
-        gaussians["log_scales"],
-        projected.splats,
-        rows,
-    )
+    rows = work.array("features", (gaussians.count, wanted.floats))
+    for start, stop, (part,) in parts(work, gaussians):
+        own = projected.rows(start, stop)
+        launch_items(
+            device,
+            device.kernels("features", LANES=1, **wanted.defines).features,
+            part.count,
+            part.count,
+            camera_array,
+            after,
+            own.tile_counts,
+            part["means"],
+            part["quaternions"],
+            part["log_scales"],
+            own.splats,
+            rows.rows(start, stop),
+        )
     return rows
 
 
