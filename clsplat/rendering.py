@@ -51,6 +51,8 @@ from clsplat.stages.project import (
 from clsplat.stages.ranges import TileLists, tile_lists
 
 Float32 = NDArray[np.float32]
+PROJECTION_DEFINES: dict[str, dict[str, object]] = {"equirectangular": {"RAYS": 1}, "fisheye": {"RAYS": 2}}
+"""What the kernels are built with for a camera that has no image plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +99,11 @@ class Rasterizer:
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
-        self.device = device.with_switches(kernel_defines(self.config))
+        switches = kernel_defines(self.config)
+        self.device = device.with_switches(switches)
+        self._by_projection = {
+            name: device.with_switches({**switches, **defines}) for name, defines in PROJECTION_DEFINES.items()
+        }
         self.work = work or Workspace(device)
         self._all_bits = self.config.key_bits == "all"
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS)
@@ -116,19 +122,29 @@ class Rasterizer:
 
         backward: whether the gradient will be asked for; what only that needs is left out else.
         """
-        device, work = self.device, self.work
+        device, work = self.device_of(camera), self.work
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
         camera_array.set(pack)
         projected = project(device, work, gaussians, camera, camera_array)
         counted = count(device, work, projected.splats, projected.tile_counts, projected.shown, all_bits=self._all_bits)
-        bands = self._plan(projected, counted, tiles_of(camera))
+        bands = self._plan(device, projected, counted, tiles_of(camera))
         part = None
         for band in bands:
             del part  # its arrays may have to make room for larger ones
-            part = self._part(projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
+            part = self._part(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
             size = (camera.width, camera.height)
             record = backward and len(bands) == 1 and self.config.record_cells
-            blended = blend(device, work, part.lists, projected.splats, background, *size, band, record=record)
+            blended = blend(
+                device,
+                work,
+                part.lists,
+                projected.splats,
+                background,
+                *size,
+                band,
+                record=record,
+                camera_array=camera_array,
+            )
         assert part is not None, "an image has a tile"
         return Frame(camera, camera_array, background, projected, bands, part, blended)
 
@@ -136,29 +152,49 @@ class Rasterizer:
         """What the band lists; where there are several bands it takes the memory of the one before."""
         if len(frame.bands) == 1:
             return frame.part
-        return self._part(frame.projected, band, tiles_of(frame.camera))
+        return self._part(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
     def channels(self, gaussians: AnyGaussians, frame: Frame, wanted: Features, after: DeviceArray) -> Channels:
         """What the frame has beside colour; after: the packed camera that motion goes to."""
-        device, work, projected = self.device, self.work, frame.projected
+        device, work, projected = self.device_of(frame.camera), self.work, frame.projected
         rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected)
         found = None
         for band in frame.bands:
             part = self.part(frame, band)
             found = channels(
-                device, work, wanted, rows, part.lists, projected, frame.blended, frame.camera.height, band
+                device,
+                work,
+                wanted,
+                rows,
+                part.lists,
+                projected,
+                frame.blended,
+                frame.camera.height,
+                band,
+                frame.camera_array,
             )
             del part  # as in `forward`
         assert found is not None, "an image has a tile"
         return found
 
-    def _plan(self, projected: Projected, counted: Counted, tiles: tuple[int, int]) -> tuple[Band, ...]:
+    def device_of(self, camera: Camera) -> Device:
+        """The device with the switches that the camera's projection wants of the kernels."""
+        return self._by_projection.get(camera.projection, self.device)
+
+    def _plan(self, device: Device, projected: Projected, counted: Counted, tiles: tuple[int, int]) -> tuple[Band, ...]:
         if counted.pairs <= self.capacity:
             return (Band(0, tiles[0] * tiles[1]),)
-        return plan_bands(self.device, self.work, projected, tiles, self.capacity)
+        return plan_bands(device, self.work, projected, tiles, self.capacity)
 
-    def _part(self, projected: Projected, band: Band, tiles: tuple[int, int], counted: Counted | None = None) -> Part:
-        device, work = self.device, self.work
+    def _part(
+        self,
+        device: Device,
+        projected: Projected,
+        band: Band,
+        tiles: tuple[int, int],
+        counted: Counted | None = None,
+    ) -> Part:
+        work = self.work
         counted = counted or count_band(device, work, projected, tiles, band, all_bits=self._all_bits)
         listing = duplicate_and_sort if self.config.depth_sort == "pairs" else duplicate
         pairs = listing(device, work, projected.splats, counted, tiles, band)

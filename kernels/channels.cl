@@ -20,7 +20,11 @@
 GROUP __kernel void channels(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
                              __global const uint *gaussian_from_sorted, __global const float *splats,
                              __global const float *features, __global const int *stops, __global float *planes,
-                             __global int *whole) {
+                             __global int *whole
+#ifdef RAYS
+                             , __constant float *camera
+#endif
+) {
 #if ITEMS > 1
   __local int group_last;
 #endif
@@ -31,6 +35,7 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
 
   PIXEL_TABLES
+  RAY_TABLES
   floatL t[OWNED], sums[FEATURES + 1][OWNED], median[OWNED], nearest[OWNED], largest[OWNED];
   intL stop[OWNED], count[OWNED], heaviest[OWNED];
   int last = begin;
@@ -58,15 +63,12 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
     PREFETCH(features + (size_t)FEATURES * gaussian_from_sorted[i + AHEAD < last ? i + AHEAD : last - 1]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian;
     __global const float *own = features + (size_t)FEATURES * gaussian;
-    const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
-    const float log2o = splat[SPLAT_LOG2O], depth = splat[SPLAT_DEPTH];
-    const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
+    SPLAT_HERE(splat)
+    const float depth = splat[SPLAT_DEPTH];
     const Reach reach = reach_of(splat, tile_x, tile_y);
     FOR_CELLS(cell, reach) {
       const int k = cell / ITEMS;
-      const floatL dy = my - AT_Y(cell);
-      const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy);
-      const floatL power = log2_alpha(u, l22 * dy, log2o);
+      const floatL power = LOG2_ALPHA(splat, cell, k);
       const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
       if (ANYL(taken)) {
         const floatL before = t[k];

@@ -108,8 +108,10 @@ def channels(
     blended: Blended,
     height: int,
     band: Band | None = None,
+    camera_array: DeviceArray | None = None,
 ) -> Channels:
-    """Blend the features with the weights of `blended`, which is of the same lists; the band's tiles, or all."""
+    """Blend the features with the weights of `blended`, which is of the same lists; the band's tiles, or all.
+    camera_array: for pixels that are rays."""
     plane_rows, stride = blended.stops.shape
     means = work.array("channel_means", (wanted.floats + 2, plane_rows, stride))
     whole = work.array("channel_whole", (2, plane_rows, stride), np.int32)
@@ -129,5 +131,6 @@ def channels(
         blended.stops,
         means,
         whole,
+        *([camera_array] if device.switched("RAYS") else []),
     )
     return Channels(wanted, means, whole)

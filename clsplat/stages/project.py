@@ -273,9 +273,15 @@ def project(
     tile_counts = work.array("tile_counts", (n,), np.uint32)
     tiles_x, tiles_y = tiles_of(camera)
     keeps_culled = device.switched("NO_FRUSTUM_CULL", "NO_OPACITY_CULL")
+    rays = device.switched("RAYS")
+    if rays:
+        keeps_culled = False  # project_rays has no such switches
     projected = Projected(splats, tile_counts, work.array("shown", (n,), np.uint32) if keeps_culled else None)
     for start, stop, (part,) in parts(work, gaussians):
         out = projected.rows(start, stop)
+        if rays:
+            _project_rays(device, part, camera, camera_array, out)
+            continue
         extras = [name for name in ("sh_degrees", "sh_cache") if name in part.arrays]
         defines = {name.upper(): True for name in extras}
         if part["sh_rest"].dtype == np.float16:
@@ -296,6 +302,28 @@ def project(
             *(part[name] for name in extras),
         )
     return projected
+
+
+def _project_rays(
+    device: Device, part: DeviceGaussians, camera: Camera, camera_array: DeviceArray, out: Projected
+) -> None:
+    defines: dict[str, object] = {"SH_DEGREES": True} if "sh_degrees" in part.arrays else {}
+    if part["sh_rest"].dtype == np.float16:
+        defines["SH_HALF"] = True
+    launch_items(
+        device,
+        device.kernels("project_rays", LANES=1, **defines).project_rays,
+        part.count,
+        part.count,
+        part.coefficients,
+        camera.width,
+        camera.height,
+        camera_array,
+        *(part[group] for group in GROUPS),
+        out.splats,
+        out.tile_counts,
+        *([part["sh_degrees"]] if "sh_degrees" in part.arrays else []),
+    )
 
 
 @dataclass(frozen=True, eq=False)
