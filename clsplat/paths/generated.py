@@ -21,8 +21,8 @@ PathName = Literal["turntable", "spiral", "through"]
 SPIRAL_TURNS = 2
 STEEPEST = np.deg2rad(85.0)
 """Elevations that a spiral keeps below: straight up and down, a level camera does not know where its right is."""
-SMOOTHING = np.array([1.0, 4.0, 6.0, 4.0, 1.0])
-"""Weights of a camera and of two neighbours on each side, for what a hand does between two photographs."""
+REACH = 3
+"""Neighbours on each side that a camera is smoothed with, for what a hand does between two photographs."""
 
 
 def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -73,9 +73,10 @@ def _between(values: Float64, wave: Float64) -> Float64:
 def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """From the first camera to the last in their order, smoothed, at an even speed, with the first one's intrinsics.
 
-    Positions and rotations are weighted means over two neighbours on each side (fewer towards the ends, which stay
-    where they are); a spline goes through these. Speed counts distances and angles, each in steps of the median camera,
-    so a camera that only turns takes its time as well. Raises ValueError for no cameras or no frames.
+    Positions and rotations are those of a parabola fitted to a camera and three neighbours on each side (fewer towards
+    the ends, which stay where they are), which keeps an arc where it is; a spline goes through these. Speed counts
+    distances and angles, each in steps of the median camera, so a camera that only turns takes its time as well. Raises
+    ValueError for no cameras or no frames.
     """
     if not cameras or frames < 1:
         raise ValueError(f"a path of {frames} frames through {len(cameras)} cameras: expected at least one of each")
@@ -101,15 +102,22 @@ def _in_medians(lengths: Float64) -> Float64:
 def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:
     positions = np.stack([camera.position for camera in cameras])
     rotations = Rotation.from_matrix(np.stack([camera.rotation.T for camera in cameras]))
-    middle = len(SMOOTHING) // 2
     smooth = []
     for index in range(len(cameras)):
-        reach = min(middle, index, len(cameras) - 1 - index)
-        near, weights = slice(index - reach, index + reach + 1), SMOOTHING[middle - reach : middle + reach + 1]
-        position = weights @ positions[near] / weights.sum()
-        rotation = rotations[near].mean(weights).inv().as_matrix()
-        smooth.append(replace(cameras[0], rotation=rotation, translation=-rotation @ position))
+        reach = min(REACH, index, len(cameras) - 1 - index)
+        near, weights = slice(index - reach, index + reach + 1), parabola_weights(reach)
+        turns = (rotations[index].inv() * rotations[near]).as_rotvec()
+        rotation = (rotations[index] * Rotation.from_rotvec(weights @ turns)).inv().as_matrix()
+        smooth.append(replace(cameras[0], rotation=rotation, translation=-rotation @ (weights @ positions[near])))
     return smooth
+
+
+def parabola_weights(reach: int) -> Float64:
+    """Weights (2 reach + 1,) of evenly spaced values in the middle of the parabola nearest to them (Savitzky and Golay
+    1964)."""
+    offsets = np.arange(-reach, reach + 1)
+    scale = 3 / ((2 * reach + 3) * (2 * reach + 1) * (2 * reach - 1))
+    return np.asarray(scale * (3 * reach * reach + 3 * reach - 1 - 5 * offsets**2))
 
 
 PATHS: dict[str, Callable[[Sequence[Camera], int], list[Camera]]] = {
