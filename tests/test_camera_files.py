@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 from clsplat.errors import InputError
 from clsplat.images import write_image
 from clsplat.paths import choose_shot, read_shot
+from clsplat.paths.keyed import FILE, KEY
 from clsplat.reference.cameras import cam_from_pixel
 from clsplat.stages.project import pack_camera
 
@@ -302,6 +304,21 @@ def test_a_far_plane_is_told_of(tmp_path: Path) -> None:
     path = write(tmp_path / "shot.json", own(far=20))
     assert choose_shot(path).warnings == (f"{path}: its far plane (20) is not applied",)
     assert choose_shot(write(path, own())).warnings == ()
+
+
+def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "cameras.md").read_text()
+    blocks = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    shots = []
+    for block in blocks:
+        (tmp_path / "example.json").write_text(block)
+        shots.append(read_shot(tmp_path / "example.json"))
+    assert [[len(shot.frames), shot.frames[0].number] for shot in shots] == [[1, 1], [1, 1], [73, 1001]]
+    for shot in shots:  # each looks from y = -4 along +y, the world's z up
+        np.testing.assert_allclose(shot.cameras[0].position[:2], [0, -4])
+        np.testing.assert_allclose(shot.cameras[0].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-8)
+    for name in (*FILE, *KEY):
+        assert f"`{name}`" in text, name
 
 
 def test_the_kernels_refuse_what_they_do_not_have(tmp_path: Path) -> None:

@@ -164,6 +164,23 @@ def test_stages_that_cannot_be(stage: Path, old: str, new: str, message: str) ->
     assert "\n" not in str(caught.value)
 
 
+def test_what_usd_warns_of_is_a_line(stage: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    stage.write_text(STAGE + 'def "gone" (references = @nowhere.usda@</x>)\n{\n}\n')
+    (warning,) = read_shot(stage, size=(100, None)).warnings
+    assert warning.startswith(f"{stage}: USD says: In </gone>: Could not open asset @nowhere.usda@")
+    assert "0x" not in warning
+    assert capfd.readouterr().err == ""
+
+
+def test_the_example_of_the_documentation(stage: Path) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "cameras.md").read_text()
+    stage.write_text(text[text.index("#usda") : text.index("```", text.index("#usda"))])
+    shot = read_shot(stage, size=(1920, None))
+    assert (len(shot.frames), shot.frames[0].number, shot.cameras[0].height) == (48, 1001, 1080)
+    np.testing.assert_allclose(shot.cameras[0].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-7)
+    assert shot.cameras[0].cx == pytest.approx(960 - 96)
+
+
 def test_a_stage_without_a_size(stage: Path) -> None:
     with pytest.raises(InputError, match=r"a USD camera has no size in pixels, expected --width or --height"):
         read_shot(stage)

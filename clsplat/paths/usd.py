@@ -25,32 +25,39 @@ ORTHOGRAPHIC_UNIT = 0.1
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
     """The frames of a stage's camera, from its start time code to its end, or the samples' where it has no range.
 
-    size: width and height in pixels; one follows from the other by the aperture; if neither is given they are the
-    stage's render settings'. The horizontal aperture fills the width, pixels are square. prim: path or name of the
-    camera, if the stage has several. Raises InputError for a stage that cannot be opened or has no such camera, no
-    size, or values that cannot be; and where usd-core is not installed.
+    size: width and height in pixels; one follows from the other by the first frame's aperture; if neither is given
+    they are the stage's render settings'. The horizontal aperture fills the width, pixels are square. prim: path or
+    name of the camera, if the stage has several. What USD warns of becomes the shot's warnings. Raises InputError for a
+    stage that cannot be opened or has no such camera, no size, or values that cannot be; and where usd-core is not
+    installed.
     """
     try:
-        from pxr import Tf, Usd, UsdGeom
+        from pxr import Tf, Usd, UsdGeom, UsdUtils
     except ImportError:
         raise InputError(f"{path}: USD needs usd-core, expected it installed: pip install 'clsplat[usd]'") from None
     if not path.is_file():
         raise InputError(f"{path}: no such file, expected a USD stage")
+    # takes what USD would print: a layer that does not resolve may have nothing to do with the camera
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise InputError(f"{path}: is no USD stage that can be opened: {' '.join(str(error).split())[:200]}") from None
+    except Tf.ErrorException:
+        raise InputError(
+            f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more"
+        ) from None
     camera = _find(path, [UsdGeom.Camera(each) for each in stage.Traverse() if each.IsA(UsdGeom.Camera)], prim)
     where = f"{path}: {camera.GetPath()}"
     codes = _time_codes(where, stage, camera)
-    aspects = {_aspect(where, camera, code) for code in codes}
-    width, height = _size(path, stage, size, aspects)
+    horizontal, vertical = _aperture(where, camera, codes[0])
+    width, height = _size(path, stage, size, horizontal / vertical)
     start, per_second = codes[0], float(stage.GetTimeCodesPerSecond())
     frames = []
     for code in codes:
         time = None if len(codes) == 1 or per_second <= 0 else (code - start) / per_second
         frames.append(Frame(code, _camera(f"{where} at {code}", camera, code, width, height), f"{code:04d}", time))
-    return Shot(tuple(frames))
+    # without the end of the line, where USD has the stage's address in memory
+    told = [each.commentary.split(" (instantiating")[0] for each in diagnostics.TakeUncoalescedDiagnostics()]
+    return Shot(tuple(frames), tuple(f"{path}: USD says: {' '.join(line.split())}" for line in told[:3]))
 
 
 def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:
@@ -107,16 +114,16 @@ def _number(where: str, attribute: Any, code: int) -> float:
     return float(value)
 
 
-def _aspect(where: str, camera: Any, code: int) -> float:
-    """Width over height of the aperture."""
+def _aperture(where: str, camera: Any, code: int) -> tuple[float, float]:
+    """Its width and height."""
     horizontal = _number(where, camera.GetHorizontalApertureAttr(), code)
     vertical = _number(where, camera.GetVerticalApertureAttr(), code)
     if not (horizontal > 0 and vertical > 0):
         raise InputError(f"{where}: aperture {horizontal:g} x {vertical:g}, expected both above 0")
-    return horizontal / vertical
+    return horizontal, vertical
 
 
-def _size(path: Path, stage: Any, size: tuple[int | None, int | None], aspects: set[float]) -> tuple[int, int]:
+def _size(path: Path, stage: Any, size: tuple[int | None, int | None], aspect: float) -> tuple[int, int]:
     from pxr import UsdRender
 
     width, height = size
@@ -126,12 +133,8 @@ def _size(path: Path, stage: Any, size: tuple[int | None, int | None], aspects: 
         if attribute is None or not attribute.HasAuthoredValue():
             raise InputError(f"{path}: a USD camera has no size in pixels, expected --width or --height")
         width, height = (int(side) for side in attribute.Get())
-    aspect = min(
-        aspects
-    )  # the aperture's shape hardly ever moves; then the height of the first frames is as good as any
     if width is None:
-        assert height is not None
-        width = max(1, round(height * aspect))
+        width = max(1, round((height or 0) * aspect))
     if height is None:
         height = max(1, round(width / aspect))
     if not (width > 0 and height > 0):
@@ -145,7 +148,7 @@ def _camera(where: str, camera: Any, code: int, width: int, height: int) -> Came
     # USD's vectors are rows, so its matrices are the transposes of ours
     matrix = np.array(camera.ComputeLocalToWorldTransform(code), np.float64).T
     rotation, translation, scale = opengl_pose(matrix, where, "transform")
-    aperture = _number(where, camera.GetHorizontalApertureAttr(), code)
+    aperture, _ = _aperture(where, camera, code)
     focal = _number(where, camera.GetFocalLengthAttr(), code)
     right = _number(where, camera.GetHorizontalApertureOffsetAttr(), code)
     up = _number(where, camera.GetVerticalApertureOffsetAttr(), code)
