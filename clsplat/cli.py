@@ -138,15 +138,27 @@ class Eval:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a model from the cameras of a COLMAP model, an image for each of its images."""
+    """Render a model from the cameras of a file or along a path made from them, an image for each frame."""
 
     model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
     """A run's folder or a model file."""
-    cameras: Annotated[Path, arg(metavar="SPARSE_DIR")]
-    """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one."""
+    cameras: Annotated[Path, arg(metavar="PATH")]
+    """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
+    nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
-    """Where the images go, such as 'out/{name}.exr'; .png files have 8 bits, .exr files floats.
-    {name} is the image's name without its extension, sub-folders included."""
+    """Where the images go, such as 'out/{name}.exr' or 'shot/beauty.####.exr'; .png files have 8 bits, .exr files
+    floats. {name} is the image's name without its extension, sub-folders included, or else the frame's number; ####,
+    %04d and {frame} are the frame's number."""
+    path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
+    """A path made from the cameras, in place of the cameras themselves: around what they look at, the same twice while
+    rising and sinking, or through them in their order, smoothed. Its frames count from 1."""
+    count: Annotated[int | None, arg(metavar="INT")] = None
+    """Frames of the path; 120 if not given."""
+    frames: Annotated[str | None, arg(metavar="1-100,200-300:2,...")] = None
+    """Render these frames only; all if not given. Ranges may have a step. Write --frames=-5-10 if it begins with a
+    negative number."""
+    usd_camera: Annotated[str | None, arg(metavar="PRIM")] = None
+    """Path or name of the camera, for a USD stage that has several."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     alpha: Flag = False

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat.cli import Bench, Demo, Devices, Eval, Render, Sfm, Train, Tune, Verb
 from clsplat.errors import DeviceError, InputError
+from clsplat.frames import output_paths
 from clsplat.memory import Plan, parse_bytes
 
 if TYPE_CHECKING:
@@ -229,9 +230,9 @@ def evaluate(verb: Eval) -> int:
 
 def render(verb: Render) -> int:
     """Model and cameras to images. All names and sizes are checked before the first is rendered."""
-    from clsplat.colmap import read_cameras
     from clsplat.device.context import open_device
     from clsplat.images import write_image
+    from clsplat.paths import choose_shot
     from clsplat.rendering import Renderer
 
     extension = PurePosixPath(verb.output).suffix.lower()
@@ -243,26 +244,32 @@ def render(verb: Render) -> int:
     verb.rasterizer.check()
     limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
-    if not verb.cameras.is_dir():
-        raise InputError(f"{verb.cameras}: no such folder, expected a COLMAP model (cameras and images, bin or txt)")
-    cameras = {name: resize(camera) for name, camera in read_cameras(verb.cameras).items()}
-    if not cameras:
-        raise InputError(f"{verb.cameras}: has no images, expected at least one")
-    paths = output_paths(verb.output, list(cameras))
+    shot = choose_shot(
+        verb.cameras,
+        path=verb.path,
+        count=verb.count,
+        frames=verb.frames,
+        size=(verb.width, verb.height),
+        usd_camera=verb.usd_camera,
+    )
+    shot.require_perspective()
+    paths = output_paths(verb.output, [(frame.number, frame.name) for frame in shot.frames])
+    for warning in shot.warnings:
+        print(f"clsplat: warning: {warning}", file=sys.stderr)
     gaussians = _load_model(verb.model)
     renderer = Renderer(open_device(verb.device, limit), config=verb.rasterizer)
 
     written = []
-    for name, camera in cameras.items():
+    for frame, path in zip(shot.frames, paths, strict=True):
         start = time.monotonic()
+        camera = resize(frame.camera)
         result = renderer.render(gaussians, camera, background)
-        path = paths[name]
         path.parent.mkdir(parents=True, exist_ok=True)
         image = with_alpha(result.image, result.alpha) if verb.alpha else result.image
         write_image(path, image, alpha="associated")
         seconds = time.monotonic() - start
-        record = {"name": name, "path": str(path), "width": camera.width, "height": camera.height, "seconds": seconds}
-        written.append(record)
+        size = {"width": camera.width, "height": camera.height}
+        written.append({"name": frame.name, "frame": frame.number, "path": str(path), **size, "seconds": seconds})
         if not verb.json:
             print(f"{path}  {camera.width}x{camera.height}  {seconds:.2f} s")
     if verb.json:
@@ -361,24 +368,6 @@ def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Ca
         return camera.resized(max(1, across), max(1, down))
 
     return resize
-
-
-def output_paths(pattern: str, names: list[str]) -> dict[str, Path]:
-    """The file of every image name. Raises InputError where two would be one, or one would leave the folder."""
-    if "{name}" not in pattern and len(names) > 1:
-        raise InputError(f"{pattern}: has no {{name}} in it, expected one to tell {len(names)} cameras apart")
-    paths: dict[str, Path] = {}
-    taken: dict[Path, str] = {}
-    for name in names:
-        pure = PurePosixPath(name)
-        if pure.is_absolute() or ".." in pure.parts:
-            raise InputError(f"image name {name!r} leads out of the output folder")
-        path = Path(pattern.replace("{name}", str(pure.with_suffix(""))))
-        if path in taken:
-            raise InputError(f"{path}: would be both {taken[path]} and {name}")
-        taken[path] = name
-        paths[name] = path
-    return paths
 
 
 def _load_model(path: Path) -> Gaussians:

@@ -16,6 +16,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.layout import CAMERA, PLAIN_SLOTS, SPLAT, TILE, SlotFields
 from clsplat.device.profile import stage
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
@@ -220,7 +221,12 @@ def download_gaussians(gaussians: AnyGaussians) -> Gaussians:
 
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
-    """A camera in the order of `layout.CAMERA`: its values rounded to float32, and as _LOW what that left of them."""
+    """A camera in the order of `layout.CAMERA`: its values rounded to float32, and as _LOW what that left of them.
+
+    Raises InputError for a projection that the kernels do not have.
+    """
+    if camera.projection != "perspective":
+        raise InputError(f"{camera.projection} cameras are not rendered yet, expected a perspective one")
     half_w, half_h = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
     values = {
         "FX": camera.fx,
