@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device, open_device
 from clsplat.device.layout import CAMERA, PLAIN_SLOTS, WIDEST_SLOTS, SlotFields
 from clsplat.device.switches import kernel_defines
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
 from clsplat.needs import plan_frame
@@ -325,15 +326,18 @@ class Renderer:
         self,
         gaussians: Gaussians | AnyGaussians,
         camera: Camera,
-        wanted: Iterable[str] = (),
+        wanted: Collection[str] = (),
         *,
         after: Camera | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> tuple[RenderResult, ChannelResult]:
         """As `render`, with what the view has beside colour (docs/channels.md).
 
-        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None.
+        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None. Raises
+        InputError for motion of a camera without an image plane.
         """
+        if "motion" in wanted and camera.projection in PROJECTION_DEFINES:
+            raise InputError(f"motion is not defined for {camera.projection} cameras")
         of = Features.of(wanted)
         on_device = self._hold(gaussians, camera, of.floats) if isinstance(gaussians, Gaussians) else gaussians
         frame = self._forward(on_device, camera, background)

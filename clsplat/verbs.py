@@ -252,7 +252,7 @@ def render(verb: Render) -> int:
         size=(verb.width, verb.height),
         usd_camera=verb.usd_camera,
     )
-    shot.require_perspective()
+    shot.check()
     paths = output_paths(verb.output, [(frame.number, frame.name) for frame in shot.frames])
     for warning in shot.warnings:
         print(f"clsplat: warning: {warning}", file=sys.stderr)

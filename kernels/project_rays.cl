@@ -1,4 +1,4 @@
-// Projection for equirectangular (RAYS == 1) and fisheye (RAYS == 2) cameras (docs/cameras.md, equations 50 to 57): each
+// Projection for equirectangular (RAYS == 1) and fisheye (RAYS == 2) cameras (docs/cameras.md, equations 8 to 14): each
 // Gaussian to its ellipse on the plane that touches the sphere of directions at its mean's, where perspective bends it
 // least; there is no pole and no seam. Built with one lane: its bits are those of any shape.
 #include "shared/math.h"
@@ -39,7 +39,7 @@ typedef struct {
   int whole_rows;     // the box goes all the way round
 } Tangent;
 
-// (52): f: the direction; reach: of the ellipse on the tangent plane, filled in by box_of.
+// (10): f: the direction; reach: of the ellipse on the tangent plane, filled in by box_of.
 static inline void tangent_of(const float *f, __constant float *camera, Tangent *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
 #if RAYS == 1
@@ -175,7 +175,7 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
   Tangent t;
   tangent_of(f, camera, &t);
 
-  // (53), (54): M = e A S / distance, and the low-pass as two columns more; the determinant by its minors.
+  // (11), (12): M = e A S / distance, and the low-pass as two columns more; the determinant by its minors.
   __global const float *raw = quaternions + 4 * i;
   float norm2 = 0.0f, q[4], r[9], m1[5], m2[5];
   for (int k = 0; k < 4; ++k) norm2 = fma1(raw[k], raw[k], norm2);

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -296,8 +297,9 @@ def test_paths_made_of_cameras(tmp_path: Path) -> None:
     fisheye = write(tmp_path / "f.json", camera_path(camera_type="fisheye"))
     with pytest.raises(InputError, match="its cameras are fisheye, --path needs perspective"):
         choose_shot(fisheye, path="turntable")
-    with pytest.raises(InputError, match="frame 1: fisheye cameras are not rendered yet"):
-        choose_shot(fisheye).require_perspective()
+    choose_shot(fisheye).check()
+    with pytest.raises(InputError, match="--channels motion: frame 1 is fisheye, expected a perspective camera"):
+        choose_shot(fisheye).check(["rgb", "motion"])
 
 
 def test_a_far_plane_is_told_of(tmp_path: Path) -> None:
@@ -322,7 +324,10 @@ def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
 
 
 def test_the_kernels_refuse_what_they_do_not_have(tmp_path: Path) -> None:
-    view = first(tmp_path, projection="fisheye")
-    with pytest.raises(InputError, match="fisheye cameras are not rendered yet, expected a perspective one"):
-        pack_camera(view)
+    with pytest.raises(InputError, match="orthographic cameras are not rendered yet, expected another projection"):
+        pack_camera(replace(first(tmp_path), projection="orthographic"))
+    panorama = first(tmp_path, projection="equirectangular", fov_x=360)
+    pack_camera(panorama)
+    with pytest.raises(InputError, match=r"of which 60\.0 are a whole turn: expected no more"):
+        pack_camera(replace(panorama, width=64, fx=60 / (2 * np.pi)))
     pack_camera(first(tmp_path))

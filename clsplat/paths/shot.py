@@ -55,12 +55,14 @@ class Shot:
             warnings += (f"--frames {text}: {len(missing)} of these frames do not exist; {have}",)
         return Shot(tuple(frame for frame in self.frames if frame.number in asked), warnings)
 
-    def require_perspective(self) -> None:
-        """Raises InputError for a frame of another projection, which is defined but not rendered yet."""
+    def check(self, channels: Iterable[str] = ()) -> None:
+        """Raises InputError for a frame whose projection is not rendered, or not with these channels."""
         for frame in self.frames:
-            if frame.camera.projection != "perspective":
-                kind = frame.camera.projection
+            kind = frame.camera.projection
+            if kind == "orthographic":
                 raise InputError(f"frame {frame.number}: {kind} cameras are not rendered yet, expected perspective")
+            if kind != "perspective" and "motion" in channels:
+                raise InputError(f"--channels motion: frame {frame.number} is {kind}, expected a perspective camera")
 
     def at(self, frame: float) -> Camera:
         """The camera at a frame that need not be whole, such as within a shutter's time: interpolated as keys are."""

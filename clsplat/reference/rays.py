@@ -47,7 +47,7 @@ class Picture:
 
 
 def footprints(directions: Float64, camera: Camera) -> tuple[Float64, Float64, Float64]:
-    """(51), (52): right, down (N, 3) and what a pixel is on the tangent plane, (N, 2, 2), columns by u and v."""
+    """(9), (10): right, down (N, 3) and what a pixel is on the tangent plane, (N, 2, 2), columns by u and v."""
     x, y, z = directions.T
     zero = np.zeros_like(x)
     pixels = np.zeros((len(x), 2, 2))
@@ -71,7 +71,7 @@ def footprints(directions: Float64, camera: Camera) -> tuple[Float64, Float64, F
 
 
 def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
-    """(50) to (55)."""
+    """(8) to (13)."""
     arrays = parameters(gaussians)
     means = arrays["means"]
     p = means @ camera.rotation.T + camera.translation
@@ -89,7 +89,7 @@ def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
 
 
 def render(gaussians: Gaussians, camera: Camera, background: Float64 | tuple[float, float, float]) -> Picture:
-    """(56), then front to back by distance, as equations 14 to 16 of docs/gradients.md. A pixel without a ray shows the
+    """(14), then front to back by distance, as equations 14 to 16 of docs/gradients.md. A pixel without a ray shows the
     background."""
     t = tangents(gaussians, camera)
     _, rays = cam_from_pixel(camera, pixel_grid(camera))

@@ -225,8 +225,11 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
 
     Raises InputError for a projection that the kernels do not have.
     """
-    if camera.projection != "perspective":
-        raise InputError(f"{camera.projection} cameras are not rendered yet, expected a perspective one")
+    if camera.projection == "orthographic":
+        raise InputError("orthographic cameras are not rendered yet, expected another projection")
+    if camera.projection == "equirectangular" and camera.width > (turn := 2 * np.pi * camera.fx) * (1 + 1e-6):
+        wide = f"{camera.width} pixels wide, of which {turn:.1f} are a whole turn"
+        raise InputError(f"an equirectangular camera is {wide}: expected no more")
     half_w, half_h = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
     values = {
         "FX": camera.fx,

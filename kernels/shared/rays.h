@@ -42,7 +42,7 @@ static inline void ray_of(floatL px, floatL py, __constant float *camera, floatL
 #endif
 }
 
-// log2 of alpha before the cap: the ray (x, y, z) goes through the tangent plane at the mean's direction, (56).
+// log2 of alpha before the cap: the ray (x, y, z) goes through the tangent plane at the mean's direction, (14).
 static inline floatL log2_alpha_of_ray(floatL x, floatL y, floatL z, __global const float *splat) {
   const floatL along = fmaL(x, (floatL)(splat[RAY_FX]), fmaL(y, (floatL)(splat[RAY_FY]), z * splat[RAY_FZ]));
   // U and V are at right angles to the mean's direction: of the ray only what differs from that matters, and has its
