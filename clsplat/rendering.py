@@ -333,8 +333,8 @@ class Renderer:
     ) -> tuple[RenderResult, ChannelResult]:
         """As `render`, with what the view has beside colour (docs/channels.md).
 
-        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None. Raises
-        InputError for motion of a camera without an image plane.
+        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None.
+        Raises InputError for motion of a camera without an image plane.
         """
         if "motion" in wanted and camera.projection in PROJECTION_DEFINES:
             raise InputError(f"motion is not defined for {camera.projection} cameras")
