@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 TEMPORARY_SUFFIX = ".clsplat-tmp"
+_TEMPORARY = re.compile(rf"\.(.+)\.[0-9a-f]{{12}}{re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
 
 
 @contextmanager
@@ -44,6 +47,31 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
     """Write `data` as the whole content of `path`; see `atomic_writer`."""
     with atomic_writer(path) as file:
         file.write(data)
+
+
+def temporaries(targets: Iterable[Path]) -> list[Path]:
+    """The temporary files that writers of these files have left, or are writing still."""
+    names: dict[Path, set[str]] = {}
+    for target in targets:
+        real = Path(os.path.realpath(target))
+        names.setdefault(real.parent, set()).add(real.name)
+    found = []
+    for folder, wanted in names.items():
+        with suppress(OSError):
+            for entry in os.scandir(folder):
+                match = _TEMPORARY.fullmatch(entry.name)
+                if match and match[1] in wanted:
+                    found.append(Path(entry.path))
+    return sorted(found)
+
+
+def digest(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of the file's content, in hexadecimal. Raises OSError."""
+    found = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            found.update(block)
+    return found.hexdigest()
 
 
 def _sync_folder(folder: Path) -> None:

@@ -18,13 +18,11 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.config import Compression, ExrDepth, Parts
 from clsplat.errors import InputError
-from clsplat.images import unassociate, write_spec
+from clsplat.images import image_size, unassociate, write_spec
 
 Float64 = NDArray[np.float64]
-Parts = Literal["one", "several"]
-Depth = Literal["half", "float"]
-Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
 class Encoding:
     """How pictures are encoded. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
 
-    depth: Depth = "half"
+    depth: ExrDepth = "half"
     parts: Parts = "one"
     compression: Compression = "zip"
     bits: int = 8
@@ -151,6 +149,49 @@ def write_layers(
         write_spec(path, [pixels], [spec], path.suffix.lower()[1:])
 
 
+def is_whole(
+    path: Path,
+    width: int,
+    height: int,
+    channels: Iterable[str],
+    encoding: Encoding,
+    attributes: Mapping[str, str | int | float] | None = None,
+) -> bool:
+    """Whether a file is there that holds these channels, as `write_layers` would have them, in a picture of that size,
+    with no other values of these attributes, and that decodes to its last row. A file that was cut short does not."""
+    channels = [name for name in LAYERS if name in set(channels)]
+    exr = path.suffix.lower() == ".exr"
+    groups = _parts(channels) if exr and encoding.parts == "several" else [tuple(channels)]
+    if not path.is_file():
+        return False
+    try:
+        image_size(path)  # finds a PNG that is cut short, of which libpng would print
+    except InputError:
+        return False
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        oiio.geterror()
+        return False
+    try:
+        for part, group in enumerate(groups):
+            if not source.seek_subimage(part, 0):
+                return False
+            spec = source.spec()
+            names = tuple(channel for name in group for channel in LAYERS[name].names)
+            if (spec.width, spec.height, tuple(spec.channelnames)) != (width, height, names):
+                return False
+            if any(spec.getattribute(key) not in (None, value) for key, value in (attributes or {}).items()):
+                return False
+            bottom = spec.y + spec.height
+            row = source.read_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels, oiio.FLOAT)
+            if row is None or source.geterror():
+                return False
+        return not source.seek_subimage(len(groups), 0)
+    finally:
+        source.geterror()
+        source.close()
+
+
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
     grouped: dict[str, list[str]] = {}
     for name in names:
@@ -226,6 +267,7 @@ def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
         spec.full_width, spec.full_height = header.window.width, header.window.height
     if header.pixel_aspect != 1.0:
         spec.attribute("PixelAspectRatio", float(header.pixel_aspect))
+    spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes
     for name, value in header.attributes.items():
         spec.attribute(name, value)
     return spec

@@ -316,11 +316,19 @@ class Renderer:
         self._after: DeviceArray | None = None
 
     def render(
-        self, gaussians: Gaussians | AnyGaussians, camera: Camera, background: Sequence[float] = (0.0, 0.0, 0.0)
+        self,
+        gaussians: Gaussians | AnyGaussians,
+        camera: Camera,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        *,
+        contiguous: bool = True,
     ) -> RenderResult:
-        """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object."""
+        """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object.
+
+        contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting.
+        """
         on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
-        return self._result(self._forward(on_device, camera, background))
+        return self._result(self._forward(on_device, camera, background), contiguous=contiguous)
 
     def render_channels(
         self,
@@ -330,6 +338,7 @@ class Renderer:
         *,
         after: Camera | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
+        contiguous: bool = True,
     ) -> tuple[RenderResult, ChannelResult]:
         """As `render`, with what the view has beside colour (docs/channels.md).
 
@@ -346,12 +355,11 @@ class Renderer:
         self._after.set(pack_camera(after or camera))
         found = self._rasterizer.channels(on_device, frame, of, self._after)
         height, width = camera.height, camera.width
-        means, whole = (
-            np.ascontiguousarray(array.get()[:, :height, :width].transpose(1, 2, 0))
-            for array in (found.means, found.whole)
-        )
+        means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (found.means, found.whole))
+        if contiguous:
+            means, whole = np.ascontiguousarray(means), np.ascontiguousarray(whole)
         fields = {name: means[:, :, at : at + WIDTHS[name]] for name, at in of.offsets.items()}
-        return self._result(frame), ChannelResult(
+        return self._result(frame, contiguous=contiguous), ChannelResult(
             depth=fields.pop("depth")[:, :, 0],
             fields=fields,
             median=means[:, :, -2],
@@ -364,11 +372,11 @@ class Renderer:
         self._background.set(np.asarray(background, np.float32))
         return self._rasterizer.forward(gaussians, camera, self._background, backward=False)
 
-    def _result(self, frame: Frame) -> RenderResult:
+    def _result(self, frame: Frame, *, contiguous: bool) -> RenderResult:
         height, width = frame.camera.height, frame.camera.width
-        planes = frame.blended.image.get()[:, :height, :width]
+        image = frame.blended.image.get()[:, :height, :width].transpose(1, 2, 0)
         alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
-        return RenderResult(np.ascontiguousarray(planes.transpose(1, 2, 0)), alpha)
+        return RenderResult(np.ascontiguousarray(image) if contiguous else image, alpha)
 
     def _hold(self, gaussians: Gaussians, camera: Camera, features: int = 0) -> AnyGaussians:
         """The model on the device, or on the host if a frame of this size leaves too little room for it."""

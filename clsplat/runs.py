@@ -210,6 +210,16 @@ def _read_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(int(record["step"]), arrays, record["state"])
 
 
+def model_file(path: Path) -> Path:
+    """The model file that a run's folder, or the path of a file, means. Raises InputError for a run without one."""
+    if not path.is_dir():
+        return path
+    trained = Run.open(path)
+    if not trained.model_path.exists():
+        raise InputError(f"{trained.model_path}: no such file, the run has not written its model yet")
+    return trained.model_path
+
+
 def is_run(path: Path) -> bool:
     """Whether the folder holds a config.toml that clsplat wrote."""
     try:

@@ -25,7 +25,7 @@ def test_render(model: str, folder: str, pipeline: Pipeline, tmp_path: Path, cap
         tmp_path / "out" / "x_a_y.exr",
         tmp_path / "out" / "x_sub" / "b.c_y.exr",
     ]
-    assert list(pipeline.written) == [record["path"] for record in records]
+    assert sorted(pipeline.written) == sorted(record["path"] for record in records)
     assert pipeline.calls == [("render", 4, 32, 24, (0.5, 0, 1)), ("render", 4, 20, 40, (0.5, 0, 1))]
     assert pipeline.written[records[0]["path"]].shape == (24, 32, 3)
 
@@ -94,7 +94,7 @@ def test_render_of_a_camera_path(model: str, pipeline: Pipeline, tmp_path: Path,
     assert main(["render", model, "--cameras", str(cameras), "-o", out, "--frames", "3,8-11:2", "--json"]) == 0
     records = json.loads(capsys.readouterr().out)
     assert [record["frame"] for record in records] == [3, 8, 10]
-    assert list(pipeline.written) == [str(tmp_path / "shot" / f"beauty.{i:04d}.exr") for i in (3, 8, 10)]
+    assert sorted(pipeline.written) == [str(tmp_path / "shot" / f"beauty.{i:04d}.exr") for i in (3, 8, 10)]
     assert pipeline.calls == [("render", 4, 40, 30, (0, 0, 0))] * 3
     assert main(["render", model, "--cameras", str(cameras), "-o", out, "--frames", "12-13", "--width", "80"]) == 0
     assert pipeline.calls[3:] == [("render", 4, 80, 60, (0, 0, 0))]
@@ -108,7 +108,7 @@ def test_render_of_a_camera_path(model: str, pipeline: Pipeline, tmp_path: Path,
 def test_render_along_a_path(path: str, model: str, folder: str, pipeline: Pipeline, tmp_path: Path) -> None:
     out = str(tmp_path / "%02d.png")
     assert main(["render", model, "--cameras", folder, "-o", out, "--path", path, "--count", "5"]) == 0
-    assert list(pipeline.written) == [str(tmp_path / f"{i:02d}.png") for i in range(1, 6)]
+    assert sorted(pipeline.written) == [str(tmp_path / f"{i:02d}.png") for i in range(1, 6)]
     assert pipeline.calls == [("render", 4, 32, 24, (0, 0, 0))] * 5
 
 
@@ -119,7 +119,7 @@ def test_render_of_frames_that_begin_negative(model: str, pipeline: Pipeline, tm
     cameras.write_text(json.dumps({"clsplat_cameras": 1, "width": 8, "height": 6, "keys": keys}))
     out = str(tmp_path / "{frame}.png")
     assert main(["render", model, "--cameras", str(cameras), "-o", out, "--frames=-2-1"]) == 0
-    assert list(pipeline.written) == [str(tmp_path / f"{i}.png") for i in (-2, -1, 0, 1)]
+    assert set(pipeline.written) == {str(tmp_path / f"{i}.png") for i in (-2, -1, 0, 1)}
 
 
 def test_cameras_that_cannot_be_rendered(model: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
@@ -148,7 +148,7 @@ def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_
     out = str(tmp_path / "{name}.png")
     cases = [
         (["--cameras", folder, "-o", str(tmp_path / "one.png")], "has no {name} in it, expected one to tell 2 cameras"),
-        (["--cameras", folder, "-o", str(tmp_path / "{name}.tga")], "extension '.tga', expected .png or .exr"),
+        (["--cameras", folder, "-o", str(tmp_path / "{name}.tga")], "extension '.tga', expected one of .exr, .png"),
         (["--cameras", folder, "-o", str(tmp_path / "{name}")], "extension 'none'"),
         (["--cameras", str(tmp_path / "none"), "-o", out], "none: no such folder"),
         (["--cameras", folder, "-o", out, "--background", "red"], "expected black, white or three numbers"),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -197,7 +198,10 @@ def test_nowhere_to_write(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
-def test_the_same_bytes_twice(tmp_path: Path) -> None:
-    for name in ("a.exr", "b.exr"):
-        write_layers(tmp_path / name, everything(), Encoding(parts="several"))
-    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+@pytest.mark.parametrize("extension", ["exr", "tif", "png", "jpg"])
+def test_the_same_bytes_a_second_later(extension: str, tmp_path: Path) -> None:
+    layers = everything() if extension == "exr" else {"rgb": everything()["rgb"]}
+    for name in ("a", "b"):
+        write_layers(tmp_path / f"{name}.{extension}", layers, Encoding(parts="several"))
+        time.sleep(1.1 if name == "a" else 0)
+    assert (tmp_path / f"a.{extension}").read_bytes() == (tmp_path / f"b.{extension}").read_bytes()
