@@ -143,6 +143,8 @@ def _run(job: Job) -> int:
     if not job.on_farm:
         how: dict[str, Any] = {"memory_limit": job.memory_limit, "profile": verb.profile}
         shaders = [open_shader(job.gaussians, options, job.rasterizer, device=each, **how) for each in job.devices]
+    if _is_main_thread():  # again, as pycolmap and compilers of kernels install handlers of their own
+        signal.signal(signal.SIGTERM, _interrupt)
     render_job.make_folders(tasks)
     render_job.remove_temporaries(tasks)
     there = render_job.complete(tasks, options) if verb.skip_existing else set()
@@ -269,18 +271,23 @@ def _plan(job: Job, selector: str | None) -> tuple[str, Plan]:
 @contextmanager
 def _terminable() -> Iterator[None]:
     """Inside, SIGTERM raises KeyboardInterrupt in the main thread."""
-    if threading.current_thread() is not threading.main_thread():
+    if not _is_main_thread():
         yield
         return
 
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _is_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 def _warn(text: str) -> None:
