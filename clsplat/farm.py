@@ -134,7 +134,8 @@ def _results(client: Any, tasks: Sequence[Task], scene: Scene) -> Iterator[Recor
         ]
 
     threads = sum(client.nthreads().values())
-    pending = as_completed(submit(max(64, 4 * threads)))
+    with client.as_current():
+        pending = as_completed(submit(max(64, 4 * threads)))
     for future in pending:
         try:
             result = future.result()

@@ -3,9 +3,9 @@
 
     stress_render_kills.py -o OUT --kills 10 -- MODEL --cameras SCENE --path turntable --count 120
 
-What follows -- are arguments of `clsplat render` without -o. OUT/whole and OUT/killed are made and must not exist. After
-every kill each frame that is there has to be whole, and in the end all have to be the same, byte for byte, with nothing
-beside them. Exit status 0 if so, else 1.
+What follows -- are arguments of `clsplat render` without -o. OUT/whole and OUT/killed are made and must not exist.
+After every kill each frame that is there has to be whole, and in the end all have to be the same, byte for byte, with
+nothing beside them. Exit status 0 if so, else 1.
 """
 
 from __future__ import annotations
