@@ -7,6 +7,7 @@ A frame is a task. Every worker loads the model once and keeps it; the files hav
 from __future__ import annotations
 
 import logging
+import signal
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
@@ -153,6 +154,11 @@ def _results(client: Any, tasks: Sequence[Task], scene: Scene) -> Iterator[Recor
             pending.add(another)
 
 
+def dask_setup(_: Any) -> None:
+    """Called by Dask in a local worker: Ctrl-C, which a terminal sends to it as well, is for the job to deal with."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 @contextmanager
 def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     try:
@@ -183,6 +189,7 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
             processes=True,
             memory_limit=None,  # Dask's own would end workers whose model is large
             dashboard_address=None,
+            preload=[__name__],
             silence_logs=logging.CRITICAL,
         ) as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
