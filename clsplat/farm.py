@@ -106,8 +106,8 @@ def render_on_farm(
     """Render the frames on the cluster of the scheduler at that address, or on a new one of `workers` processes here.
 
     on_done: as for `render_job.run_tasks`. The frames of a worker that is lost are rendered again by others. Raises
-    InputError where there is no such cluster, and ClsplatError for a frame that cannot be rendered, or whose workers
-    were lost three times.
+    InputError where there is no such cluster, and ClsplatError for a frame that cannot be rendered, or that has cost
+    more workers than Dask allows.
     """
     if not tasks:
         return

@@ -110,6 +110,21 @@ def test_a_worker_is_killed_half_way(shot: list[str], whole: dict[str, bytes], t
     assert contents(tmp_path) == whole
 
 
+def test_ctrl_c_of_a_terminal(shot: list[str], tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="the extra `farm` brings it")
+    line = [sys.executable, "-m", "clsplat", "render", *shot, "-o", str(tmp_path / "a.####.exr"), "--workers", "2"]
+    line += ["--progress", "json", "--width", "480"]
+    process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stdout is not None
+    process.stdout.readline()
+    os.killpg(process.pid, signal.SIGINT)  # to the workers as well
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err.startswith("clsplat: interrupted after ")
+    assert err.count("\n") == 1, err
+    assert not [path for path in tmp_path.iterdir() if path.suffix != ".exr"]
+
+
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     distributed = pytest.importorskip("distributed", reason="the extra `farm` brings it")
