@@ -120,8 +120,8 @@ def test_ctrl_c_of_a_terminal(shot: list[str], tmp_path: Path) -> None:
     os.killpg(process.pid, signal.SIGINT)  # to the workers as well
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert err.startswith("clsplat: interrupted after ")
-    assert err.count("\n") == 1, err
+    assert err.splitlines()[-1].startswith("clsplat: interrupted after ")
+    assert "Traceback" not in err  # a compiler of kernels that is stopped may say so
     assert not [path for path in tmp_path.iterdir() if path.suffix != ".exr"]
 
 
