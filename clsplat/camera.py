@@ -1,23 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pinhole camera: COLMAP's axes (x right, y down, z forward), pixel centres at +0.5."""
+"""The camera: COLMAP's axes (x right, y down, z forward), pixel centres at +0.5."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float64 = NDArray[np.float64]
+Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera and its pose.
+    """A camera and its pose; a pinhole unless `projection` says otherwise.
 
-    width, height: image size in pixels; fx, fy, cx, cy: intrinsics in pixels, the principal point measured
-    from the image's top left corner, so that the centre of the first pixel is (0.5, 0.5);
-    rotation (3, 3), translation (3,): `cam_from_world`, x_cam = rotation @ x_world + translation.
+    width, height: image size in pixels; fx, fy: pixels a unit of what the projection maps, see below; cx, cy: the
+    principal point in pixels, measured from the image's top left corner, so that the centre of the first pixel is
+    (0.5, 0.5); rotation (3, 3), translation (3,): `cam_from_world`, x_cam = rotation @ x_world + translation.
+
+    projection, and what a pixel is a multiple of there (docs/cameras.md has the equations): perspective, x/z and y/z;
+    orthographic, x and y, so 1 / fx is world units a pixel; fisheye (equidistant), the angle from the axis in radians;
+    equirectangular, longitude and latitude in radians. near, far: depths in world units between which something is
+    seen; depth is z, for fisheye and equirectangular the distance. Nothing applies `far` yet.
     """
 
     width: int
@@ -29,6 +37,8 @@ class Camera:
     rotation: Float64
     translation: Float64
     near: float = 0.01
+    far: float = math.inf
+    projection: Projection = "perspective"
 
     @property
     def position(self) -> Float64:
@@ -54,3 +64,19 @@ class Camera:
             cx=self.cx * sx,
             cy=self.cy * sy,
         )
+
+
+def focal_length(fov: float, size: float, projection: Projection = "perspective") -> float:
+    """fx (or fy) of a camera that sees the angle `fov`, radians, across `size` pixels around its axis.
+
+    Raises ValueError for an angle that the projection cannot show, and for orthographic, which has none.
+    """
+    if projection == "orthographic":
+        raise ValueError("an orthographic camera has no angle of view")
+    if projection == "perspective":
+        if not 0 < fov < math.pi:
+            raise ValueError(f"angle of view {math.degrees(fov):g} degrees, expected more than 0 and less than 180")
+        return 0.5 * size / math.tan(0.5 * fov)
+    if not 0 < fov <= 2 * math.pi * (1 + 1e-12):
+        raise ValueError(f"angle of view {math.degrees(fov):g} degrees, expected more than 0 and at most 360")
+    return size / fov

@@ -21,7 +21,17 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
-from clsplat.config import PRESETS, Preset, RasterizerConfig, Schedule, TrainConfig, bundled
+from clsplat.config import (
+    PRESETS,
+    Compression,
+    ExrDepth,
+    Parts,
+    Preset,
+    RasterizerConfig,
+    Schedule,
+    TrainConfig,
+    bundled,
+)
 from clsplat.errors import ClsplatError, InputError
 
 Flag = Annotated[bool, FlagCreatePairsOff]
@@ -138,19 +148,45 @@ class Eval:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a model from the cameras of a COLMAP model, an image for each of its images."""
+    """Render a model from the cameras of a file or along a path made from them, an image for each frame."""
 
     model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
     """A run's folder or a model file."""
-    cameras: Annotated[Path, arg(metavar="SPARSE_DIR")]
-    """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one."""
+    cameras: Annotated[Path, arg(metavar="PATH")]
+    """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
+    nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
-    """Where the images go, such as 'out/{name}.exr'; .png files have 8 bits, .exr files floats.
-    {name} is the image's name without its extension, sub-folders included."""
+    """Where the images go, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG. {name} is the
+    image's name without its extension, sub-folders included, or else the frame's number; ####, %04d and {frame} are
+    the frame's number."""
+    path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
+    """A path made from the cameras, in place of the cameras themselves: around what they look at, the same twice while
+    rising and sinking, or through them in their order, smoothed. Its frames count from 1."""
+    count: Annotated[int | None, arg(metavar="INT")] = None
+    """Frames of the path; 120 if not given."""
+    frames: Annotated[str | None, arg(metavar="1-100,200-300:2,...")] = None
+    """Render these frames only; all if not given. Ranges may have a step. Write --frames=-5-10 if it begins with a
+    negative number."""
+    usd_camera: Annotated[str | None, arg(metavar="PRIM")] = None
+    """Path or name of the camera, for a USD stage that has several."""
+    channels: Annotated[str, arg(metavar="NAME,...")] = "rgb"
+    """What the files hold: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion, count
+    and id (of Gaussians). docs/render.md has each."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     alpha: Flag = False
-    """Write alpha too, and no background: premultiplied in EXR, straight in PNG."""
+    """Write alpha too, as --channels rgb,alpha does, and no background: premultiplied in EXR and TIFF, straight in
+    PNG."""
+    exr: ExrDepth = "float"
+    """Floats of 16 or 32 bits in EXR, for colour, alpha and normals; depths, positions and motion are always of 32."""
+    parts: Parts = "one"
+    """EXR files of one part, or of one for colour with alpha and one for each other channel."""
+    compression: Compression = "zip"
+    """Of EXR files; pxr24, dwaa and dwab lose some of the values."""
+    bits: Literal[8, 16] = 8
+    """Of a channel in PNG and TIFF."""
+    quality: int = 95
+    """Of JPEG, from 1 to 100."""
     width: Annotated[int | None, arg(metavar="INT")] = None
     """Width in pixels; follows from the height, or from the camera, if not given."""
     height: Annotated[int | None, arg(metavar="INT")] = None
@@ -160,14 +196,28 @@ class Render:
     preset: Annotated[Preset | None, arg(metavar="exact|default|fast")] = None
     """Bundle of rasterizer settings; the run's own, or the default's, if not given. A --rasterizer flag goes before
     it."""
-    device: Device = None
-    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
-    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    skip_existing: Flag = False
+    """Leave out frames whose file is there and can be read to its end, in this size and with these channels."""
+    dry_run: Flag = False
+    """Print what would be done, and do nothing: frames, sizes, channels, memory, files."""
+    progress: Literal["auto", "json", "openjd", "none"] = "auto"
+    """auto: a bar on a terminal, and a line for each frame written; json: an object a line for each frame, on standard
+    output, or with --json on standard error; openjd: what Open Job Description shows as progress."""
+    profile: Flag = False
+    """Measure what part of the time the device is at work; in --json by frame."""
+    device: Annotated[str | None, arg(metavar="DEVICE,...|all")] = None
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them; several, with commas,
+    share the frames. If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    workers: Annotated[int | None, arg(metavar="INT")] = None
+    """Render with so many processes of this machine, a Dask cluster. Needs the extra: pip install 'clsplat[farm]'."""
+    scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Render on the Dask cluster of this scheduler, such as tcp://host:8786, whose workers see the same files."""
     max_device_mem: Memory = None
     """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
     If not given: all that the device has."""
     json: Flag = False
-    """Print the images written as JSON: name, path, width, height, seconds."""
+    """Print the frames as JSON when all are done: name, frame, path, width, height, seconds, skipped. With --dry-run:
+    the plan."""
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
 
@@ -318,7 +368,8 @@ def parse(arguments: Sequence[str]) -> Verb:
 
         bundle = PRESETS[verb.preset] if verb.preset else Run.open(verb.model).config.rasterizer
         if bundle != RasterizerConfig():
-            render = replace(verb, rasterizer=bundle, alpha=False, json=False)
+            unset: dict[str, Any] = dict.fromkeys(("alpha", "json", "skip_existing", "dry_run", "profile"), False)
+            render = replace(verb, rasterizer=bundle, **unset)
             verb = _tyro(Render, arguments[1:], prog="clsplat render", default=render)
     return verb
 

@@ -17,6 +17,9 @@ Background = Literal["black", "white", "random"]
 Preset = Literal["exact", "default", "fast"]
 Schedule = Literal["paper", "short"]
 Growth = Literal["paper", "budget"]
+Parts = Literal["one", "several"]
+ExrDepth = Literal["half", "float"]
+Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
 
 _Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
 """Names of settings, whether a value makes sense (which NaN must not), and what is expected."""

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,6 +19,7 @@ from clsplat.errors import InputError
 TEMPORARY_SUFFIX = ".clsplat-tmp"
 MAX_DOCUMENT = 32 << 20
 """Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
+_TEMPORARY = re.compile(rf"\.(.+)\.[0-9a-f]{{12}}{re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
 
 
 @contextmanager
@@ -50,6 +53,31 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
     """Write `data` as the whole content of `path`; see `atomic_writer`."""
     with atomic_writer(path) as file:
         file.write(data)
+
+
+def temporaries(targets: Iterable[Path]) -> list[Path]:
+    """The temporary files that writers of these files have left, or are writing still."""
+    names: dict[Path, set[str]] = {}
+    for target in targets:
+        real = Path(os.path.realpath(target))
+        names.setdefault(real.parent, set()).add(real.name)
+    found = []
+    for folder, wanted in names.items():
+        with suppress(OSError):
+            for entry in os.scandir(folder):
+                match = _TEMPORARY.fullmatch(entry.name)
+                if match and match[1] in wanted:
+                    found.append(Path(entry.path))
+    return sorted(found)
+
+
+def digest(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of the file's content, in hexadecimal. Raises OSError."""
+    found = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            found.update(block)
+    return found.hexdigest()
 
 
 def _sync_folder(folder: Path) -> None:

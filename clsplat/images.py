@@ -161,7 +161,7 @@ def write_image(
         spec.attribute("oiio:UnassociatedAlpha", 1)
     for name, value in (metadata or {}).items():
         spec.attribute(name, value)
-    _write_atomically(path, np.ascontiguousarray(pixels), spec, extension[1:])
+    write_spec(path, [np.ascontiguousarray(pixels)], [spec], extension[1:])
 
 
 def downscale(image: Float32, width: int, height: int) -> Float32:
@@ -299,13 +299,21 @@ def _check_png_is_whole(path: Path) -> None:
     raise InputError(f"{path}: does not decode: the PNG ends early, after {size} bytes; copy it again or leave it out")
 
 
-def _write_atomically(path: Path, pixels: NDArray[Any], spec: Any, kind: str) -> None:
+def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], kind: str) -> None:
+    """Write a file of one part or several, (H, W, C) each with its OpenImageIO specification, atomically.
+
+    Raises ClsplatError if writing fails."""
     # Not through files.atomic_writer: OpenImageIO writes to a name, not to an open file.
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
     try:
         output: Any = oiio.ImageOutput.create(kind)
-        written = output.open(str(temporary), spec) and output.write_image(pixels)
+        # several parts have to be announced together
+        written = output.open(str(temporary), specs[0] if len(specs) == 1 else tuple(specs))
+        for index, pixels in enumerate(parts):
+            if index > 0:
+                written = written and output.open(str(temporary), specs[index], "AppendSubimage")
+            written = written and output.write_image(pixels)
         reason = output.geterror()
         if not (output.close() and written):
             raise ClsplatError(f"{path}: cannot be written: {_one_line(reason or output.geterror())}")

@@ -20,9 +20,12 @@ _SMALL = 4096
 """Camera, background, totals and the like."""
 
 
-def plan_frame(device: Device, gaussians: int, floats: int, camera: Camera, config: RasterizerConfig) -> Plan:
-    """Of rendering alone; floats: parameters of a Gaussian (`ShStorage.floats`). Raises CapacityError."""
-    return _plan(device, gaussians, floats, [camera], config, training=False, slot=0, statistics=0)
+def plan_frame(
+    device: Device, gaussians: int, floats: int, camera: Camera, config: RasterizerConfig, features: int = 0
+) -> Plan:
+    """Of rendering alone; floats: parameters of a Gaussian (`ShStorage.floats`); features: floats of each Gaussian's
+    that go into channels beside colour. Raises CapacityError."""
+    return _plan(device, gaussians, floats, [camera], config, training=False, slot=0, statistics=0, features=features)
 
 
 def plan_step(
@@ -52,6 +55,7 @@ def _plan(
     training: bool,
     slot: int,
     statistics: int,
+    features: int = 0,
 ) -> Plan:
     planes = loss = 0
     for camera in cameras:
@@ -61,6 +65,7 @@ def _plan(
         sums = 9 * 4 * camera.height * strips(device)
         # image, transmittance, stops; ranges, counts_by_tile; in training target, its source, image_gradient
         own = 20 * pixels + 12 * tiles_x * tiles_y + ((24 + _SOURCE) * pixels + sums if training else 0)
+        own += 4 * (features + 4) * pixels if features else 0  # with median, first, count and index
         loss = max(loss, scratch if training else 0)
         planes = max(planes, own)
     longest = max(gaussians, device.budget // 36)
@@ -73,6 +78,6 @@ def _plan(
         loss=loss,
         scratch=scratch_bytes(device, longest) + _SMALL,
         sorts_pairs=config.depth_sort == "pairs",
-        extra=statistics + (0 if config.frustum_cull and config.opacity_cull else 4),
+        extra=statistics + 4 * features + (0 if config.frustum_cull and config.opacity_cull else 4),
     )
     return plan(need, device.budget, device.max_allocation, device.row_alignment)

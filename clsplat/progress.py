@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Protocol, TextIO
+from typing import Any, Literal, Protocol, TextIO
 
 PLAIN_INTERVAL = 10.0
 """Seconds between plain lines."""
@@ -113,6 +114,89 @@ class StageProgress:
             text = stage if fraction is None else f"{stage} {100 * fraction:.0f} %"
             print(text, file=self.stream, flush=True)
             self.stage, self.printed_at = stage, now
+
+
+class FrameRecord(Protocol):
+    """What is shown of a frame, `clsplat.render_job.Record` for one; seconds that it took."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def frame(self) -> int: ...
+    @property
+    def path(self) -> str: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def seconds(self) -> float: ...
+    @property
+    def skipped(self) -> bool: ...
+
+
+class FrameProgress:
+    """A context manager; call it with each `FrameRecord` when its file is complete.
+
+    total: frames, skipped ones too; style: auto, a bar on standard error where that is a terminal, and a line for each
+    frame written on `lines` unless that is None or both are one terminal; json, an object a line there; openjd, what
+    Open Job Description takes for progress; none.
+    """
+
+    def __init__(
+        self,
+        total: int,
+        style: Literal["auto", "json", "openjd", "none"] = "auto",
+        *,
+        lines: TextIO | None = None,
+        stream: TextIO | None = None,
+    ) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self.total, self.style, self.lines, self.done = total, style, lines, 0
+        stream = stream if stream is not None else sys.stderr
+        self.live: Progress | None = None
+        if style == "auto" and stream.isatty():
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=None),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+            )
+            self.live = Progress(*columns, console=Console(file=stream), refresh_per_second=4, speed_estimate_period=60)
+            self.task = self.live.add_task("frames", total=total)
+            self.lines = None if lines is not None and lines.isatty() else lines
+
+    def __enter__(self) -> FrameProgress:  # noqa: PYI034  # as above
+        if self.live is not None:
+            self.live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.live is not None:
+            self.live.stop()
+
+    def __call__(self, record: FrameRecord) -> None:
+        self.done += 1
+        if self.live is not None:
+            self.live.update(self.task, completed=self.done, description=f"frame {record.frame}")
+        if self.lines is None or self.style == "none":
+            return
+        if self.style == "json":
+            names = ("frame", "name", "path", "seconds", "skipped")
+            values: dict[str, Any] = {name: getattr(record, name) for name in names}
+            text = json.dumps({**values, "done": self.done, "total": self.total})
+        elif self.style == "openjd":
+            did = "is there" if record.skipped else f"took {record.seconds:.2f} s"
+            text = f"openjd_progress: {100 * self.done / self.total:.1f}\nopenjd_status: frame {record.frame} {did}"
+        elif record.skipped:
+            return
+        else:
+            text = f"{record.path}  {record.width}x{record.height}  {record.seconds:.2f} s"
+        print(text, file=self.lines, flush=True)
 
 
 def duration(seconds: float) -> str:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,14 +13,16 @@ from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device, open_device
-from clsplat.device.layout import PLAIN_SLOTS, WIDEST_SLOTS, SlotFields
+from clsplat.device.layout import CAMERA, PLAIN_SLOTS, WIDEST_SLOTS, SlotFields
 from clsplat.device.switches import kernel_defines
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
 from clsplat.needs import plan_frame
 from clsplat.sh import check_half, coefficients_in_use, needed_degrees
 from clsplat.stages.adam import REFUSED
 from clsplat.stages.blend import Blended, blend, blend_grad
+from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
 from clsplat.stages.duplicate import (
     MAX_PAIRS,
     Band,
@@ -51,6 +53,8 @@ from clsplat.stages.project import (
 from clsplat.stages.ranges import TileLists, tile_lists
 
 Float32 = NDArray[np.float32]
+PROJECTION_DEFINES: dict[str, dict[str, object]] = {"equirectangular": {"RAYS": 1}, "fisheye": {"RAYS": 2}}
+"""What the kernels are built with for a camera that has no image plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +104,11 @@ class Rasterizer:
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
-        self.device = device.with_switches({**device.switches, **kernel_defines(self.config)})
+        switches = {**device.switches, **kernel_defines(self.config)}
+        self.device = device.with_switches(switches)
+        self._by_projection = {
+            name: device.with_switches({**switches, **defines}) for name, defines in PROJECTION_DEFINES.items()
+        }
         self.work = work or Workspace(device)
         # What `count` reads each time, with room for what training counts beside it: one copy for both.
         self.found = allocate(device, (4 + len(REFUSED),), np.uint32)
@@ -122,20 +130,30 @@ class Rasterizer:
 
         backward: whether the gradient will be asked for; what only that needs is left out else.
         """
-        device, work = self.device, self.work
+        device, work = self.device_of(camera), self.work
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
         camera_array.set(pack)
         projected = project(device, work, gaussians, camera, camera_array)
         of = (projected.splats, projected.tile_counts, projected.shown)
         counted = count(device, work, *of, all_bits=self._all_bits, found=self.found)
-        bands = self._plan(projected, counted, tiles_of(camera))
+        bands = self._plan(device, projected, counted, tiles_of(camera))
         part = None
         for band in bands:
             del part  # its arrays may have to make room for larger ones
-            part = self._part(projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
+            part = self._part(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
             size = (camera.width, camera.height)
             record = backward and len(bands) == 1 and self.config.record_cells
-            blended = blend(device, work, part.lists, projected.splats, background, *size, band, record=record)
+            blended = blend(
+                device,
+                work,
+                part.lists,
+                projected.splats,
+                background,
+                *size,
+                band,
+                record=record,
+                camera_array=camera_array,
+            )
         assert part is not None, "an image has a tile"
         return Frame(camera, camera_array, background, projected, bands, part, blended, counted.beside)
 
@@ -143,15 +161,49 @@ class Rasterizer:
         """What the band lists; where there are several bands it takes the memory of the one before."""
         if len(frame.bands) == 1:
             return frame.part
-        return self._part(frame.projected, band, tiles_of(frame.camera))
+        return self._part(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
-    def _plan(self, projected: Projected, counted: Counted, tiles: tuple[int, int]) -> tuple[Band, ...]:
+    def channels(self, gaussians: AnyGaussians, frame: Frame, wanted: Features, after: DeviceArray) -> Channels:
+        """What the frame has beside colour; after: the packed camera that motion goes to."""
+        device, work, projected = self.device_of(frame.camera), self.work, frame.projected
+        rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected)
+        found = None
+        for band in frame.bands:
+            part = self.part(frame, band)
+            found = channels(
+                device,
+                work,
+                wanted,
+                rows,
+                part.lists,
+                projected,
+                frame.blended,
+                frame.camera.height,
+                band,
+                frame.camera_array,
+            )
+            del part  # as in `forward`
+        assert found is not None, "an image has a tile"
+        return found
+
+    def device_of(self, camera: Camera) -> Device:
+        """The device with the switches that the camera's projection wants of the kernels."""
+        return self._by_projection.get(camera.projection, self.device)
+
+    def _plan(self, device: Device, projected: Projected, counted: Counted, tiles: tuple[int, int]) -> tuple[Band, ...]:
         if counted.pairs <= self.capacity:
             return (Band(0, tiles[0] * tiles[1]),)
-        return plan_bands(self.device, self.work, projected, tiles, self.capacity)
+        return plan_bands(device, self.work, projected, tiles, self.capacity)
 
-    def _part(self, projected: Projected, band: Band, tiles: tuple[int, int], counted: Counted | None = None) -> Part:
-        device, work = self.device, self.work
+    def _part(
+        self,
+        device: Device,
+        projected: Projected,
+        band: Band,
+        tiles: tuple[int, int],
+        counted: Counted | None = None,
+    ) -> Part:
+        work = self.work
         counted = counted or count_band(device, work, projected, tiles, band, all_bits=self._all_bits)
         listing = duplicate_and_sort if self.config.depth_sort == "pairs" else duplicate
         pairs = listing(device, work, projected.splats, counted, tiles, band)
@@ -224,6 +276,19 @@ class RenderResult:
     alpha: Float32
 
 
+@dataclass(frozen=True, eq=False)
+class ChannelResult:
+    """depth, median, first (H, W) float32, along the camera's axis; count, index (H, W) int32, index -1 for nothing;
+    fields: normal and position (H, W, 3), in the world, motion (H, W, 2), in pixels, those that were asked for."""
+
+    depth: Float32
+    fields: dict[str, Float32]
+    median: Float32
+    first: Float32
+    count: NDArray[np.int32]
+    index: NDArray[np.int32]
+
+
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
     """What the settings keep of the SH of a model that is held to be rendered. Raises InputError where a coefficient
     is more than a half holds."""
@@ -256,31 +321,89 @@ class Renderer:
         self._sh: tuple[Gaussians, ShStorage] | None = None
         self._held: AnyGaussians | None = None
         self._planned: tuple[object, ...] | None = None
+        self._after: DeviceArray | None = None
 
     def render(
-        self, gaussians: Gaussians | AnyGaussians, camera: Camera, background: Sequence[float] = (0.0, 0.0, 0.0)
+        self,
+        gaussians: Gaussians | AnyGaussians,
+        camera: Camera,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        *,
+        contiguous: bool = True,
     ) -> RenderResult:
         """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object; of what is
-        on the device the camera has to count from where the means do."""
+        on the device the camera has to count from where the means do.
+
+        contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting.
+        """
         if isinstance(gaussians, Gaussians):
             camera = camera.from_origin(gaussians.origin)
         on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
-        self._background.set(np.asarray(background, np.float32))
-        blended = self._rasterizer.forward(on_device, camera, self._background, backward=False).blended
-        height, width = camera.height, camera.width
-        planes = blended.image.get()[:, :height, :width]
-        alpha: Float32 = np.float32(1) - blended.transmittance.get()[:height, :width]
-        return RenderResult(np.ascontiguousarray(planes.transpose(1, 2, 0)), alpha)
+        return self._result(self._forward(on_device, camera, background), contiguous=contiguous)
 
-    def _hold(self, gaussians: Gaussians, camera: Camera) -> AnyGaussians:
+    def render_channels(
+        self,
+        gaussians: Gaussians | AnyGaussians,
+        camera: Camera,
+        wanted: Collection[str] = (),
+        *,
+        after: Camera | None = None,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        contiguous: bool = True,
+    ) -> tuple[RenderResult, ChannelResult]:
+        """As `render`, with what the view has beside colour (docs/channels.md).
+
+        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None.
+        Raises InputError for motion of a camera without an image plane.
+        """
+        if "motion" in wanted and camera.projection in PROJECTION_DEFINES:
+            raise InputError(f"motion is not defined for {camera.projection} cameras")
+        of = Features.of(wanted)
+        after = after or camera
+        origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
+        camera, after = camera.from_origin(origin), after.from_origin(origin)
+        on_device = self._hold(gaussians, camera, of.floats) if isinstance(gaussians, Gaussians) else gaussians
+        frame = self._forward(on_device, camera, background)
+        if self._after is None:
+            self._after = allocate(self.device, (len(CAMERA),), np.float32)
+        self._after.set(pack_camera(after))
+        found = self._rasterizer.channels(on_device, frame, of, self._after)
+        height, width = camera.height, camera.width
+        means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (found.means, found.whole))
+        if contiguous:
+            means, whole = np.ascontiguousarray(means), np.ascontiguousarray(whole)
+        fields = {name: means[:, :, at : at + WIDTHS[name]] for name, at in of.offsets.items()}
+        if "position" in fields and origin.any():  # in the world: float32 keeps what it can of that
+            shown = whole[:, :, :1] > 0
+            fields["position"] = np.where(shown, fields["position"] + origin, 0).astype(np.float32)
+        return self._result(frame, contiguous=contiguous), ChannelResult(
+            depth=fields.pop("depth")[:, :, 0],
+            fields=fields,
+            median=means[:, :, -2],
+            first=means[:, :, -1],
+            count=whole[:, :, 0],
+            index=whole[:, :, 1],
+        )
+
+    def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:
+        self._background.set(np.asarray(background, np.float32))
+        return self._rasterizer.forward(gaussians, camera, self._background, backward=False)
+
+    def _result(self, frame: Frame, *, contiguous: bool) -> RenderResult:
+        height, width = frame.camera.height, frame.camera.width
+        image = frame.blended.image.get()[:, :height, :width].transpose(1, 2, 0)
+        alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
+        return RenderResult(np.ascontiguousarray(image) if contiguous else image, alpha)
+
+    def _hold(self, gaussians: Gaussians, camera: Camera, features: int = 0) -> AnyGaussians:
         """The model on the device, or on the host if a frame of this size leaves too little room for it."""
         if self._sh is None or self._sh[0] is not gaussians:
             self._sh = self._held = None
             self._sh = (gaussians, held_sh(gaussians, self._rasterizer.config))
         sh = self._sh[1]
-        asked = (len(gaussians), sh.floats, camera.width, camera.height)
+        asked = (len(gaussians), sh.floats, camera.width, camera.height, features)
         if self._planned != asked:
-            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, self._rasterizer.config)
+            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, self._rasterizer.config, features)
             self._rasterizer.follow(plan)
             if plan.streamed or isinstance(self._held, HostGaussians):
                 self._held = None

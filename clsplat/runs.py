@@ -268,6 +268,16 @@ def _array(data: bytes, name: str) -> NDArray[Any]:
     return array.reshape(shape, order="F" if match[2] == "True" else "C")
 
 
+def model_file(path: Path) -> Path:
+    """The model file that a run's folder, or the path of a file, means. Raises InputError for a run without one."""
+    if not path.is_dir():
+        return path
+    trained = Run.open(path)
+    if not trained.model_path.exists():
+        raise InputError(f"{trained.model_path}: no such file, the run has not written its model yet")
+    return trained.model_path
+
+
 def is_run(path: Path) -> bool:
     """Whether the folder holds a config.toml that clsplat wrote."""
     try:

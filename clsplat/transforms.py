@@ -76,35 +76,54 @@ def read_transforms(path: Path) -> Transforms:
     `train_filenames`, `val_filenames` and `test_filenames` are honoured. Raises InputError that names the file and the
     key for JSON that does not parse, a key that is missing or of the wrong kind, and listed pictures that are missing.
     """
-    document = _load(path)
+    document = load_document(path)
+    readers = _readers(path, document)
+    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
+    require_images(files, path)
+    result = Transforms(_frames(path, readers, files))
+    if any("mask_path" in keys.frame for keys in readers):
+        result.warnings.append(f"{path}: 'mask_path' is ignored, masks are not supported")
+    result.box = _ngp_box(Keys(path, None, {}, document))
+    _read_points(path, document, result)
+    return result
+
+
+def read_poses(path: Path, size: tuple[int, int] | None = None) -> list[Frame]:
+    """The cameras of a transforms.json alone, in its order.
+
+    Its pictures need not be there where the file says `w h`; else, where a picture is missing, too, it counts as one of
+    `size`, (width, height). Raises InputError as `read_transforms`.
+    """
+    readers = _readers(path, load_document(path))
+    return _frames(path, readers, [_find_file(path.parent, keys.text("file_path")) for keys in readers], size)
+
+
+def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{path}: has no 'frames' (a list of pictures with their poses); {EXPORT_AGAIN}")
-    readers = [_Keys(path, index, frame, document) for index, frame in enumerate(frames)]
+    readers = [Keys(path, f"frame {index}", frame, document) for index, frame in enumerate(frames)]
     for keys in readers:
         _inside(path.parent, keys.text("file_path"), keys.where)
-    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
-    require_images(files, path)
+    return readers
 
-    held_out = _held_out(document)
-    result = Transforms([])
+
+def _frames(path: Path, readers: list[Keys], files: list[Path], size: tuple[int, int] | None = None) -> list[Frame]:
+    held_out = _held_out(readers[0].document)
+    frames = []
     for keys, file in zip(readers, files, strict=True):
         listed = keys.text("file_path")
         split = None if held_out is None else "test" if _plain(listed) in held_out else "train"
-        lens = _lens(keys, file)
-        rotation, translation = _pose(keys)
+        lens = _lens(keys, file, size)
+        rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
         name = _plain(listed) + file.name[len(PurePosixPath(_plain(listed)).name) :]  # with the extension found
-        result.frames.append(Frame(name, file, lens, rotation, translation, split))
+        frames.append(Frame(name, file, lens, rotation, translation, split))
     seen: set[str] = set()
-    for frame in result.frames:
+    for frame in frames:
         if frame.name in seen:
             raise InputError(f"{path}: lists {frame.name} twice, expected each picture once; remove one of the frames")
         seen.add(frame.name)
-    if any("mask_path" in frame for frame in frames):
-        result.warnings.append(f"{path}: 'mask_path' is ignored, masks are not supported")
-    result.box = _ngp_box(_Keys(path, None, {}, document))
-    _read_points(path, document, result)
-    return result
+    return frames
 
 
 def read_blender(folder: Path) -> Transforms:
@@ -127,12 +146,12 @@ def read_blender(folder: Path) -> Transforms:
     return Transforms(frames, train.points, train.colors, train.box, train.warnings + test.warnings)
 
 
-class _Keys:
-    """Values of one frame, or of the file where the frame does not have them."""
+class Keys:
+    """Values of one frame, or of the file where the frame does not have them; `where` begins every error."""
 
-    def __init__(self, path: Path, index: int | None, frame: dict[str, Any], document: dict[str, Any]) -> None:
+    def __init__(self, path: Path, part: str | None, frame: dict[str, Any], document: dict[str, Any]) -> None:
         self.path, self.frame, self.document = path, frame, document
-        self.where = str(path) if index is None else f"{path}: frame {index}"
+        self.where = str(path) if part is None else f"{path}: {part}"
 
     def get(self, key: str) -> Any:
         value = self.frame.get(key)
@@ -141,7 +160,7 @@ class _Keys:
     def text(self, key: str) -> str:
         value = self.get(key)
         if not isinstance(value, str) or not value.strip():
-            found = f"has no '{key}'" if value is None else f"'{key}' is {_short(value)}, expected text"
+            found = f"has no '{key}'" if value is None else f"'{key}' is {short(value)}, expected text"
             raise InputError(f"{self.where}: {found}; {EXPORT_AGAIN}")
         return value
 
@@ -150,25 +169,33 @@ class _Keys:
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
-            raise InputError(f"{self.where}: '{key}' is {_short(value)}, expected a number")
+            raise InputError(f"{self.where}: '{key}' is {short(value)}, expected a number")
         return float(value)
 
+    def require(self, key: str) -> float:
+        """As `number`; InputError also where there is none."""
+        value = self.number(key)
+        if value is None:
+            raise InputError(f"{self.where}: has no '{key}', expected a number")
+        return value
 
-def _short(value: object) -> str:
+
+def short(value: object) -> str:
+    """A value for an error's line."""
     try:
         return repr(value)[:60]
     except ValueError:  # an integer of thousands of digits
         return "an endless number"
 
 
-def _load(path: Path) -> dict[str, Any]:
-    expected = "a transforms.json"
+def load_document(path: Path, expected: str = "a transforms.json", key: str = "'frames'") -> dict[str, Any]:
+    """The JSON object in a file. Raises InputError, which says that `expected`, an object with `key`, was."""
     try:
         document = parse_json(read_document(path, expected))
     except ValueError as error:
         raise InputError(f"{path}: is not JSON: {error}; expected {expected}") from None
     if not isinstance(document, dict):
-        raise InputError(f"{path}: holds no JSON object, expected one with 'frames'")
+        raise InputError(f"{path}: holds no JSON object, expected one with {key}")
     return document
 
 
@@ -196,7 +223,7 @@ def _inside(folder: Path, listed: str, where: str) -> None:
     path = Path(os.path.normpath(root / listed.replace("\\", "/")))
     if not listed.isprintable() or not path.is_relative_to(os.path.normpath(root)):
         raise InputError(
-            f"{where}: {_short(listed)} is no path inside the scene's folder {folder}; move what it names into it, or "
+            f"{where}: {short(listed)} is no path inside the scene's folder {folder}; move what it names into it, or "
             "put a link there"
         )
 
@@ -210,10 +237,18 @@ def _held_out(document: dict[str, Any]) -> set[str] | None:
     return None
 
 
-def _lens(keys: _Keys, file: Path) -> Lens:
+def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
     width, height = keys.number("w"), keys.number("h")
     if width is None or height is None:
-        width, height = image_size(file, orient=False)
+        if not file.is_file():
+            if size is None:
+                raise InputError(
+                    f"{keys.where}: has no 'w' and 'h', nor is its picture there: {file}; give both --width and "
+                    "--height"
+                )
+            width, height = size
+        else:
+            width, height = image_size(file, orient=False)
     fx = _focal(keys, "fl_x", "camera_angle_x", width)
     fy = _focal(keys, "fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
@@ -233,7 +268,7 @@ def _lens(keys: _Keys, file: Path) -> Lens:
     return check_lens(Lens(model, round(width), round(height), params), keys.where)
 
 
-def _focal(keys: _Keys, focal: str, angle: str, size: float) -> float | None:
+def _focal(keys: Keys, focal: str, angle: str, size: float) -> float | None:
     if (value := keys.number(focal)) is not None:
         return value
     if (value := keys.number(angle)) is None:
@@ -243,7 +278,7 @@ def _focal(keys: _Keys, focal: str, angle: str, size: float) -> float | None:
     return 0.5 * size / math.tan(0.5 * value)
 
 
-def _distortion(keys: _Keys) -> tuple[str, list[float]]:
+def _distortion(keys: Keys) -> tuple[str, list[float]]:
     """COLMAP's model and its coefficients."""
     model = keys.get("camera_model") or ""
     k1, k2, k3, k4, k5, k6, p1, p2 = (
@@ -253,7 +288,7 @@ def _distortion(keys: _Keys) -> tuple[str, list[float]]:
         return "OPENCV_FISHEYE", [k1, k2, k3, k4]
     if model not in PERSPECTIVE:
         listed = ", ".join(name for name in (*PERSPECTIVE, *FISHEYE) if name)
-        raise InputError(f"{keys.where}: unknown 'camera_model' {_short(model)}, expected one of {listed}")
+        raise InputError(f"{keys.where}: unknown 'camera_model' {short(model)}, expected one of {listed}")
     if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
         return "PINHOLE", []
     if k4 and model != "FULL_OPENCV":
@@ -266,30 +301,32 @@ def _distortion(keys: _Keys) -> tuple[str, list[float]]:
     return "OPENCV", [k1, k2, p1, p2]
 
 
-def _pose(keys: _Keys) -> tuple[Float64, Float64]:
-    given = keys.frame.get("transform_matrix")
+def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64, float]:
+    """`cam_from_world` rotation (3, 3) and translation (3,), and the scale that was in it, of a `world_from_cam` matrix
+    (4, 4) or (3, 4) in OpenGL's axes. Raises InputError, about `what` in `where`, for what is no pose."""
     if given is None:
-        raise InputError(f"{keys.where}: has no 'transform_matrix' (the 4 x 4 pose); {EXPORT_AGAIN}")
+        raise InputError(f"{where}: has no {what} (the 4 x 4 pose); {EXPORT_AGAIN}")
     try:
         matrix = np.array(given, np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < MAX_NUMBER).all():
-        raise InputError(f"{keys.where}: 'transform_matrix' is {_short(given)}, expected 4 x 4 finite numbers")
+        raise InputError(f"{where}: {what} is {short(given)}, expected 4 x 4 finite numbers")
     # A scaled camera object leaves its scale in the matrix; a camera has none.
     determinant = float(np.linalg.det(matrix[:3, :3]))
-    axes = matrix[:3, :3] / np.cbrt(determinant) if determinant > 0 else np.zeros((3, 3))
+    scale = float(np.cbrt(determinant))
+    axes = matrix[:3, :3] / scale if determinant > 0 else np.zeros((3, 3))
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-2:
         raise InputError(
-            f"{keys.where}: 'transform_matrix' has no rotation in it (determinant {determinant:.3g}), expected "
+            f"{where}: {what} has no rotation in it (determinant {determinant:.3g}), expected "
             "world_from_camera in OpenGL's axes; check how it was exported"
         )
     u, _, v = np.linalg.svd(axes)
     cam_from_world: Float64 = (u @ v @ COLMAP_FROM_OPENGL).T
-    return cam_from_world, -cam_from_world @ matrix[:3, 3]
+    return cam_from_world, -cam_from_world @ matrix[:3, 3], scale
 
 
-def _ngp_box(keys: _Keys) -> tuple[Float64, Float64] | None:
+def _ngp_box(keys: Keys) -> tuple[Float64, Float64] | None:
     side = keys.number("aabb_scale")
     if side is None or side <= 0:
         return None

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import json
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb
@@ -16,14 +14,10 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.memory import Plan, parse_bytes
 
 if TYPE_CHECKING:
-    from clsplat.camera import Camera
     from clsplat.device.context import Device
     from clsplat.gaussians import Gaussians
     from clsplat.runs import Run
     from clsplat.scene import Scene
-
-IMAGE_EXTENSIONS = (".png", ".exr")
-Colour = tuple[float, float, float]
 
 
 def run(verb: Verb) -> int:
@@ -40,6 +34,8 @@ def run(verb: Verb) -> int:
         case Eval():
             return evaluate(verb)
         case Render():
+            from clsplat.verb_render import render
+
             return render(verb)
         case Bench():
             return bench(verb)
@@ -192,15 +188,16 @@ def evaluate(verb: Eval) -> int:
     from clsplat.device.context import open_device
     from clsplat.evaluate import background_colour
     from clsplat.evaluate import evaluate as measure
+    from clsplat.gaussians import Gaussians
     from clsplat.metrics import lpips_missing
     from clsplat.rendering import Renderer
-    from clsplat.runs import Run, is_run
+    from clsplat.runs import Run, is_run, model_file
     from clsplat.trust import require
 
     limit = parse_bytes(verb.max_device_mem)
     given_run = Run.open(verb.model) if verb.model.is_dir() else None
     trained = given_run or (Run.open(verb.model.parent) if is_run(verb.model.parent) else None)
-    gaussians = _load_model(verb.model)
+    gaussians = Gaussians.load(model_file(verb.model))
     config = trained.config if trained else TrainConfig()
     source = verb.scene or (trained.scene if trained else None)
     if source is None:
@@ -236,52 +233,6 @@ def evaluate(verb: Eval) -> int:
     _print_summary(result)
     if reason := lpips_missing():
         print(f"no LPIPS: {reason}", file=sys.stderr)
-    return 0
-
-
-def render(verb: Render) -> int:
-    """Model and cameras to images. All names and sizes are checked before the first is rendered."""
-    from clsplat.colmap import read_cameras
-    from clsplat.device.context import open_device
-    from clsplat.images import write_image
-    from clsplat.rendering import Renderer
-    from clsplat.trust import require
-
-    extension = PurePosixPath(verb.output).suffix.lower()
-    if extension not in IMAGE_EXTENSIONS:
-        raise InputError(f"{verb.output}: has the extension {extension or 'none'!r}, expected .png or .exr")
-    if verb.alpha and verb.background is not None:
-        raise InputError("--alpha and --background exclude each other: with alpha there is no background")
-    background = parse_colour(verb.background or "black")
-    verb.rasterizer.check()
-    limit = parse_bytes(verb.max_device_mem)
-    resize = resizer(verb.width, verb.height, verb.scale)
-    if not verb.cameras.is_dir():
-        raise InputError(f"{verb.cameras}: no such folder, expected a COLMAP model (cameras and images, bin or txt)")
-    cameras = {name: resize(camera) for name, camera in read_cameras(verb.cameras).items()}
-    if not cameras:
-        raise InputError(f"{verb.cameras}: has no images, expected at least one")
-    paths = output_paths(verb.output, list(cameras))
-    gaussians = _load_model(verb.model)
-    device = open_device(verb.device, limit)
-    require(device, forward=True)
-    renderer = Renderer(device, config=verb.rasterizer)
-
-    written = []
-    for name, camera in cameras.items():
-        start = time.monotonic()
-        result = renderer.render(gaussians, camera, background)
-        path = paths[name]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        image = with_alpha(result.image, result.alpha) if verb.alpha else result.image
-        write_image(path, image, alpha="associated")
-        seconds = time.monotonic() - start
-        record = {"name": name, "path": str(path), "width": camera.width, "height": camera.height, "seconds": seconds}
-        written.append(record)
-        if not verb.json:
-            print(f"{path}  {camera.width}x{camera.height}  {seconds:.2f} s")
-    if verb.json:
-        print(json.dumps(written, indent=2))
     return 0
 
 
@@ -334,79 +285,6 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
         raise InputError(f"--size {text}: expected a width and a height in pixels such as 1024x768")
     return int(words[0]), int(words[1])
-
-
-def with_alpha(image: Any, alpha: Any) -> Any:
-    """(H, W, 4) float32, premultiplied, from an image (H, W, 3) over black and its alpha (H, W)."""
-    import numpy as np
-
-    return np.concatenate([image, alpha[:, :, None]], axis=2, dtype=np.float32)
-
-
-def parse_colour(text: str) -> Colour:
-    """black, white or three numbers from 0 to 1. Raises InputError."""
-    named: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-    if text in named:
-        return named[text]
-    try:
-        red, green, blue = (float(word) for word in text.split(","))
-    except ValueError:
-        red = green = blue = -1.0
-    if not (0 <= red <= 1 and 0 <= green <= 1 and 0 <= blue <= 1):
-        raise InputError(f"--background {text}: expected black, white or three numbers from 0 to 1 such as 0.2,0.2,0.3")
-    return red, green, blue
-
-
-def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Camera], Camera]:
-    """A camera's size after --width, --height and --scale. Raises InputError for sizes that make no sense."""
-    for flag, value in (("--width", width), ("--height", height), ("--scale", scale)):
-        if value is not None and not 0 < value < float("inf"):
-            raise InputError(f"{flag} {value}: expected a number above 0")
-    if scale != 1 and (width or height):
-        raise InputError("--scale and --width or --height exclude each other")
-
-    def resize(camera: Camera) -> Camera:
-        across, down = width, height
-        if across is None:
-            across = round(camera.width * (down / camera.height if down else scale))
-        if down is None:
-            down = round(camera.height * (across / camera.width if width else scale))
-        if (across, down) == (camera.width, camera.height):
-            return camera
-        return camera.resized(max(1, across), max(1, down))
-
-    return resize
-
-
-def output_paths(pattern: str, names: list[str]) -> dict[str, Path]:
-    """The file of every image name. Raises InputError where two would be one, or one would leave the folder."""
-    if "{name}" not in pattern and len(names) > 1:
-        raise InputError(f"{pattern}: has no {{name}} in it, expected one to tell {len(names)} cameras apart")
-    paths: dict[str, Path] = {}
-    taken: dict[Path, str] = {}
-    for name in names:
-        pure = PurePosixPath(name)
-        if pure.is_absolute() or ".." in pure.parts:
-            raise InputError(f"image name {name!r} leads out of the output folder")
-        path = Path(pattern.replace("{name}", str(pure.with_suffix(""))))
-        if path in taken:
-            raise InputError(f"{path}: would be both {taken[path]} and {name}")
-        taken[path] = name
-        paths[name] = path
-    return paths
-
-
-def _load_model(path: Path) -> Gaussians:
-    """The Gaussians of a run or of a model file."""
-    from clsplat.gaussians import Gaussians
-    from clsplat.runs import Run
-
-    if not path.is_dir():
-        return Gaussians.load(path)
-    trained = Run.open(path)
-    if not trained.model_path.exists():
-        raise InputError(f"{trained.model_path}: no such file, the run has not written its model yet")
-    return Gaussians.load(trained.model_path)
 
 
 def _check_scene(scene: Scene) -> None:

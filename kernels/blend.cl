@@ -46,6 +46,9 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
 #ifdef RECORD_CELLS
                           , __global uint *cells_from_sorted
 #endif
+#ifdef RAYS
+                          , __constant float *camera
+#endif
 #ifdef COUNT_PAIRS
                           , __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
 #endif
@@ -54,6 +57,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
   const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];
   PIXEL_TABLES
+  RAY_TABLES
   floatL t[OWNED], kept[OWNED], red[OWNED], green[OWNED], blue[OWNED];
   intL stop[OWNED];
   COUNT(intL added = (intL)(0); uint evaluated = 0;)
@@ -80,16 +84,12 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     } else reach = second;
     PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i + AHEAD < end ? i + AHEAD : end - 1]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
-    const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
-    const float log2o = splat[SPLAT_LOG2O];
+    SPLAT_HERE(splat)
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
-    const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
     RECORD(uint cells = 0;)
     FOR_CELLS(cell, IN_OPEN(reach, open)) {
       const int k = cell / ITEMS;
-      const floatL dy = my - AT_Y(cell);
-      const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy);
-      const floatL power = log2_alpha(u, l22 * dy, log2o);
+      const floatL power = LOG2_ALPHA(splat, cell, k);
       COUNT(evaluated += LANES;)
       const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
       if (CONTRIBUTES(reached)) {

@@ -6,8 +6,9 @@
 #include "shared/prefetch.h"
 
 // What tile_span gives, of the tiles [first_tile, end_tile) in row-major order.
-static inline void band_span(const Ellipse *e, int ty, int tiles_x, int first_tile, int end_tile, int *x0, int *x1) {
-  tile_span(e, ty, tiles_x, x0, x1);
+static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, int first_tile, int end_tile, int *x0,
+                             int *x1) {
+  tile_span(e, ty, part, tiles_x, x0, x1);
   *x0 = max(*x0, first_tile - ty * tiles_x);
   *x1 = max(*x0, min(*x1, end_tile - ty * tiles_x));
 }
@@ -64,9 +65,11 @@ __kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, 
   if (i >= n || tile_counts[i] == 0) return;
   const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i, tiles_x, tiles_y);
   for (int ty = e.tile_y0; ty < e.tile_y1; ++ty) {
-    int x0, x1;
-    tile_span(&e, ty, tiles_x, &x0, &x1);
-    for (int tx = x0; tx < x1; ++tx) atomic_inc(counts + ty * tiles_x + tx);
+    for (int part = 0; part < SPANS; ++part) {
+      int x0, x1;
+      tile_span(&e, ty, part, tiles_x, &x0, &x1);
+      for (int tx = x0; tx < x1; ++tx) atomic_inc(counts + ty * tiles_x + tx);
+    }
   }
 }
 
@@ -81,9 +84,11 @@ __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, co
     const Ellipse e = ellipse_of(splats + (size_t)SPLAT_SIZE * i, tiles_x, tiles_y);
     const int y0 = max(e.tile_y0, first_tile / tiles_x), y1 = min(e.tile_y1, (end_tile - 1) / tiles_x + 1);
     for (int ty = y0; ty < y1; ++ty) {
-      int x0, x1;
-      band_span(&e, ty, tiles_x, first_tile, end_tile, &x0, &x1);
-      count += x1 - x0;
+      for (int part = 0; part < SPANS; ++part) {
+        int x0, x1;
+        band_span(&e, ty, part, tiles_x, first_tile, end_tile, &x0, &x1);
+        count += x1 - x0;
+      }
     }
   }
   band_counts[i] = count;
@@ -108,11 +113,13 @@ __kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y
   uint pair = offsets[rank], slot = slots[i];
   const int y0 = max(e.tile_y0, first_tile / tiles_x), y1 = min(e.tile_y1, (end_tile - 1) / tiles_x + 1);
   for (int ty = y0; ty < y1; ++ty) {
-    int x0, x1;
-    band_span(&e, ty, tiles_x, first_tile, end_tile, &x0, &x1);
-    for (int tx = x0; tx < x1; ++tx, ++pair, ++slot) {
-      tile_keys[pair] = ty * tiles_x + tx - first_tile;
-      pair_ids[pair] = (uint2)(slot, i);
+    for (int part = 0; part < SPANS; ++part) {
+      int x0, x1;
+      band_span(&e, ty, part, tiles_x, first_tile, end_tile, &x0, &x1);
+      for (int tx = x0; tx < x1; ++tx, ++pair, ++slot) {
+        tile_keys[pair] = ty * tiles_x + tx - first_tile;
+        pair_ids[pair] = (uint2)(slot, i);
+      }
     }
   }
 }
@@ -132,12 +139,14 @@ __kernel void duplicate_slots(const uint visible, const int tiles_x, const int t
   uint slot = slots[i];
   const int y0 = max(e.tile_y0, first_tile / tiles_x), y1 = min(e.tile_y1, (end_tile - 1) / tiles_x + 1);
   for (int ty = y0; ty < y1; ++ty) {
-    int x0, x1;
-    band_span(&e, ty, tiles_x, first_tile, end_tile, &x0, &x1);
-    for (int tx = x0; tx < x1; ++tx, ++slot) {
-      tile_keys[slot] = ty * tiles_x + tx - first_tile;
-      depth_keys[slot] = depth;
-      gaussian_from_slot[slot] = i;
+    for (int part = 0; part < SPANS; ++part) {
+      int x0, x1;
+      band_span(&e, ty, part, tiles_x, first_tile, end_tile, &x0, &x1);
+      for (int tx = x0; tx < x1; ++tx, ++slot) {
+        tile_keys[slot] = ty * tiles_x + tx - first_tile;
+        depth_keys[slot] = depth;
+        gaussian_from_slot[slot] = i;
+      }
     }
   }
 }

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from models import random_gaussians
 
+from clsplat import colmap, layers, verb_render  # noqa: F401  # imported before fakes take their modules' places
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig, TrainConfig
 from clsplat.errors import DeviceError, InputError
@@ -47,6 +48,11 @@ class Pipeline:
     written: dict[str, np.ndarray] = field(default_factory=dict)
     cameras: dict[str, Camera] = field(default_factory=lambda: {"a.jpg": camera(), "sub/b.c.jpg": camera(20, 40)})
     training: Callable[..., None] = lambda *_: None
+
+    def write_layers(self, path: Path, made: dict[str, np.ndarray], *_: object) -> None:
+        """In place of the real one."""
+        planes = [plane if plane.ndim == 3 else plane[:, :, None] for plane in made.values()]
+        self.written[str(path)] = np.concatenate(planes, axis=2)
 
 
 @pytest.fixture
@@ -93,7 +99,9 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             assert isinstance(device, FakeDevice)
             assert config == RasterizerConfig()
 
-        def render(self, gaussians: Gaussians, camera: Camera, background: tuple[float, ...] = (0, 0, 0)) -> Result:
+        def render(
+            self, gaussians: Gaussians, camera: Camera, background: tuple[float, ...] = (0, 0, 0), **_: Any
+        ) -> Result:
             pipe.calls.append(("render", len(gaussians), camera.width, camera.height, tuple(background)))
             size = (camera.height, camera.width)
             return Result(np.full((*size, 3), 0.25, np.float32), np.full(size, 0.5, np.float32))
@@ -126,12 +134,13 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         assert image.shape[2] == 3 or alpha == "associated"
         pipe.written[str(path)] = image
 
+    monkeypatch.setattr(colmap, "read_cameras", lambda _: pipe.cameras)
+    monkeypatch.setattr(layers, "write_layers", pipe.write_layers)
     fakes: dict[str, dict[str, Any]] = {
         "scene": {"load_scene": load_scene},
         "training": {"train": train},
         "rendering": {"Renderer": Renderer},
         "device.context": {"open_device": open_device},
-        "colmap": {"read_cameras": lambda _: pipe.cameras},
         "images": {"write_image": write_image},
     }
     for name, members in fakes.items():

@@ -25,7 +25,7 @@ def test_render(model: str, folder: str, pipeline: Pipeline, tmp_path: Path, cap
         tmp_path / "out" / "x_a_y.exr",
         tmp_path / "out" / "x_sub" / "b.c_y.exr",
     ]
-    assert list(pipeline.written) == [record["path"] for record in records]
+    assert sorted(pipeline.written) == sorted(record["path"] for record in records)
     assert pipeline.calls == [("render", 4, 32, 24, (0.5, 0, 1)), ("render", 4, 20, 40, (0.5, 0, 1))]
     assert pipeline.written[records[0]["path"]].shape == (24, 32, 3)
 
@@ -80,11 +80,75 @@ def test_render_sizes(
     assert pipeline.calls == [("render", 4, *size, (0, 0, 0))]
 
 
+PATH = {
+    "render_width": 40,
+    "render_height": 30,
+    "camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 60}] * 12,
+}
+
+
+def test_render_of_a_camera_path(model: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
+    cameras = tmp_path / "camera_path.json"
+    cameras.write_text(json.dumps(PATH))
+    out = str(tmp_path / "shot" / "beauty.####.exr")
+    assert main(["render", model, "--cameras", str(cameras), "-o", out, "--frames", "3,8-11:2", "--json"]) == 0
+    records = json.loads(capsys.readouterr().out)
+    assert [record["frame"] for record in records] == [3, 8, 10]
+    assert sorted(pipeline.written) == [str(tmp_path / "shot" / f"beauty.{i:04d}.exr") for i in (3, 8, 10)]
+    assert pipeline.calls == [("render", 4, 40, 30, (0, 0, 0))] * 3
+    assert main(["render", model, "--cameras", str(cameras), "-o", out, "--frames", "12-13", "--width", "80"]) == 0
+    assert pipeline.calls[3:] == [("render", 4, 80, 60, (0, 0, 0))]
+    captured = capsys.readouterr()
+    assert captured.err == (
+        "clsplat: warning: --frames 12-13: 1 of these frames do not exist; there are the frames 1-12\n"
+    )
+
+
+@pytest.mark.parametrize("path", ["turntable", "spiral", "through"])
+def test_render_along_a_path(path: str, model: str, folder: str, pipeline: Pipeline, tmp_path: Path) -> None:
+    out = str(tmp_path / "%02d.png")
+    assert main(["render", model, "--cameras", folder, "-o", out, "--path", path, "--count", "5"]) == 0
+    assert sorted(pipeline.written) == [str(tmp_path / f"{i:02d}.png") for i in range(1, 6)]
+    assert pipeline.calls == [("render", 4, 32, 24, (0, 0, 0))] * 5
+
+
+def test_render_of_frames_that_begin_negative(model: str, pipeline: Pipeline, tmp_path: Path) -> None:
+    key = {"position": [0, 0, 0], "world_from_cam": [1, 0, 0, 0], "fov_x": 60}
+    keys = [{"frame": -5, **key}, {"frame": 5, **key}]
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(json.dumps({"clsplat_cameras": 1, "width": 8, "height": 6, "keys": keys}))
+    out = str(tmp_path / "{frame}.png")
+    assert main(["render", model, "--cameras", str(cameras), "-o", out, "--frames=-2-1"]) == 0
+    assert set(pipeline.written) == {str(tmp_path / f"{i}.png") for i in (-2, -1, 0, 1)}
+
+
+def test_cameras_that_cannot_be_rendered(model: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
+    cameras, out = tmp_path / "camera_path.json", ["-o", str(tmp_path / "shot" / "####.exr")]
+    cases: list[tuple[dict[str, object], list[str], str]] = [
+        ({"camera_path": []}, out, f"{cameras}: has no keys in 'camera_path'"),
+        ({}, [*out, "--frames", "20-30"], "--frames 20-30: holds none of the frames to render"),
+        ({}, [*out, "--frames", "9-3"], "--frames 9-3: the range '9-3' is empty"),
+        ({}, [*out, "--count", "3"], "--count 3: expected --path with it"),
+        ({}, [*out, "--path", "turntable", "--count", "0"], "--count 0: expected 1 to 1,000,000 frames"),
+        ({}, [*out, "--usd-camera", "c"], "is no USD stage"),
+        ({}, ["-o", str(tmp_path / "shot" / "a.exr")], "or a frame number such as ####"),
+        ({}, ["-o", str(tmp_path / "shot" / "{nam}.exr")], "{nam} is not known, expected {name}, {frame}, #### or"),
+    ]
+    for changes, arguments, message in cases:
+        cameras.write_text(json.dumps({**PATH, **changes}))
+        assert main(["render", model, "--cameras", str(cameras), *arguments]) == 2, arguments
+        assert message in error_line(capsys)
+    assert main(["render", model, "--cameras", str(cameras), *out, "--path", "zigzag"]) == 2
+    assert "zigzag" in error_line(capsys)
+    assert not pipeline.written
+    assert not (tmp_path / "shot").exists()
+
+
 def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
     out = str(tmp_path / "{name}.png")
     cases = [
         (["--cameras", folder, "-o", str(tmp_path / "one.png")], "has no {name} in it, expected one to tell 2 cameras"),
-        (["--cameras", folder, "-o", str(tmp_path / "{name}.tga")], "extension '.tga', expected .png or .exr"),
+        (["--cameras", folder, "-o", str(tmp_path / "{name}.tga")], "extension '.tga', expected one of .exr, .png"),
         (["--cameras", folder, "-o", str(tmp_path / "{name}")], "extension 'none'"),
         (["--cameras", str(tmp_path / "none"), "-o", out], "none: no such folder"),
         (["--cameras", folder, "-o", out, "--background", "red"], "expected black, white or three numbers"),

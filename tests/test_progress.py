@@ -2,9 +2,12 @@
 """Progress as plain lines and as a bar."""
 
 import io
+import json
 from dataclasses import dataclass
+from typing import Any
 
-from clsplat.progress import StageProgress, TrainProgress, duration
+from clsplat.progress import FrameProgress, StageProgress, TrainProgress, duration
+from clsplat.render_job import Record
 
 
 @dataclass
@@ -46,6 +49,50 @@ def test_a_bar_on_a_terminal() -> None:
         progress(Report(10))
     assert "step 10/10" in stream.getvalue()
     assert "PSNR 20.00" in stream.getvalue()
+
+
+def frames() -> list[Record]:
+    return [Record("a", 7, "a.0007.exr", 8, 6, 0.25), Record("b", 8, "a.0008.exr", 8, 6, 0.0, skipped=True)]
+
+
+def shown(style: Any, *, stream: io.StringIO, lines: io.StringIO | None) -> str:
+    with FrameProgress(2, style, lines=lines, stream=stream) as progress:
+        for record in frames():
+            progress(record)
+    return "" if lines is None else lines.getvalue()
+
+
+def test_frames_on_a_terminal_are_a_bar() -> None:
+    bar = Terminal()
+    assert shown("auto", stream=bar, lines=Terminal()) == ""  # lines would go through the bar
+    assert "frame 8" in bar.getvalue()
+    assert "2/2" in bar.getvalue()
+    assert shown("auto", stream=Terminal(), lines=io.StringIO()) == "a.0007.exr  8x6  0.25 s\n"
+
+
+def test_frames_elsewhere_are_lines() -> None:
+    plain = io.StringIO()
+    assert shown("auto", stream=plain, lines=io.StringIO()) == "a.0007.exr  8x6  0.25 s\n"
+    assert shown("auto", stream=plain, lines=None) == ""
+    assert shown("none", stream=plain, lines=io.StringIO()) == ""
+    first, second = shown("json", stream=Terminal(), lines=io.StringIO()).splitlines()
+    assert json.loads(first) == {
+        "frame": 7,
+        "name": "a",
+        "path": "a.0007.exr",
+        "seconds": 0.25,
+        "skipped": False,
+        "done": 1,
+        "total": 2,
+    }
+    assert json.loads(second)["skipped"] is True
+    assert shown("openjd", stream=plain, lines=io.StringIO()).splitlines() == [
+        "openjd_progress: 50.0",
+        "openjd_status: frame 7 took 0.25 s",
+        "openjd_progress: 100.0",
+        "openjd_status: frame 8 is there",
+    ]
+    assert plain.getvalue() == ""
 
 
 def test_stages_are_told_apart() -> None:

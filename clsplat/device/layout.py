@@ -34,6 +34,15 @@ SPLAT = (
 docs/gradients.md times sqrt(log2(e) / 2), so that log2(alpha) = LOG2O - u^2 - v^2; colour; camera depth; half extents
 in pixels of the ellipse where alpha is 1/255."""
 
+RAY = (
+    *("FX", "FY", "FZ", "UX", "UY", "UZ", "VX", "LOG2O"),
+    *("RED", "GREEN", "BLUE", "DEPTH"),
+    *("VY", "VZ", "COLUMNS", "ROWS"),
+)
+"""The same of an equirectangular or fisheye camera, colour and depth where SPLAT has them: the mean's direction F; U
+and V, of which a ray r in the camera makes u = U.r / F.r and v = V.r / F.r, so that log2(alpha) = LOG2O - u^2 - v^2;
+distance; tiles of the box, 16 bits each, first and one past the last (kernels/shared/tile.h)."""
+
 SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
 """Partial gradients of one (tile, Gaussian) pair; the last two only where absolute gradients are kept. Where
 contributions are kept, the sum of the blending weights is behind them all (`kernels/shared/splat.h`: SLOT_WEIGHT)."""
@@ -67,7 +76,7 @@ WIDEST_SLOTS = SlotFields(absolute=True, contributions=True)
 def header() -> str:
     """The declarations as OpenCL C."""
     lines = [f"#define TILE {TILE}", f"#define PAD {PAD}"]
-    for prefix, fields in (("CAMERA", CAMERA), ("SPLAT", SPLAT), ("SLOT", SLOT)):
+    for prefix, fields in (("CAMERA", CAMERA), ("SPLAT", SPLAT), ("RAY", RAY), ("SLOT", SLOT)):
         lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]
         lines.append(f"#define {prefix}_SIZE {len(fields)}")
     lines.append(f"#define SLOT_PLAIN {SLOT_PLAIN}")

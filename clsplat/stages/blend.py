@@ -57,17 +57,19 @@ def blend(
     band: Band | None = None,
     *,
     record: bool = True,
+    camera_array: DeviceArray | None = None,
 ) -> Blended:
     """Blend the Gaussians of each of the band's tiles, all tiles if none is given, front to back over the background
     (3,). Pixels of other tiles are left as they are.
 
-    record: keep the cells that the gradient has to go through, where the kernels' shape has them.
+    record: keep the cells that the gradient has to go through, where the kernels' shape has them; camera_array: for
+    pixels that are rays, whose gradient there is none of.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     planes = _planes(work, width, height, kept=band is not None and band.first > 0)
     items = tile_items(device)
     cells = None
-    if record and items == 1 and device.shape.lanes >= 8:
+    if record and not device.switched("RAYS") and items == 1 and device.shape.lanes >= 8:
         cells = work.array("cells_from_sorted", lists.gaussian_from_sorted.shape, np.uint32)
     defines = {"RECORD_CELLS": True} if cells else {}
     launch_groups(
@@ -85,6 +87,7 @@ def blend(
         background,
         *planes,
         *([cells] if cells else []),
+        *([camera_array] if device.switched("RAYS") else []),
     )
     return Blended(*planes, cells)
 

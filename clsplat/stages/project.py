@@ -16,6 +16,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.layout import CAMERA, PLAIN_SLOTS, SPLAT, TILE, SlotFields
 from clsplat.device.profile import stage
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
@@ -220,7 +221,15 @@ def download_gaussians(gaussians: AnyGaussians) -> Gaussians:
 
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
-    """A camera in the order of `layout.CAMERA`: its values rounded to float32, and as _LOW what that left of them."""
+    """A camera in the order of `layout.CAMERA`: its values rounded to float32, and as _LOW what that left of them.
+
+    Raises InputError for a projection that the kernels do not have.
+    """
+    if camera.projection == "orthographic":
+        raise InputError("orthographic cameras are not rendered yet, expected another projection")
+    if camera.projection == "equirectangular" and camera.width > (turn := 2 * np.pi * camera.fx) * (1 + 1e-6):
+        wide = f"{camera.width} pixels wide, of which {turn:.1f} are a whole turn"
+        raise InputError(f"an equirectangular camera is {wide}: expected no more")
     half_w, half_h = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
     values = {
         "FX": camera.fx,
@@ -274,9 +283,15 @@ def project(
     tile_counts = work.array("tile_counts", (n,), np.uint32)
     tiles_x, tiles_y = tiles_of(camera)
     keeps_culled = device.switched("NO_FRUSTUM_CULL", "NO_OPACITY_CULL")
+    rays = device.switched("RAYS")
+    if rays:
+        keeps_culled = False  # project_rays has no such switches
     projected = Projected(splats, tile_counts, work.array("shown", (n,), np.uint32) if keeps_culled else None)
     for start, stop, (part,) in parts(work, gaussians):
         out = projected.rows(start, stop)
+        if rays:
+            _project_rays(device, part, camera, camera_array, out)
+            continue
         extras = [name for name in ("sh_degrees", "sh_cache") if name in part.arrays]
         defines = {name.upper(): True for name in extras}
         if part["sh_rest"].dtype == np.float16:
@@ -297,6 +312,28 @@ def project(
             *(part[name] for name in extras),
         )
     return projected
+
+
+def _project_rays(
+    device: Device, part: DeviceGaussians, camera: Camera, camera_array: DeviceArray, out: Projected
+) -> None:
+    defines: dict[str, object] = {"SH_DEGREES": True} if "sh_degrees" in part.arrays else {}
+    if part["sh_rest"].dtype == np.float16:
+        defines["SH_HALF"] = True
+    launch_items(
+        device,
+        device.kernels("project_rays", LANES=1, **defines).project_rays,
+        part.count,
+        part.count,
+        part.coefficients,
+        camera.width,
+        camera.height,
+        camera_array,
+        *(part[group] for group in GROUPS),
+        out.splats,
+        out.tile_counts,
+        *([part["sh_degrees"]] if "sh_degrees" in part.arrays else []),
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,28 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
     sum_gvv = fmaL(gv, v, sum_gvv);                                                                                   \
   } while (0)
 
+// What a loop over cells needs of a Gaussian, and log2 of its alpha before the cap in cell `cell`, the k-th of the item's.
+#ifdef RAYS
+#include "shared/rays.h"
+#define RAY_TABLES                                                                                                    \
+  floatL ray_x[OWNED], ray_y[OWNED], ray_z[OWNED];                                                                    \
+  for (int k = 0; k < OWNED; ++k) {                                                                                   \
+    const int cell = get_local_id(0) + k * ITEMS;                                                                     \
+    ray_of((float)tile_x + 0.5f + PIXELS_X(cell), (float)tile_y + 0.5f + PIXELS_Y(cell), camera, ray_x + k,           \
+           ray_y + k, ray_z + k);                                                                                     \
+  }
+#define SPLAT_HERE(splat)
+#define LOG2_ALPHA(splat, cell, k) log2_alpha_of_ray(ray_x[k], ray_y[k], ray_z[k], splat)
+#else
+#define RAY_TABLES
+#define SPLAT_HERE(splat)                                                                                             \
+  const float l11 = (splat)[SPLAT_L11], l12 = (splat)[SPLAT_L12], l22 = (splat)[SPLAT_L22];                           \
+  const float log2o = (splat)[SPLAT_LOG2O];                                                                           \
+  const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
+#define LOG2_ALPHA(splat, cell, k)                                                                                    \
+  log2_alpha(whitened_u(l11, l12, mx - AT_X(cell), my - AT_Y(cell)), l22 * (my - AT_Y(cell)), log2o)
+#endif
+
 // log2 of alpha before the cap, from the mean's offset in (u, v).
 static inline floatL log2_alpha(floatL u, floatL v, float log2o) {
   return fmaL(-u, u, fmaL(-v, v, (floatL)(log2o)));

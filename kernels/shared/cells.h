@@ -52,7 +52,9 @@ typedef int4 int4U __attribute__((aligned(4)));
 // The cells that a Gaussian reaches: those that have a pixel in its ellipse, as bits, where one work-item walks
 // a tile of at most 32; else those that its box reaches.
 #if LANES >= 8 && ITEMS == 1
+#ifndef RAYS // there every cell of a tile is looked at
 #define CELLS_BY_ELLIPSE
+#endif
 typedef uint Reach;
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_ctz)
@@ -109,7 +111,7 @@ static inline uint join_rows(int8 bits) {
 }
 
 static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) {
-#if defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP)
+#if (defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP)) || defined(RAYS)
   return CELLS == 32 ? 0xffffffffu : (1u << (CELLS % 32)) - 1;
 #else
   const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
@@ -157,6 +159,7 @@ typedef struct {
 
 static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) {
   Reach reach = {0, COLUMNS, 0, ROWS};
+#ifndef RAYS
   const float x = (splat[SPLAT_PIXEL_X] - (float)tile_x) + splat[SPLAT_SUB_X];
   const float y = (splat[SPLAT_PIXEL_Y] - (float)tile_y) + splat[SPLAT_SUB_Y];
 #ifndef NO_COLUMN_SKIP
@@ -166,6 +169,7 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #ifndef NO_ROW_SKIP
   reach.y0 = first_cell(y - splat[SPLAT_HALF_H], (float)CELL_H, ROWS);
   reach.y1 = end_cell(y + splat[SPLAT_HALF_H], (float)CELL_H, ROWS);
+#endif
 #endif
   return reach;
 }

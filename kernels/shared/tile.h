@@ -37,6 +37,29 @@ static inline int end_cell(float high, float size, int count) {
 #define SMALL_BOX 16
 #endif
 
+#ifdef RAYS // what a pixel shows is a direction: project_rays.cl has found the box
+typedef struct {
+  int tile_x0, tile_x1, tile_y0, tile_y1; // of the box; where x0 > x1 it goes round: [x0, tiles_x) and [0, x1)
+  int box;                                // how many tiles
+} Ellipse;
+
+static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int tiles_y) {
+  const uint columns = as_uint(splat[RAY_COLUMNS]), rows = as_uint(splat[RAY_ROWS]);
+  Ellipse e = {columns & 0xffff, columns >> 16, rows & 0xffff, rows >> 16, 0};
+  e.box = (e.tile_y1 - e.tile_y0) * (e.tile_x1 - e.tile_x0 + (e.tile_x0 > e.tile_x1 ? tiles_x : 0));
+  return e;
+}
+
+// The tiles [*x0, *x1) of the box in a tile row, in two parts.
+#define SPANS 2
+static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, int *x0, int *x1) {
+  const int wraps = e->tile_x0 > e->tile_x1;
+  *x0 = wraps && part == 0 ? 0 : e->tile_x0;
+  *x1 = wraps && part == 1 ? tiles_x : e->tile_x1;
+  if (!wraps && part == 1) *x1 = *x0;
+}
+
+#else
 typedef struct {
   float mx, my, l11, l12, l22, half_w, half_h;
   float budget;  // u^2 + v^2 at its edge
@@ -88,8 +111,9 @@ static inline float right_edge(const Ellipse *e, float d0, float d1) {
   return (-e->l12 * dy + sqrt(rest > 0.0f ? rest : 0.0f)) / e->l11;
 }
 
-// The tiles [*x0, *x1) that the ellipse reaches in tile row ty, or those of its box if they are few.
-static inline void tile_span(const Ellipse *e, int ty, int tiles_x, int *x0, int *x1) {
+// The tiles [*x0, *x1) that the ellipse reaches in tile row ty, or those of its box if they are few; all in one part.
+#define SPANS 1
+static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, int *x0, int *x1) {
   *x0 = e->tile_x0;
   *x1 = e->tile_x1 > e->tile_x0 ? e->tile_x1 : e->tile_x0;
   if (e->box <= SMALL_BOX) return;
@@ -104,15 +128,17 @@ static inline void tile_span(const Ellipse *e, int ty, int tiles_x, int *x0, int
   *x1 = end_cell(e->mx + right, (float)TILE, tiles_x);
   if (*x1 < *x0) *x1 = *x0;
 }
+#endif
 
 // How many tiles those of all rows are.
 static inline uint tile_count(const Ellipse *e, int tiles_x) {
   if (e->box <= SMALL_BOX) return e->box;
   uint count = 0;
-  for (int ty = e->tile_y0; ty < e->tile_y1; ++ty) {
-    int x0, x1;
-    tile_span(e, ty, tiles_x, &x0, &x1);
-    count += x1 - x0;
-  }
+  for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)
+    for (int part = 0; part < SPANS; ++part) {
+      int x0, x1;
+      tile_span(e, ty, part, tiles_x, &x0, &x1);
+      count += x1 - x0;
+    }
   return count;
 }

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which frames are rendered (`--frames`), and the file of each (`-o`)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from clsplat.errors import InputError
+
+MOST_FRAMES = 10_000_000
+RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?")
+FIELD = re.compile(r"(#+)|%(0\d+)?d|\{(\w*)(?::(0\d+)d?)?\}", re.ASCII)
+
+
+def parse_frames(text: str) -> list[int]:
+    """The frames of a list such as 1-100, 1-100:2 or 7,12,30-40, each once, in rising order.
+
+    A step counts from a range's begin and must be at least 1. Negative numbers are frames like any other: -5--1 is five
+    of them. Raises InputError for anything else, and for a range that ends before it begins.
+    """
+    frames: set[int] = set()
+    for word in text.split(","):
+        match = RANGE.fullmatch(word.strip())
+        if match is None:
+            raise InputError(
+                f"--frames {text}: {word.strip()!r} is no frame or range, expected such as 1-100:2 or 7,12"
+            )
+        first = int(match[1])
+        last, step = int(match[2] or first), int(match[3] or 1)
+        if step < 1:
+            raise InputError(f"--frames {text}: {word.strip()!r} has the step {step}, expected at least 1")
+        if last < first:
+            raise InputError(f"--frames {text}: the range {word.strip()!r} is empty, expected its end after its begin")
+        if (last - first) // step + len(frames) >= MOST_FRAMES:
+            raise InputError(f"--frames {text}: lists more than {MOST_FRAMES:,} frames; is a digit too many in it?")
+        frames.update(range(first, last + 1, step))
+    return sorted(frames)
+
+
+def ranges(frames: Sequence[int]) -> str:
+    """Rising frames in short, such as 1-3,7; the first ones where there are many gaps."""
+    runs: list[list[int]] = []
+    for frame in frames:
+        if runs and frame == runs[-1][1] + 1:
+            runs[-1][1] = frame
+        else:
+            runs.append([frame, frame])
+    words = [str(first) if first == last else f"{first}-{last}" for first, last in runs]
+    return ",".join(words[:8]) + (",..." if len(words) > 8 else "")
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A pattern for the names of files.
+
+    `####` and `%04d` are the frame's number in at least so many digits, `{frame}` and `%d` in as few as it has,
+    `{frame:04}` in four again; `{name}` is its name without extension, with its folders.
+    """
+
+    text: str
+
+    def __post_init__(self) -> None:
+        for match in FIELD.finditer(self.text):
+            if match[3] not in (None, "frame") and not (match[3] == "name" and match[4] is None):
+                raise InputError(f"{self.text}: {match[0]} is not known, expected {{name}}, {{frame}}, #### or %04d")
+
+    @property
+    def has_frame(self) -> bool:
+        """Whether it tells frames apart by their numbers."""
+        return any(match[3] != "name" for match in FIELD.finditer(self.text))
+
+    @property
+    def has_name(self) -> bool:
+        """Whether it tells frames apart by their names."""
+        return any(match[3] == "name" for match in FIELD.finditer(self.text))
+
+    def path(self, frame: int, name: str) -> Path:
+        """The file of a frame. Raises InputError for a name that leads out of the output folder."""
+
+        def fill(match: re.Match[str]) -> str:
+            if match[3] == "name":
+                return _stem(name)
+            width = len(match[1]) if match[1] else int(match[2] or match[4] or 0)
+            return f"{frame:0{width}d}"
+
+        # one pass: a name may have # or % in it
+        return Path(FIELD.sub(fill, self.text))
+
+
+def _stem(name: str) -> str:
+    pure = PurePosixPath(name)
+    if pure.is_absolute() or ".." in pure.parts:
+        raise InputError(f"image name {name!r} leads out of the output folder")
+    if not pure.name:
+        raise InputError(f"image name {name!r} is empty, expected a name for the file")
+    return str(pure.with_suffix(""))
+
+
+def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
+    """The file of every frame (number, name). Raises InputError where two would be one, or one would leave the
+    folder, or the pattern is none."""
+    parsed = Pattern(pattern)
+    if len(frames) > 1 and not (parsed.has_name or parsed.has_frame):
+        raise InputError(
+            f"{pattern}: has no {{name}} in it, expected one to tell {len(frames)} cameras apart, or a frame number "
+            "such as ####"
+        )
+    taken: dict[Path, str] = {}
+    for frame, name in frames:
+        path = parsed.path(frame, name)
+        if path in taken:
+            raise InputError(f"{path}: would be both {taken[path]} and {name}")
+        taken[path] = name
+    return list(taken)

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a rendered frame is written as: layers of channels in EXR, one part or several, or a plain picture.
+
+EXR names follow the OpenEXR documentation ("Technical introduction", layers): R G B A Z, N.x N.y N.z, P.x P.y P.z,
+forward.u forward.v. Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
+vectors, p_camera = p_world M, with the camera looking along -z, x right, y up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config import Compression, ExrDepth, Parts
+from clsplat.errors import InputError
+from clsplat.images import image_size, unassociate, write_spec
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """names: of the channels in a file. kind: colour is half or float as asked for; exact stays float, as a half has 11
+    bits of a depth; whole is uint32 in a part of its own, else float. part: its name in a file of several parts."""
+
+    names: tuple[str, ...]
+    kind: Literal["colour", "exact", "whole"]
+    part: str
+
+
+LAYERS: dict[str, Layer] = {
+    "rgb": Layer(("R", "G", "B"), "colour", "rgba"),
+    "alpha": Layer(("A",), "colour", "rgba"),
+    "depth": Layer(("Z",), "exact", "depth"),
+    "median": Layer(("median.Z",), "exact", "median"),
+    "first": Layer(("first.Z",), "exact", "first"),
+    "normals": Layer(("N.x", "N.y", "N.z"), "colour", "N"),
+    "position": Layer(("P.x", "P.y", "P.z"), "exact", "P"),
+    "motion": Layer(("forward.u", "forward.v"), "exact", "forward"),
+    "count": Layer(("count",), "whole", "count"),
+    "id": Layer(("id",), "whole", "id"),
+}
+"""Every channel that `--channels` takes, in the order of a file."""
+
+_MATRICES = {"worldToCamera": "worldtocamera", "worldToNDC": "worldtoscreen"}
+"""OpenImageIO's names of them."""
+_HALF_MAX = np.float32(65504)
+_LARGEST_FLOAT_INDEX = 2**24
+
+EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How pictures are encoded. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
+
+    depth: ExrDepth = "half"
+    parts: Parts = "one"
+    compression: Compression = "zip"
+    bits: int = 8
+    quality: int = 95
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Where the pixels lie: x, y of the first in the display window, whose size is width x height."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, eq=False)
+class Header:
+    """What goes into the file beside pixels; window: None where the picture is the display window."""
+
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    matrices: Mapping[str, Float64] = field(default_factory=dict)
+    window: Window | None = None
+    pixel_aspect: float = 1.0
+
+
+def parse_channels(text: str) -> tuple[str, ...]:
+    """The names in `text`, comma-separated, in the order of LAYERS. Raises InputError."""
+    asked = [word.strip() for word in text.split(",") if word.strip()]
+    unknown = [word for word in asked if word not in LAYERS]
+    if unknown or not asked:
+        found = f"has {', '.join(map(repr, unknown))}" if unknown else "is empty"
+        raise InputError(f"--channels {text}: {found}, expected some of {', '.join(LAYERS)}")
+    return tuple(name for name in LAYERS if name in asked)
+
+
+def check_format(path: str, channels: Iterable[str]) -> None:
+    """Raise InputError where a file of that name cannot hold the channels."""
+    extension = Path(path).suffix.lower()
+    if extension not in EXTENSIONS:
+        raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(EXTENSIONS)}")
+    if extension == ".exr":
+        return
+    holds = ("rgb",) if extension in (".jpg", ".jpeg") else ("rgb", "alpha")
+    over = [name for name in channels if name not in holds]
+    if over or "rgb" not in channels:
+        lacking = f"cannot hold {', '.join(over)}" if over else "needs rgb"
+        raise InputError(f"{path}: a {extension[1:].upper()} {lacking}; write .exr, or other --channels")
+
+
+def camera_matrices(camera: Camera) -> dict[str, Float64]:
+    """worldToCamera and worldToNDC of a perspective camera: x and y from -1 to 1 over the picture, z from -1 at the
+    near plane to 1 at infinity."""
+    to_camera = np.eye(4)
+    flip = np.diag([1.0, -1.0, -1.0])
+    to_camera[:3, :3] = (flip @ camera.rotation).T
+    to_camera[3, :3] = flip @ camera.translation
+    projection = np.zeros((4, 4))  # of row vectors; the camera looks along -z, so that w = -z
+    projection[0, 0] = 2 * camera.fx / camera.width
+    projection[1, 1] = 2 * camera.fy / camera.height
+    projection[2] = [1 - 2 * camera.cx / camera.width, 2 * camera.cy / camera.height - 1, -1.0, -1.0]
+    projection[3, 2] = -2 * camera.near
+    return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
+
+
+def write_layers(
+    path: Path, layers: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
+) -> None:
+    """Write a frame, atomically.
+
+    layers: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
+    numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `images.write_image`.
+    """
+    path, encoding, header = Path(path), encoding or Encoding(), header or Header()
+    check_format(str(path), layers)
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such folder to write {path.name} to")
+    ordered = {name: layers[name] for name in LAYERS if name in layers}
+    if path.suffix.lower() == ".exr":
+        groups = _parts(tuple(ordered)) if encoding.parts == "several" else [tuple(ordered)]
+        pairs = [_exr_part(group, ordered, encoding, header, named=len(groups) > 1) for group in groups]
+        write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], "exr")
+    else:
+        pixels, spec = _picture(path.suffix.lower(), ordered, encoding, header)
+        write_spec(path, [pixels], [spec], path.suffix.lower()[1:])
+
+
+def is_whole(
+    path: Path,
+    width: int,
+    height: int,
+    channels: Iterable[str],
+    encoding: Encoding,
+    attributes: Mapping[str, str | int | float] | None = None,
+) -> bool:
+    """Whether a file is there that holds these channels, as `write_layers` would have them, in a picture of that size,
+    with no other values of these attributes, and that decodes to its last row. A file that was cut short does not."""
+    channels = [name for name in LAYERS if name in set(channels)]
+    exr = path.suffix.lower() == ".exr"
+    groups = _parts(channels) if exr and encoding.parts == "several" else [tuple(channels)]
+    if not path.is_file():
+        return False
+    try:
+        image_size(path)  # finds a PNG that is cut short, of which libpng would print
+    except InputError:
+        return False
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        oiio.geterror()
+        return False
+    try:
+        for part, group in enumerate(groups):
+            if not source.seek_subimage(part, 0):
+                return False
+            spec = source.spec()
+            names = tuple(channel for name in group for channel in LAYERS[name].names)
+            if (spec.width, spec.height, tuple(spec.channelnames)) != (width, height, names):
+                return False
+            if any(spec.getattribute(key) not in (None, value) for key, value in (attributes or {}).items()):
+                return False
+            bottom = spec.y + spec.height
+            row = source.read_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels, oiio.FLOAT)
+            if row is None or source.geterror():
+                return False
+        return not source.seek_subimage(len(groups), 0)
+    finally:
+        source.geterror()
+        source.close()
+
+
+def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
+    grouped: dict[str, list[str]] = {}
+    for name in names:
+        grouped.setdefault(LAYERS[name].part, []).append(name)
+    return [tuple(group) for group in grouped.values()]
+
+
+def _exr_part(
+    names: Sequence[str], layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
+) -> tuple[NDArray[Any], Any]:
+    kinds = [LAYERS[name].kind for name in names for _ in LAYERS[name].names]
+    planes = [_planes(layers[name]) for name in names]
+    if set(kinds) == {"whole"}:
+        pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes the largest
+        spec = _spec(pixels, oiio.UINT32, header)
+    else:
+        pixels = np.concatenate([_for_floats(name, layers[name]) for name in names], axis=2)
+        formats = [oiio.HALF if kind == "colour" and encoding.depth == "half" else oiio.FLOAT for kind in kinds]
+        half = np.array([one == oiio.HALF for one in formats])
+        pixels[:, :, half] = np.clip(pixels[:, :, half], -_HALF_MAX, _HALF_MAX)  # else it would become infinite
+        spec = _spec(pixels, formats[0] if len(set(formats)) == 1 else oiio.FLOAT, header)
+        if len(set(formats)) > 1:
+            spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
+    spec.channelnames = tuple(channel for name in names for channel in LAYERS[name].names)
+    if "alpha" in names:
+        spec.alpha_channel = spec.channelnames.index("A")
+    spec.attribute("compression", encoding.compression)
+    if named:
+        spec.attribute("oiio:subimagename", LAYERS[names[0]].part)
+    for name, matrix in header.matrices.items():
+        spec.attribute(_MATRICES.get(name, name), oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
+    return np.ascontiguousarray(pixels), spec
+
+
+def _for_floats(name: str, plane: NDArray[Any]) -> NDArray[np.float32]:
+    if LAYERS[name].kind == "whole" and plane.max(initial=0) > _LARGEST_FLOAT_INDEX:
+        raise InputError(
+            f"--channels {name}: the largest is {plane.max():,}, more than a float holds exactly; use --parts several, "
+            "where it is a whole number"
+        )
+    return _planes(plane).astype(np.float32)
+
+
+def _picture(
+    extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+) -> tuple[NDArray[Any], Any]:
+    pixels = np.concatenate([_planes(plane) for plane in layers.values()], axis=2).astype(np.float32)
+    if pixels.shape[2] == 4 and extension == ".png":
+        pixels = unassociate(pixels)
+    bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
+    most = 2**bits - 1
+    pixels = np.rint(np.clip(np.nan_to_num(pixels), 0, 1).astype(np.float64) * most)
+    whole = np.ascontiguousarray(pixels.astype(np.uint8 if bits == 8 else np.uint16))
+    spec = _spec(whole, oiio.UINT8 if bits == 8 else oiio.UINT16, header)
+    spec.channelnames = ("R", "G", "B", "A")[: whole.shape[2]]
+    if extension == ".png":
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+    if extension in (".jpg", ".jpeg"):
+        spec.attribute("Compression", f"jpeg:{encoding.quality}")
+    return whole, spec
+
+
+def _planes(plane: NDArray[Any]) -> NDArray[Any]:
+    return plane[:, :, None] if plane.ndim == 2 else plane
+
+
+def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    if header.window is not None:
+        spec.x, spec.y = header.window.x, header.window.y
+        spec.full_x = spec.full_y = 0
+        spec.full_width, spec.full_height = header.window.width, header.window.height
+    if header.pixel_aspect != 1.0:
+        spec.attribute("PixelAspectRatio", float(header.pixel_aspect))
+    spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes
+    for name, value in header.attributes.items():
+        spec.attribute(name, value)
+    return spec

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Key frames, and the smooth camera between them.
+
+Positions go along a cubic Hermite spline over time. A key's velocity is that of the parabola through it and its two
+neighbours (Catmull-Rom for keys that are not evenly spaced in time), and never more than three times the slower of the
+two average speeds beside it. So the path and its speed are continuous, it stays within a chord's length of both keys,
+a hold (two equal keys) holds, and moving a key changes two segments on each side at most. A spline with a continuous
+second derivative has none of the last three; a centripetal one takes its knots from distances, and the times of keys
+are the user's. Rotations: the same construction on angular velocities, and cumulative Bezier curves of quaternions
+(Kim, Kim, Shin 1995, "A general construction scheme for unit quaternion curves with simple high order derivatives").
+Scalars: monotone cubics (Fritsch and Carlson 1980), focal lengths in their logarithm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from clsplat.camera import Camera
+
+Float64 = NDArray[np.float64]
+
+STEEPEST = 3.0
+"""A tangent over the slope beside it. At 3 a cubic's inner Bezier points are a chord's length from its ends; for a
+scalar it is the largest at which a cubic is sure to be monotone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Key:
+    """A camera at a frame, which need not be whole; roll: radians about its own z axis, on top of its rotation."""
+
+    frame: float
+    camera: Camera
+    roll: float = 0.0
+
+
+def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | None = None) -> list[Camera]:
+    """The cameras at `frames`, which must be of one size and projection; before the first and after the last key that
+    key's.
+
+    keys: with frames that rise. loop: frames after which the first key comes again; more than the keys span. Rotations
+    go the shorter way from key to key, rolls as far as they say. Raises ValueError for no keys, or frames that do not
+    rise.
+    """
+    if not keys:
+        raise ValueError("expected at least one key")
+    times = np.array([key.frame for key in keys], np.float64)
+    if not (np.diff(times) > 0).all() or (loop is not None and not times[-1] - times[0] < loop):
+        raise ValueError("expected keys whose frames rise, within the loop where there is one")
+    at = np.asarray(frames, np.float64)
+    positions = np.stack([key.camera.position for key in keys])
+    rotations = Rotation.from_matrix(np.stack([key.camera.rotation.T for key in keys]))
+    scalars = np.array(
+        [[key.roll, np.log(key.camera.fx), np.log(key.camera.fy), key.camera.cx, key.camera.cy] for key in keys]
+    )
+    if loop is not None:
+        # a turn before and one after: every slope looks at two neighbours at most
+        at = times[0] + np.mod(at - times[0], loop)
+        closing = np.zeros(scalars.shape[1])
+        closing[0] = 2 * np.pi * np.round((scalars[-1, 0] - scalars[0, 0]) / (2 * np.pi))
+        times = np.concatenate([times - loop, times, times + loop])
+        positions = np.tile(positions, (3, 1))
+        rotations = Rotation.concatenate([rotations] * 3)
+        scalars = np.concatenate([scalars - closing, scalars, scalars + closing])
+    if len(times) == 1:
+        times = np.array([times[0], times[0] + 1])
+        positions, scalars = np.tile(positions, (2, 1)), np.tile(scalars, (2, 1))
+        rotations = Rotation.concatenate([rotations] * 2)
+    at = np.clip(at, times[0], times[-1])
+    segment = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+
+    path = _positions(times, positions, at, segment)
+    turned = _rotations(times, rotations, at, segment)
+    values = np.asarray(PchipInterpolator(times, scalars)(at))
+    roll = np.zeros((len(at), 3))
+    roll[:, 2] = values[:, 0]
+    cam_from_world = (turned * Rotation.from_rotvec(roll)).inv().as_matrix()
+    cameras = []
+    for index, (rotation, position) in enumerate(zip(cam_from_world, path, strict=True)):
+        fx, fy = np.exp(values[index, 1:3])
+        cameras.append(
+            replace(
+                keys[int(segment[index]) % len(keys)].camera,
+                fx=float(fx),
+                fy=float(fy),
+                cx=float(values[index, 3]),
+                cy=float(values[index, 4]),
+                rotation=rotation,
+                translation=-rotation @ position,
+            )
+        )
+    return cameras
+
+
+def tangents(times: Float64, slopes: Float64) -> Float64:
+    """Velocities (N, D) at the keys from the average ones (N - 1, D) between them and the keys' times (N,)."""
+    before, after = np.diff(times)[:-1, None], np.diff(times)[1:, None]
+    result = np.concatenate([slopes[:1], slopes[-1:]])
+    if len(slopes) > 1:
+        inner = (after * slopes[:-1] + before * slopes[1:]) / (before + after)
+        # at an end the same parabola, unless it sets out backwards
+        first = ((2 * before[0] + after[0]) * slopes[0] - before[0] * slopes[1]) / (before[0] + after[0])
+        last = ((2 * after[-1] + before[-1]) * slopes[-1] - after[-1] * slopes[-2]) / (before[-1] + after[-1])
+        first = first if first @ slopes[0] > 0 else np.zeros_like(first)
+        last = last if last @ slopes[-1] > 0 else np.zeros_like(last)
+        result = np.concatenate([first[None], inner, last[None]])
+    speeds = np.linalg.norm(slopes, axis=1)
+    most = STEEPEST * np.minimum(np.append(speeds, np.inf), np.insert(speeds, 0, np.inf))
+    lengths = np.linalg.norm(result, axis=1)
+    scale = np.divide(most, lengths, out=np.ones_like(most), where=lengths > most)
+    limited: Float64 = result * scale[:, None]
+    return limited
+
+
+def _positions(times: Float64, keys: Float64, at: Float64, segment: NDArray[np.intp]) -> Float64:
+    """(F, 3)."""
+    chords, lengths = np.diff(keys, axis=0), np.diff(times)
+    velocity = tangents(times, chords / lengths[:, None])
+    h = lengths[segment][:, None]
+    s = (at - times[segment])[:, None] / h
+    leave, arrive = velocity[segment] * h, velocity[segment + 1] * h
+    path: Float64 = keys[segment] + chords[segment] * s * s * (3 - 2 * s) + s * (1 - s) * ((1 - s) * leave - s * arrive)
+    # the end of a segment is a key to the last bit only if it is taken from there
+    return np.where(s == 1, keys[segment + 1], path)
+
+
+def _rotations(times: Float64, keys: Rotation, at: Float64, segment: NDArray[np.intp]) -> Rotation:
+    lengths = np.diff(times)
+    # a step's vector is the same in the axes of the key before it and of the key after it
+    steps = (keys[:-1].inv() * keys[1:]).as_rotvec()
+    velocity = tangents(times, steps / lengths[:, None])
+    h = lengths[segment][:, None]
+    s = (at - times[segment])[:, None] / h
+    leave, arrive = velocity[segment] * h / 3, velocity[segment + 1] * h / 3
+    step = Rotation.from_rotvec(steps[segment])
+    middle = (Rotation.from_rotvec(-leave) * step * Rotation.from_rotvec(-arrive)).as_rotvec()
+    return (
+        keys[segment]
+        * Rotation.from_rotvec((1 - (1 - s) ** 3) * leave)
+        * Rotation.from_rotvec(s * s * (3 - 2 * s) * middle)
+        * Rotation.from_rotvec(s**3 * arrive)
+    )

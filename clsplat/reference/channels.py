@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The channels beside colour in float64: twin of kernels/features.cl and channels.cl. Equation numbers are those of
+docs/channels.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN, footprint
+from clsplat.reference.project import ALPHA_MIN, Projected, rotation_matrices
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """(H, W) each but for normal and position (H, W, 3) and motion (H, W, 2): eqs. (60) to (67). All 0, and index -1,
+    where nothing is added. doubt (H, W): the least distance of what decides to its threshold: transmittance to one
+    half, and the largest weight to the second largest, both as differences."""
+
+    depth: Float64
+    normal: Float64
+    position: Float64
+    motion: Float64
+    median: Float64
+    first: Float64
+    count: Int64
+    index: Int64
+    doubt: Float64
+
+
+def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> Float64:
+    """(62): (N, 3), the axis of the smallest scale, the first of equal ones, turned to the camera."""
+    axes = rotation_matrices(quaternions)[np.arange(len(means)), :, np.argmin(log_scales, axis=1)]
+    away = ((means - camera.position) * axes).sum(axis=1)
+    return np.where(away[:, None] > 0, -axes, axes)
+
+
+def image_positions(means: Float64, camera: Camera) -> tuple[Float64, NDArray[np.bool_]]:
+    """Pixels (N, 2), and whether the mean is in front of the near plane."""
+    p = means @ camera.rotation.T + camera.translation
+    in_front = p[:, 2] > camera.near
+    z = np.where(in_front, p[:, 2], 1.0)
+    return np.stack([camera.fx * p[:, 0] / z + camera.cx, camera.fy * p[:, 1] / z + camera.cy], axis=1), in_front
+
+
+def motions(means: Float64, camera: Camera, after: Camera) -> Float64:
+    """(64): (N, 2) in pixels."""
+    there, in_front = image_positions(means, after)
+    here, _ = image_positions(means, camera)
+    return np.where(in_front[:, None], there - here, 0.0)
+
+
+def channels(
+    projected: Projected,
+    order: Int64,
+    camera: Camera,
+    after: Camera,
+    *,
+    means: Float64,
+    quaternions: Float64,
+    log_scales: Float64,
+) -> Channels:
+    """Blend front to back: `order` (M,) lists the rows of `projected`."""
+    width, height = camera.width, camera.height
+    rows = np.concatenate(
+        [
+            projected.depths[:, None],
+            normals(means, quaternions, log_scales, camera),
+            means,
+            motions(means, camera, after),
+        ],
+        axis=1,
+    )
+    sums, total = np.zeros((height, width, rows.shape[1])), np.zeros((height, width))
+    transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
+    median, first, largest = (np.zeros((height, width)) for _ in range(3))
+    second = np.zeros((height, width))
+    count, index = np.zeros((height, width), np.int64), np.full((height, width), -1, np.int64)
+    doubt = np.full((height, width), np.inf)
+    for gaussian in order:
+        splat = footprint(projected, int(gaussian), width, height)
+        if splat is None:
+            continue
+        box = (splat.rows, splat.columns)
+        alpha = np.minimum(ALPHA_MAX, splat.raw)
+        seen = alive[box] & (alpha >= ALPHA_MIN)
+        before = transmittance[box].copy()
+        after_it = before * (1 - alpha)
+        added = seen & (after_it > TRANSMITTANCE_MIN)
+        weight = np.where(added, before * alpha, 0.0)
+        depth = projected.depths[gaussian]
+        sums[box] += weight[:, :, None] * rows[gaussian]
+        total[box] += weight
+        median[box] = np.where(added & (before > 0.5) & (after_it <= 0.5), depth, median[box])
+        doubt[box] = np.where(added, np.minimum(doubt[box], np.abs(after_it - 0.5)), doubt[box])
+        first[box] = np.where(added & (count[box] == 0), depth, first[box])
+        count[box] += added
+        heavier = weight > largest[box]
+        second[box] = np.where(heavier, largest[box], np.maximum(second[box], weight))
+        index[box] = np.where(heavier, gaussian, index[box])
+        largest[box] = np.maximum(largest[box], weight)
+        transmittance[box] = np.where(added, after_it, before)
+        alive[box] &= added | ~seen
+    some = total > 0
+    means_of = sums / np.where(some, total, 1.0)[:, :, None]
+    length = np.linalg.norm(sums[:, :, 1:4], axis=2)
+    normal = sums[:, :, 1:4] / np.where(length > 0, length, 1.0)[:, :, None]
+    return Channels(
+        depth=means_of[:, :, 0],
+        normal=normal,
+        position=means_of[:, :, 4:7],
+        motion=means_of[:, :, 7:9],
+        median=median,
+        first=first,
+        count=count,
+        index=index,
+        doubt=np.minimum(doubt, np.where(some, largest - second, np.inf)),
+    )

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Equirectangular and fisheye pictures in float64, every Gaussian at every pixel: twin of kernels/project_rays.cl and
+of blending there. Equation numbers are those of docs/cameras.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.gaussians import Gaussians
+from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN
+from clsplat.reference.cameras import cam_from_pixel, pixel_grid
+from clsplat.reference.project import ALPHA_MIN, LOW_PASS, rotation_matrices, view_directions
+from clsplat.reference.render import parameters
+from clsplat.reference.sh import sh_basis
+from clsplat.reference.sort import depth_order
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Tangents:
+    """directions, right, down (N, 3): the mean's direction and the axes of the plane that touches there, in the camera;
+    covariances (N, 2, 2) on it, with the low-pass; depths (N,): distances; opacities (N,); colors (N, 3); visible."""
+
+    directions: Float64
+    right: Float64
+    down: Float64
+    covariances: Float64
+    depths: Float64
+    opacities: Float64
+    colors: Float64
+    visible: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """image (H, W, 3), alpha (H, W), depth (H, W): mean distance by weight; margin (H, W): as of `reference.blend`."""
+
+    image: Float64
+    alpha: Float64
+    depth: Float64
+    margin: Float64
+
+
+def footprints(directions: Float64, camera: Camera) -> tuple[Float64, Float64, Float64]:
+    """(9), (10): right, down (N, 3) and what a pixel is on the tangent plane, (N, 2, 2), columns by u and v."""
+    x, y, z = directions.T
+    zero = np.zeros_like(x)
+    pixels = np.zeros((len(x), 2, 2))
+    if camera.projection == "equirectangular":
+        level = np.hypot(x, z)
+        safe = np.where(level > 0, level, 1.0)
+        s, c = np.where(level > 0, x / safe, 0.0), np.where(level > 0, z / safe, 1.0)
+        right, down = np.stack([c, zero, -s], axis=1), np.stack([-y * s, level, -y * c], axis=1)
+        pixels[:, 0, 0] = np.maximum(level, 0.5 / camera.fy) / camera.fx
+        pixels[:, 1, 1] = 1 / camera.fy
+        return right, down, pixels
+    across = np.hypot(x, y)
+    safe = np.where(across > 0, across, 1.0)
+    c, s = np.where(across > 0, x / safe, 1.0), np.where(across > 0, y / safe, 0.0)
+    right, down = np.stack([z * c, z * s, -across], axis=1), np.stack([-s, c, zero], axis=1)
+    theta = np.arctan2(across, z)
+    around = np.maximum(np.sinc(theta / np.pi), 0.5 / (np.pi * camera.fx))
+    pixels[:, 0, 0], pixels[:, 0, 1] = c / camera.fx, s / camera.fy
+    pixels[:, 1, 0], pixels[:, 1, 1] = -s * around / camera.fx, c * around / camera.fy
+    return right, down, pixels
+
+
+def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
+    """(8) to (13)."""
+    arrays = parameters(gaussians)
+    means = arrays["means"]
+    p = means @ camera.rotation.T + camera.translation
+    depths = np.linalg.norm(p, axis=1)
+    directions = p / depths[:, None]
+    right, down, pixels = footprints(directions, camera)
+    axes = camera.rotation @ rotation_matrices(arrays["quaternions"]) * np.exp(arrays["log_scales"])[:, None, :]
+    half = np.stack([right, down], axis=1) @ axes / depths[:, None, None]
+    covariances = half @ half.transpose(0, 2, 1) + LOW_PASS * pixels @ pixels.transpose(0, 2, 1)
+    opacities = 1 / (1 + np.exp(-arrays["opacity_logits"]))
+    basis = sh_basis(view_directions(means, camera)[0], gaussians.sh_degree)
+    colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, arrays["sh"][:, : basis.shape[1]]))
+    visible = (depths > camera.near) & (opacities > ALPHA_MIN)
+    return Tangents(directions, right, down, covariances, depths, opacities, colors, visible)
+
+
+def render(gaussians: Gaussians, camera: Camera, background: Float64 | tuple[float, float, float]) -> Picture:
+    """(14), then front to back by distance, as equations 14 to 16 of docs/gradients.md. A pixel without a ray shows the
+    background."""
+    t = tangents(gaussians, camera)
+    _, rays = cam_from_pixel(camera, pixel_grid(camera))
+    rays = np.nan_to_num(rays)
+    count = len(rays)
+    image, depth, total = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
+    transmittance, alive, margin = np.ones(count), np.ones(count, np.bool_), np.full(count, 0.05)
+    for gaussian in depth_order(t.depths, t.visible):
+        along = rays @ t.directions[gaussian]
+        ahead = along > 0
+        safe = np.where(ahead, along, 1.0)
+        at = np.stack([rays @ t.right[gaussian], rays @ t.down[gaussian]], axis=1) / safe[:, None]
+        q = np.einsum("ni,ij,nj->n", at, np.linalg.inv(t.covariances[gaussian]), at)
+        raw = np.where(ahead, t.opacities[gaussian] * np.exp(-0.5 * q), 0.0)
+        alpha = np.minimum(ALPHA_MAX, raw)
+        seen = alive & (alpha >= ALPHA_MIN)
+        after = transmittance * (1 - alpha)
+        added = seen & (after > TRANSMITTANCE_MIN)
+        near = np.minimum(np.abs(raw / ALPHA_MIN - 1), np.abs(raw / ALPHA_MAX - 1))
+        near = np.minimum(near, np.where(seen, np.abs(after / TRANSMITTANCE_MIN - 1), np.inf))
+        margin = np.where(alive, np.minimum(margin, near), margin)
+        weight = np.where(added, transmittance * alpha, 0.0)
+        image += weight[:, None] * t.colors[gaussian]
+        depth += weight * t.depths[gaussian]
+        total += weight
+        transmittance = np.where(added, after, transmittance)
+        alive &= added | ~seen
+    image += transmittance[:, None] * np.asarray(background, np.float64)
+    size = (camera.height, camera.width)
+    mean_depth = np.divide(depth, total, out=np.zeros(count), where=total > 0)
+    alpha_plane = 1 - transmittance
+    return Picture(image.reshape(*size, 3), alpha_plane.reshape(size), mean_depth.reshape(size), margin.reshape(size))

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches features.cl and channels.cl: what a frame has beside colour and alpha (docs/channels.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_groups, launch_items
+from clsplat.device.layout import TILE
+from clsplat.device.profile import stage
+from clsplat.stages.blend import Blended, tile_items
+from clsplat.stages.duplicate import Band
+from clsplat.stages.project import AnyGaussians, Projected, parts
+from clsplat.stages.ranges import TileLists
+
+WIDTHS = {"depth": 1, "normal": 3, "position": 3, "motion": 2}
+"""Floats of each feature."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Which features are blended, in the order of WIDTHS; depth always is, as it costs next to nothing."""
+
+    names: tuple[str, ...] = ("depth",)
+
+    @classmethod
+    def of(cls, wanted: Iterable[str]) -> Features:
+        """Depth and those of `wanted`."""
+        kept = {"depth", *wanted}
+        if unknown := kept - WIDTHS.keys():
+            raise ValueError(f"no such features: {', '.join(sorted(unknown))}")
+        return cls(tuple(name for name in WIDTHS if name in kept))
+
+    @property
+    def offsets(self) -> dict[str, int]:
+        """Where each begins in a row."""
+        found, at = {}, 0
+        for name in self.names:
+            found[name] = at
+            at += WIDTHS[name]
+        return found
+
+    @property
+    def floats(self) -> int:
+        """Of a row."""
+        return sum(WIDTHS[name] for name in self.names)
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """For both kernels."""
+        return {"FEATURES": self.floats, **{f"FEATURE_{name.upper()}": at for name, at in self.offsets.items()}}
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """Planes padded to whole tiles: means (fields, rows, stride) of the features and, behind them, the depths at which
+    half of the light is stopped and at which the first Gaussian is; whole (2, rows, stride): count and index."""
+
+    features: Features
+    means: DeviceArray
+    whole: DeviceArray
+
+
+@stage("features")
+def features(
+    device: Device,
+    work: Workspace,
+    wanted: Features,
+    gaussians: AnyGaussians,
+    camera_array: DeviceArray,
+    after: DeviceArray,
+    projected: Projected,
+) -> DeviceArray:
+    """Of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to."""
+    rows = work.array("features", (gaussians.count, wanted.floats))
+    for start, stop, (part,) in parts(work, gaussians):
+        own = projected.rows(start, stop)
+        launch_items(
+            device,
+            device.kernels("features", LANES=1, **wanted.defines).features,
+            part.count,
+            part.count,
+            camera_array,
+            after,
+            own.tile_counts,
+            part["means"],
+            part["quaternions"],
+            part["log_scales"],
+            own.splats,
+            rows.rows(start, stop),
+        )
+    return rows
+
+
+@stage("channels")
+def channels(
+    device: Device,
+    work: Workspace,
+    wanted: Features,
+    rows: DeviceArray,
+    lists: TileLists,
+    projected: Projected,
+    blended: Blended,
+    height: int,
+    band: Band | None = None,
+    camera_array: DeviceArray | None = None,
+) -> Channels:
+    """Blend the features with the weights of `blended`, which is of the same lists; the band's tiles, or all.
+    camera_array: for pixels that are rays."""
+    plane_rows, stride = blended.stops.shape
+    means = work.array("channel_means", (wanted.floats + 2, plane_rows, stride))
+    whole = work.array("channel_whole", (2, plane_rows, stride), np.int32)
+    items = tile_items(device)
+    launch_groups(
+        device,
+        device.kernels("channels", ITEMS=items, **wanted.defines).channels,
+        band.tiles if band else (plane_rows // TILE) * (stride // TILE),
+        items,
+        band.first if band else 0,
+        stride // TILE,
+        height,
+        lists.ranges,
+        lists.gaussian_from_sorted,
+        projected.splats,
+        rows,
+        blended.stops,
+        means,
+        whole,
+        *([camera_array] if device.switched("RAYS") else []),
+    )
+    return Channels(wanted, means, whole)

@@ -1,0 +1,119 @@
+// The channels beside colour (docs/channels.md): features blended with the weights of the image, and what needs the order
+// of the Gaussians: depths at which a pixel is first hit and half opaque, how many it takes and which weighs most. A
+// group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
+#include "shared/math.h"
+#include "shared/lanes.h"
+#include "shared/group.h"
+#include "shared/tile.h"
+#include "shared/cells.h"
+#include "shared/alpha.h"
+#include "shared/prefetch.h"
+
+#define PLANES (FEATURES + 2)
+#define MEDIAN FEATURES
+#define FIRST (FEATURES + 1)
+
+// ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), features (n, FEATURES), stops (height, width)
+// of blend.cl, for the tiles from first_tile on -> planes (PLANES, height, width): mean features by weight, those from
+// FEATURE_NORMAL on of unit length; depth of the median, of the first; whole (2, height, width): count, and the index of
+// the Gaussian with the largest weight, the first of those, -1 for none. All 0 where nothing was added, and in padding.
+GROUP __kernel void channels(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
+                             __global const uint *gaussian_from_sorted, __global const float *splats,
+                             __global const float *features, __global const int *stops, __global float *planes,
+                             __global int *whole
+#ifdef RAYS
+                             , __constant float *camera
+#endif
+) {
+#if ITEMS > 1
+  __local int group_last;
+#endif
+  const int tile = first_tile + get_group_id(0);
+  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
+  const int begin = ranges[2 * get_group_id(0)];
+  const size_t stride = (size_t)tiles_x * TILE;
+  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
+
+  PIXEL_TABLES
+  RAY_TABLES
+  floatL t[OWNED], sums[FEATURES + 1][OWNED], median[OWNED], nearest[OWNED], largest[OWNED];
+  intL stop[OWNED], count[OWNED], heaviest[OWNED];
+  int last = begin;
+  for (int k = 0; k < OWNED; ++k) {
+    const int cell = get_local_id(0) + k * ITEMS;
+    stop[k] = LOAD_CELL(int, stops + stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell), stride);
+    t[k] = (floatL)(1.0f);
+    for (int field = 0; field <= FEATURES; ++field) sums[field][k] = (floatL)(0.0f);
+    median[k] = nearest[k] = largest[k] = (floatL)(0.0f);
+    count[k] = (intL)(0);
+    heaviest[k] = (intL)(-1);
+    last = max(last, maxL(stop[k]));
+  }
+#if ITEMS > 1
+  if (get_local_id(0) == 0) group_last = begin;
+  barrier(CLK_LOCAL_MEM_FENCE);
+  atomic_max(&group_last, last);
+  barrier(CLK_LOCAL_MEM_FENCE);
+  last = group_last;
+#endif
+
+  for (int i = begin; i < last; ++i) {
+    const uint gaussian = gaussian_from_sorted[i];
+    PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i + AHEAD < last ? i + AHEAD : last - 1]);
+    PREFETCH(features + (size_t)FEATURES * gaussian_from_sorted[i + AHEAD < last ? i + AHEAD : last - 1]);
+    __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian;
+    __global const float *own = features + (size_t)FEATURES * gaussian;
+    SPLAT_HERE(splat)
+    const float depth = splat[SPLAT_DEPTH];
+    const Reach reach = reach_of(splat, tile_x, tile_y);
+    FOR_CELLS(cell, reach) {
+      const int k = cell / ITEMS;
+      const floatL power = LOG2_ALPHA(splat, cell, k);
+      const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
+      if (ANYL(taken)) {
+        const floatL before = t[k];
+        floatL alpha = exp2L(power);
+        alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
+        alpha = AS_FLOATL(AS_INTL(alpha) & taken);
+        const floatL weight = before * alpha;
+        t[k] = fmaL(-before, alpha, before);
+        for (int field = 0; field < FEATURES; ++field)
+          sums[field][k] = fmaL(weight, (floatL)(own[field]), sums[field][k]);
+        sums[FEATURES][k] += weight;
+        const intL halving = taken & MASKL(before > 0.5f) & MASKL(t[k] <= 0.5f);
+        median[k] = halving ? (floatL)(depth) : median[k];
+        const intL opening = taken & MASKL(count[k] == 0);
+        nearest[k] = opening ? (floatL)(depth) : nearest[k];
+        count[k] -= taken; // -1 where taken
+        const intL heavier = taken & MASKL(weight > largest[k]);
+        largest[k] = heavier ? weight : largest[k];
+        heaviest[k] = heavier ? (intL)((int)gaussian) : heaviest[k];
+      }
+    }
+  }
+
+  for (int k = 0; k < OWNED; ++k) {
+    const int cell = get_local_id(0) + k * ITEMS;
+    const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
+    const floatL total = sums[FEATURES][k];
+    const floatL divisor = total > 0.0f ? total : (floatL)(1.0f);
+#ifdef FEATURE_NORMAL
+    floatL length2 = (floatL)(0.0f);
+    for (int axis = 0; axis < 3; ++axis)
+      length2 = fmaL(sums[FEATURE_NORMAL + axis][k], sums[FEATURE_NORMAL + axis][k], length2);
+    const floatL length = length2 > 0.0f ? sqrt(length2) : (floatL)(1.0f);
+#endif
+    for (int field = 0; field < FEATURES; ++field) {
+#ifdef FEATURE_NORMAL
+      const floatL by = field >= FEATURE_NORMAL && field < FEATURE_NORMAL + 3 ? length : divisor;
+#else
+      const floatL by = divisor;
+#endif
+      STORE_CELL(float, sums[field][k] / by, planes + plane * field + pixel, stride);
+    }
+    STORE_CELL(float, median[k], planes + plane * MEDIAN + pixel, stride);
+    STORE_CELL(float, nearest[k], planes + plane * FIRST + pixel, stride);
+    STORE_CELL(int, count[k], whole + pixel, stride);
+    STORE_CELL(int, heaviest[k], whole + plane + pixel, stride);
+  }
+}

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Equirectangular and fisheye pictures against a float64 twin that has every Gaussian at every pixel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import scenes
+from compare import assert_close_images, assert_same_bits
+from pipeline import BACKGROUND, shaped
+
+from clsplat.camera import Camera, focal_length
+from clsplat.device.context import Device
+from clsplat.gaussians import Gaussians
+from clsplat.reference import rays
+from clsplat.rendering import Renderer
+
+
+def all_around(count: int, seed: int) -> Gaussians:
+    """Gaussians on every side of the origin, at distances of 0.3 to 6, some of them at the poles and on the seam."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(count, 3))
+    directions[:4] = [[0, 1, 0], [0, -1, 1e-4], [1e-4, 0, -1], [-1e-4, 0.2, -1]]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    distances = np.exp(rng.uniform(np.log(0.3), np.log(6.0), (count, 1)))
+    scales = distances * np.exp(rng.uniform(np.log(0.003), np.log(0.3), (count, 3)))
+    return scenes.make_gaussians(
+        directions * distances,
+        rng.normal(size=(count, 4)),
+        np.log(scales),
+        rng.uniform(0.02, 0.98, count),
+        scenes.random_sh(rng, count),
+    )
+
+
+def panorama(width: int, height: int, turn: float = 2 * np.pi) -> Camera:
+    """Of `turn` radians around and as much up and down as its shape has."""
+    focal = width / turn
+    tilted = scenes.tilted_camera(width, height)
+    return replace(tilted, fx=focal, fy=focal, cx=width / 2, cy=height / 2, projection="equirectangular")
+
+
+def fisheye(width: int, height: int, angle: float) -> Camera:
+    focal = focal_length(np.deg2rad(angle), width, "fisheye")
+    tilted = scenes.tilted_camera(width, height)
+    return replace(tilted, fx=focal, fy=1.1 * focal, cx=0.47 * width, cy=0.52 * height, projection="fisheye")
+
+
+CAMERAS = {
+    "panorama": panorama(96, 48),
+    "panorama of a width that is no multiple of a tile": panorama(70, 35),
+    "half a turn": panorama(64, 40, np.pi),
+    "beyond the poles": panorama(48, 40),
+    "panorama off the middle": replace(panorama(96, 48), cx=20.0),
+    "fisheye of 180 degrees": fisheye(60, 50, 180),
+    "fisheye of 300 degrees": fisheye(60, 60, 300),
+    "a whole sphere in a circle": fisheye(64, 64, 360),
+}
+
+
+@cache
+def expected(name: str) -> rays.Picture:
+    return rays.render(all_around(300, 5), CAMERAS[name], BACKGROUND)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_against_the_twin(device: Device, name: str) -> None:
+    camera, gaussians, wanted = CAMERAS[name], all_around(300, 5), expected(name)
+    image, channels = Renderer(device).render_channels(gaussians, camera, background=BACKGROUND)
+    # As of a frame; a direction of float32 is good to 1e-7, that of a pixel is 0.1.
+    assert_close_images(image.image, wanted.image, 2e-5, ignore=wanted.margin < 3e-4)
+    assert_close_images(image.alpha, wanted.alpha, 2e-5, ignore=wanted.margin < 3e-4)
+    solid = wanted.alpha > 0.5
+    assert solid.any()
+    relative = np.where(solid, channels.depth / np.where(solid, wanted.depth, 1.0), 1.0)
+    assert_close_images(relative, np.ones_like(relative), 1e-4, ignore=wanted.margin < 3e-4)
+
+
+@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees"])
+def test_the_same_bits_in_every_shape(device: Device, name: str) -> None:
+    camera, gaussians = CAMERAS[name], all_around(2000, 6)
+    first, *others = (
+        Renderer(shaped(device, *shape)).render(gaussians, camera) for shape in ((8, 1), (1, 1), (1, 64), (8, 16))
+    )
+    for other in others:
+        assert_same_bits(other.image, first.image)
+        assert_same_bits(other.alpha, first.alpha)
+
+
+def test_a_turn_of_the_panorama_is_a_shift(device: Device) -> None:
+    # A quarter turn of the camera about its own vertical axis moves the picture by a quarter of its width.
+    camera, gaussians = panorama(96, 48), all_around(300, 7)
+    about_y = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    turned = replace(camera, rotation=about_y @ camera.rotation, translation=about_y @ camera.translation)
+    renderer = Renderer(device)
+    image, moved = (renderer.render(gaussians, view).image for view in (camera, turned))
+    difference = np.abs(np.roll(image, 24, axis=1) - moved).max(axis=2)
+    # Thresholds of alpha and transmittance may flip in a few pixels, each less than a step of 8 bits.
+    assert np.count_nonzero(difference > 2e-5) < 0.01 * difference.size
+    assert difference.max() < 1 / 255
+
+
+def test_in_the_middle_a_long_fisheye_is_a_pinhole(device: Device) -> None:
+    rng = np.random.default_rng(3)
+    camera = replace(scenes.straight_camera(40, 40), fx=600.0, fy=600.0)
+    depths = rng.uniform(2.0, 6.0, 100)
+    gaussians = scenes.make_gaussians(
+        scenes.world_from_pixels(camera, rng.uniform(0, 40, (100, 2)), depths),
+        rng.normal(size=(100, 4)),
+        np.log(depths[:, None] / 600 * np.exp(rng.uniform(0, 1, (100, 3)))),
+        rng.uniform(0.1, 0.9, 100),
+        scenes.random_sh(rng, 100),
+    )
+    renderer = Renderer(device)
+    wanted = renderer.render(gaussians, camera)
+    got = renderer.render(gaussians, replace(camera, projection="fisheye"))
+    assert wanted.alpha.mean() > 0.4
+    # Angle and tangent differ by a third of the angle squared: at the edge, 20 pixels off, by 0.007 of a pixel.
+    assert np.abs(got.image - wanted.image).max() < 0.01
+
+
+def test_what_is_too_near_or_transparent_is_left_out(device: Device) -> None:
+    gaussians = all_around(4, 1)
+    gaussians.means[0] = 0.005 * gaussians.means[0] / np.linalg.norm(gaussians.means[0])
+    gaussians.opacity_logits[1:] = -20.0
+    camera = replace(panorama(32, 16), rotation=np.eye(3), translation=np.zeros(3))
+    result = Renderer(device).render(gaussians, camera)
+    assert not result.alpha.any()
