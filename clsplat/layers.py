@@ -17,7 +17,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, Window
 from clsplat.errors import InputError
 from clsplat.images import unassociate, write_spec
 
@@ -71,16 +71,6 @@ class Encoding:
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
-    """Where the pixels lie: x, y of the first in the display window, whose size is width x height."""
-
-    x: int
-    y: int
-    width: int
-    height: int
-
-
-@dataclass(frozen=True, eq=False)
 class Header:
     """What goes into the file beside pixels; window: None where the picture is the display window."""
 
@@ -115,16 +105,17 @@ def check_format(path: str, channels: Iterable[str]) -> None:
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
-    """worldToCamera and worldToNDC of a perspective camera: x and y from -1 to 1 over the picture, z from -1 at the
-    near plane to 1 at infinity."""
+    """worldToCamera and worldToNDC of a perspective camera: x and y from -1 to 1 over the display window, z from -1 at
+    the near plane to 1 at infinity."""
     to_camera = np.eye(4)
     flip = np.diag([1.0, -1.0, -1.0])
     to_camera[:3, :3] = (flip @ camera.rotation).T
     to_camera[3, :3] = flip @ camera.translation
+    display = camera.window or camera
     projection = np.zeros((4, 4))  # of row vectors; the camera looks along -z, so that w = -z
-    projection[0, 0] = 2 * camera.fx / camera.width
-    projection[1, 1] = 2 * camera.fy / camera.height
-    projection[2] = [1 - 2 * camera.cx / camera.width, 2 * camera.cy / camera.height - 1, -1.0, -1.0]
+    projection[0, 0] = 2 * camera.fx / display.width
+    projection[1, 1] = 2 * camera.fy / display.height
+    projection[2] = [1 - 2 * camera.cx / display.width, 2 * camera.cy / display.height - 1, -1.0, -1.0]
     projection[3, 2] = -2 * camera.near
     return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
 

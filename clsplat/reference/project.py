@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, Window
 from clsplat.reference.sh import sh_basis, sh_basis_grad
 
 Float64 = NDArray[np.float64]
@@ -71,11 +71,14 @@ def rotation_matrices(quaternions: Float64) -> Float64:
 
 def frustum_limits(camera: Camera) -> Float64:
     """Lower and upper bound of x/z and y/z in the Jacobian, ((x, y), (x, y)): eq. (3)."""
-    size = np.array([camera.width, camera.height], np.float64)
+    window = camera.window or Window(0, 0, camera.width, camera.height)
+    size = np.array([window.width, window.height], np.float64)
     focal = np.array([camera.fx, camera.fy], np.float64)
     centre = np.array([camera.cx, camera.cy], np.float64)
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
-    return np.stack([-centre / focal - margin, (size - centre) / focal + margin])
+    first = np.array([window.x, window.y], np.float64)
+    low, high = (first - centre) / focal, (first + [camera.width, camera.height] - centre) / focal
+    return np.stack([np.minimum(-centre / focal - margin, low), np.maximum((size - centre) / focal + margin, high)])
 
 
 def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> _Geometry:
@@ -118,6 +121,8 @@ def project(
         z = geometry.p[:, 2]
         focal = np.array([camera.fx, camera.fy])
         means2d = focal * geometry.p[:, :2] / z[:, None] + np.array([camera.cx, camera.cy])
+        if camera.window is not None:
+            means2d -= [camera.window.x, camera.window.y]
 
         m1, m2 = geometry.half[:, 0], geometry.half[:, 1]
         length1, length2 = (m1 * m1).sum(axis=1), (m2 * m2).sum(axis=1)

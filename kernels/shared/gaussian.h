@@ -43,15 +43,17 @@ static inline Double camera_row(__constant float *r, __constant float *r_low, fl
   return multiply_add2(r[2], r_low[2], z, sum);
 }
 
-// (2): focal * (x / z) + centre, as whole pixels and the rest in [0, 1).
+// (2): focal * (x / z) + centre, as whole pixels from the window's first and the rest in [0, 1): the rest has the same bits
+// in every window.
 static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low, float focal, float focal_low,
-                                  float centre, float centre_low, floatL *whole, floatL *rest) {
+                                  float centre, float centre_low, float window, floatL *whole, floatL *rest) {
   const floatL ratio = x / z;
   const floatL ratio_low = (fmaL(-ratio, z, x) + fmaL(-ratio, z_low, x_low)) / z;
   const Double c = {(floatL)(centre), fmaL((floatL)(focal), ratio_low, (floatL)(centre_low))};
   const Double at = multiply_add2(focal, focal_low, ratio, c);
-  *whole = floorL(at.high);
-  *rest = (at.high - *whole) + at.low;
+  const floatL in_frame = floorL(at.high);
+  *whole = in_frame - window;
+  *rest = (at.high - in_frame) + at.low;
 }
 
 // x within [low, high], and NaN as it is.
