@@ -13,16 +13,20 @@ from numpy.typing import NDArray
 Float64 = NDArray[np.float64]
 Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
 
+FRAME_CLAMP = 0.3
+
 
 @dataclass(frozen=True)
 class Window:
     """Where a picture lies in a frame, in pixels: x, y of its first pixel, negative beyond the frame's left and upper
-    edge; width, height of the frame."""
+    edge; width, height of the frame. clamp: how far beyond the frame's edges the projection's Jacobian still follows a
+    Gaussian's mean, in halves of the frame's size; more only for a picture that shows more."""
 
     x: int
     y: int
     width: int
     height: int
+    clamp: float = FRAME_CLAMP
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +43,8 @@ class Camera:
     seen; depth is z, for fisheye and equirectangular the distance. Nothing applies `far` yet.
 
     window: where the picture is a part of a frame, or more than it: width and height are the picture's, cx and cy are
-    measured from the frame's corner. What both show has the same bits, as long as x and y are multiples of a tile and
-    an edge is no further outside of the frame than the Jacobian's clamp (docs/pictures.md).
+    measured from the frame's corner. What both show has the same bits where x and y are multiples of a tile and the
+    Jacobian's clamp is the same (docs/pictures.md).
     """
 
     width: int
@@ -73,7 +77,8 @@ class Camera:
             edges = [window.x * sx, window.y * sy, window.width * sx, window.height * sy]
             if any(edge != round(edge) for edge in edges):
                 raise ValueError(f"{window} of {self.width}x{self.height} resized to {width}x{height}: no whole pixels")
-            window = Window(*(round(edge) for edge in edges))
+            x, y, across, down = (round(edge) for edge in edges)
+            window = Window(x, y, across, down, window.clamp)
         return replace(
             self,
             width=width,

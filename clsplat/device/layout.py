@@ -23,8 +23,9 @@ CAMERA = (
     *("PX", "PY", "PZ", "WINDOW_X", "WINDOW_Y"),
     *(f"{name}_LOW" for name in _TRANSFORM),
 )
-"""A camera: `cam_from_world`, intrinsics, near plane, the limits of x/z and y/z in the Jacobian, its centre, the
-first pixel in a frame (Camera.window); and what the rounding of pose and intrinsics to float32 left, so that a mean's place on the image is good to 1e-6 pixels."""
+"""A camera: `cam_from_world`, intrinsics, near plane, the limits of x/z and y/z in the Jacobian, its centre, the first
+pixel in its frame (`Camera.window`); and what the rounding of pose and intrinsics to float32 left, so that a mean's
+place on the image is good to 1e-6 pixels."""
 
 SPLAT = (
     *("PIXEL_X", "PIXEL_Y", "SUB_X", "SUB_Y"),

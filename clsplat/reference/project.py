@@ -19,7 +19,6 @@ Bool = NDArray[np.bool_]
 
 ALPHA_MIN = 1.0 / 255.0
 LOW_PASS = 0.3
-FRUSTUM_MARGIN = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +74,8 @@ def frustum_limits(camera: Camera) -> Float64:
     size = np.array([window.width, window.height], np.float64)
     focal = np.array([camera.fx, camera.fy], np.float64)
     centre = np.array([camera.cx, camera.cy], np.float64)
-    margin = FRUSTUM_MARGIN * 0.5 * size / focal
-    first = np.array([window.x, window.y], np.float64)
-    low, high = (first - centre) / focal, (first + [camera.width, camera.height] - centre) / focal
-    return np.stack([np.minimum(-centre / focal - margin, low), np.maximum((size - centre) / focal + margin, high)])
+    margin = window.clamp * 0.5 * size / focal
+    return np.stack([-centre / focal - margin, (size - centre) / focal + margin])
 
 
 def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> _Geometry:

@@ -232,18 +232,16 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         raise InputError(f"an equirectangular camera is {wide}: expected no more")
     window = camera.window or Window(0, 0, camera.width, camera.height)
     half_w, half_h = 0.5 * window.width / camera.fx, 0.5 * window.height / camera.fy
-    right, bottom = window.x + camera.width, window.y + camera.height
     values = {
         "FX": camera.fx,
         "FY": camera.fy,
         "CX": camera.cx,
         "CY": camera.cy,
         "NEAR": camera.near,
-        # those of the frame, but nothing is clamped that is shown
-        "XMIN": min(-camera.cx / camera.fx - 0.3 * half_w, (window.x - camera.cx) / camera.fx),
-        "XMAX": max((window.width - camera.cx) / camera.fx + 0.3 * half_w, (right - camera.cx) / camera.fx),
-        "YMIN": min(-camera.cy / camera.fy - 0.3 * half_h, (window.y - camera.cy) / camera.fy),
-        "YMAX": max((window.height - camera.cy) / camera.fy + 0.3 * half_h, (bottom - camera.cy) / camera.fy),
+        "XMIN": -camera.cx / camera.fx - window.clamp * half_w,
+        "XMAX": (window.width - camera.cx) / camera.fx + window.clamp * half_w,
+        "YMIN": -camera.cy / camera.fy - window.clamp * half_h,
+        "YMAX": (window.height - camera.cy) / camera.fy + window.clamp * half_h,
         "WINDOW_X": window.x,
         "WINDOW_Y": window.y,
     }
