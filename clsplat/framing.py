@@ -134,7 +134,7 @@ def drawn_by(
     """A Draw by the kernels; after: the camera of a whole frame that motion goes to."""
 
     def draw(camera: Camera, names: Collection[str]) -> Layers:
-        camera, rows, columns = _on_tiles(camera)
+        camera, rows, columns = on_tiles(camera)
         if set(names) <= set(COLOUR):
             picture = renderer.render(gaussians, camera, background)
             layers: Layers = {"rgb": picture.image, "alpha": picture.alpha}
@@ -155,7 +155,7 @@ def drawn_by(
     return draw
 
 
-def _on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
+def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
     """A camera whose picture begins with a whole tile of its frame, and where the wanted one is in that."""
     if camera.window is None:
         return camera, slice(None), slice(None)

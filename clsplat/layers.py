@@ -53,7 +53,7 @@ LAYERS: dict[str, Layer] = {
 
 _MATRICES = {"worldToCamera": "worldtocamera", "worldToNDC": "worldtoscreen"}
 """OpenImageIO's names of them."""
-_HALF_MAX = np.float32(65504)
+HALF_MAX = np.float32(65504)
 _LARGEST_FLOAT_INDEX = 2**24
 
 EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -133,13 +133,18 @@ def write_layers(
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: no such folder to write {path.name} to")
     ordered = {name: layers[name] for name in LAYERS if name in layers}
-    if path.suffix.lower() == ".exr":
-        groups = _parts(tuple(ordered)) if encoding.parts == "several" else [tuple(ordered)]
-        pairs = [_exr_part(group, ordered, encoding, header, named=len(groups) > 1) for group in groups]
-        write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], "exr")
-    else:
-        pixels, spec = _picture(path.suffix.lower(), ordered, encoding, header)
-        write_spec(path, [pixels], [spec], path.suffix.lower()[1:])
+    pairs = encoded(path.suffix.lower(), ordered, encoding, header)
+    write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], path.suffix.lower()[1:])
+
+
+def encoded(
+    extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+) -> list[tuple[NDArray[Any], Any]]:
+    """(pixels, OpenImageIO's specification) of each part of a file. layers: in the order of LAYERS."""
+    if extension != ".exr":
+        return [_picture(extension, layers, encoding, header)]
+    groups = _parts(tuple(layers)) if encoding.parts == "several" else [tuple(layers)]
+    return [_exr_part(group, layers, encoding, header, named=len(groups) > 1) for group in groups]
 
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
@@ -161,7 +166,7 @@ def _exr_part(
         pixels = np.concatenate([_for_floats(name, layers[name]) for name in names], axis=2)
         formats = [oiio.HALF if kind == "colour" and encoding.depth == "half" else oiio.FLOAT for kind in kinds]
         half = np.array([one == oiio.HALF for one in formats])
-        pixels[:, :, half] = np.clip(pixels[:, :, half], -_HALF_MAX, _HALF_MAX)  # else it would become infinite
+        pixels[:, :, half] = np.clip(pixels[:, :, half], -HALF_MAX, HALF_MAX)  # else it would become infinite
         spec = _spec(pixels, formats[0] if len(set(formats)) == 1 else oiio.FLOAT, header)
         if len(set(formats)) > 1:
             spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
@@ -171,8 +176,7 @@ def _exr_part(
     spec.attribute("compression", encoding.compression)
     if named:
         spec.attribute("oiio:subimagename", LAYERS[names[0]].part)
-    for name, matrix in header.matrices.items():
-        spec.attribute(_MATRICES.get(name, name), oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
+    _add_matrices(spec, header)
     return np.ascontiguousarray(pixels), spec
 
 
@@ -211,6 +215,25 @@ def _planes(plane: NDArray[Any]) -> NDArray[Any]:
 def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, kind)
+    _add_header(spec, header)
+    return spec
+
+
+def deep_spec(width: int, height: int, header: Header) -> Any:
+    """Of a deep EXR, its channels and their formats left to say."""
+    spec = oiio.ImageSpec(width, height, 1, oiio.FLOAT)
+    spec.deep = True
+    _add_header(spec, header)
+    _add_matrices(spec, header)
+    return spec
+
+
+def _add_matrices(spec: Any, header: Header) -> None:
+    for name, matrix in header.matrices.items():
+        spec.attribute(_MATRICES.get(name, name), oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
+
+
+def _add_header(spec: Any, header: Header) -> None:
     if header.window is not None:
         spec.x, spec.y = header.window.x, header.window.y
         spec.full_x = spec.full_y = 0
@@ -219,4 +242,3 @@ def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
         spec.attribute("PixelAspectRatio", float(header.pixel_aspect))
     for name, value in header.attributes.items():
         spec.attribute(name, value)
-    return spec
