@@ -67,7 +67,7 @@ def check_video(path: Path) -> None:
 
 
 def yuv420(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(3 H / 2, W): luma, and below it chroma at half the size, as PyAV takes them, of (H, W, 3) in [0, 1]; sizes rounded
+    """(3 H / 2, W): luma, below it chroma at half the size, as PyAV takes them, of (H, W, 3) in [0, 1]; sizes rounded
     up to even ones. Rec.709, limited range, chroma sited at the left as in H.264. FFmpeg's own is darker by a level."""
     height, width, _ = rgb.shape
     rgb = np.pad(rgb, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -56,7 +56,7 @@ def test_colours_have_the_matrix_of_their_size(tmp_path: Path) -> None:
     write_video(path, [image] * 3, VideoConfig(crf=5))
     pictures, stream = read(path)
     assert stream.codec_context.color_range == 1
-    # Y, Cb, Cr by hand: 16 + 219 * 0.5862; 128 + 224 * (0.1176 - 0.5862) / 1.8556; 128 + 224 * (0.0784 - 0.5862) / 1.5748
+    # by hand: 16 + 219 * 0.5862; 128 + 224 * (0.1176 - 0.5862) / 1.8556; 128 + 224 * (0.0784 - 0.5862) / 1.5748
     assert abs(int(pictures[0][24, 32]) - 144) <= 1
     assert abs(int(pictures[0][48 + 6, 16]) - 71) <= 1
     assert abs(int(pictures[0][60 + 6, 16]) - 56) <= 1
