@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A frame with everything that is asked of it: framing, samples, colour, and strips where it is large.
 
-One order for all of them: the kernels draw in the model's space; that becomes light, which is filtered and averaged; what
-comes out is converted. A strip is a window of the picture, so that it goes through all of this alone.
+One order for all of them: the kernels draw in the model's space; that becomes light, which is filtered and averaged;
+what comes out is converted. A strip is a window of the picture, so that it goes through all of this alone.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Pictures:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         recorded: str = SRGB,
     ) -> None:
-        """recorded: the model's colour space (`colour.recorded_space`); background: in that space, which has to be black
-        where alpha is written. Raises InputError for settings and spaces that make no sense."""
+        """recorded: the model's colour space (`colour.recorded_space`); background: in that space, black where alpha is
+        written. Raises InputError for settings and spaces that make no sense."""
         self.config = config or PictureConfig()
         self.config.check()
         self.colours = Colours(self.config.colour, recorded)
