@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 from clsplat.big_frames import strips
 from clsplat.camera import Camera
 from clsplat.colour import Colours
+from clsplat.device.layout import TILE
 from clsplat.errors import InputError
 from clsplat.framing import on_tiles
 from clsplat.gaussians import Gaussians
 from clsplat.images import atomic_output
 from clsplat.layers import HALF_MAX, Encoding, Header, deep_spec
+from clsplat.needs import frame_pixels
 from clsplat.rendering import Renderer
 from clsplat.stages.deep import DEEP_FLOATS
 
@@ -128,7 +130,9 @@ def write_deep(
     spec.channelformats = tuple(kinds)
     spec.alpha_channel, spec.z_channel = 3, 4
     spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
-    rows = max(_STRIP_FLOATS // (camera.width * DEEP_FLOATS * (len(bounds) + 1)), 1)
+    floats = DEEP_FLOATS * (len(bounds) + 1)
+    pixels = min(_STRIP_FLOATS // floats, frame_pixels(renderer.device, planes=4 * floats))
+    rows = max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with what fills the first and last tile
     with atomic_output(path, [spec], "exr") as output:
         row = spec.y
         for strip in strips(camera, rows):

@@ -240,5 +240,6 @@ def _add_header(spec: Any, header: Header) -> None:
         spec.full_width, spec.full_height = header.window.width, header.window.height
     if header.pixel_aspect != 1.0:
         spec.attribute("PixelAspectRatio", float(header.pixel_aspect))
+    spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes
     for name, value in header.attributes.items():
         spec.attribute(name, value)

@@ -185,6 +185,16 @@ def test_strips_make_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert path.read_bytes() == whole
 
 
+def test_files_in_little_memory(tmp_path: Path) -> None:
+    gaussians, camera = scenes.random_cloud(20_000, 4, 300, 200, degree=1)
+    limit = 14 << 20  # the slices of all of it are 23 MB
+    renderer = Renderer(open_device(None, limit))
+    write_deep(tmp_path / "little.exr", renderer, gaussians, camera)
+    assert renderer.device.memory.peak <= limit
+    write_deep(tmp_path / "plenty.exr", Renderer(), gaussians, camera)
+    assert (tmp_path / "little.exr").read_bytes() == (tmp_path / "plenty.exr").read_bytes()
+
+
 def test_colours_are_converted(tmp_path: Path) -> None:
     colours = Colours(ColourConfig(colorspace=LINEAR))
     path, *_ = made(tmp_path, encoding=Encoding(depth="float"))
