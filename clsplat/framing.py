@@ -131,7 +131,8 @@ def drawn_by(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     after: Camera | None = None,
 ) -> Draw:
-    """A Draw by the kernels; after: the camera of a whole frame that motion goes to."""
+    """A Draw by the kernels; after: the camera of a whole frame that motion goes to. Motion is turned over: in files v is
+    up, and docs/channels.md has y down."""
 
     def draw(camera: Camera, names: Collection[str]) -> Layers:
         camera, rows, columns = on_tiles(camera)
@@ -150,6 +151,8 @@ def drawn_by(
             layers = {"rgb": picture.image, "alpha": picture.alpha, "depth": found.depth, "median": found.median}
             layers |= {"first": found.first, "count": found.count, "id": found.index}
             layers |= {name: found.fields[_FEATURES[name]] for name in names if name in _FEATURES}
+            if "motion" in layers:
+                layers["motion"] = layers["motion"] * np.array([1, -1], np.float32)
         return {name: np.ascontiguousarray(layers[name][rows, columns]) for name in LAYERS if name in names}
 
     return draw

@@ -155,6 +155,14 @@ def test_the_same_again(default_device: Device) -> None:
     assert_same(one, two, slice(None), slice(None))
 
 
+def test_motion_is_up_in_files(default_device: Device) -> None:
+    gaussians, camera = PERSPECTIVE
+    lower = replace(camera, cy=camera.cy + 5.0)  # all goes down by five pixels
+    motion = drawn_by(Renderer(default_device), gaussians, after=lower)(camera, ("motion", "alpha"))
+    there = motion["alpha"] > 0.5
+    assert_close(motion["motion"][there], np.tile([0.0, -5.0], (there.sum(), 1)), absolute=1e-4)
+
+
 def test_a_camera_gets_the_window_of_another() -> None:
     camera = PERSPECTIVE[1]
     part = crop(camera.resized(2 * WIDTH, 2 * HEIGHT), 10, 20, 30, 40)
