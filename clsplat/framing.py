@@ -131,8 +131,8 @@ def drawn_by(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     after: Camera | None = None,
 ) -> Draw:
-    """A Draw by the kernels; after: the camera of a whole frame that motion goes to. Motion is turned over: in files v is
-    up, and docs/channels.md has y down."""
+    """A Draw by the kernels; after: the camera of a whole frame that motion goes to. Motion is turned over: in files v
+    is up, and docs/channels.md has y down."""
 
     def draw(camera: Camera, names: Collection[str]) -> Layers:
         camera, rows, columns = on_tiles(camera)
