@@ -14,10 +14,11 @@ from clsplat.camera import Camera
 from clsplat.device.context import Device
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
-from clsplat.framing import Draw, FramingConfig, Layers, crop
+from clsplat.framing import Draw, Layers, crop
 from clsplat.images import atomic_output
 from clsplat.layers import LAYERS, Encoding, Header, check_format, encoded
 from clsplat.needs import frame_pixels
+from clsplat.picture_config import FramingConfig
 
 STRIP_PIXELS = 1 << 24
 """Pixels that are on the host at once, before filtering: about a gigabyte with every layer."""

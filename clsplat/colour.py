@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError
+from clsplat.picture_config import ColourConfig
 
 Float32 = NDArray[np.float32]
 
@@ -36,18 +36,6 @@ _NAMES = {
 }
 """What configurations call these two."""
 _LINEAR_PHOTOS = (".exr", ".hdr")
-
-
-@dataclass(frozen=True)
-class ColourConfig:
-    """Which colour space pictures are written in."""
-
-    colorspace: str = ""
-    """Colour space of the pictures, a name of the OpenColorIO configuration such as ACEScg; '' is the model's own."""
-    model_colorspace: str = ""
-    """Colour space that the model was trained in; '' goes by the model file, and by sRGB where that says nothing."""
-    ocio_config: str = ""
-    """OpenColorIO configuration, a file or ocio://NAME; '' is $OCIO, or the studio configuration that is built in."""
 
 
 def comment(space: str) -> str:

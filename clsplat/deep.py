@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import repeat
 from math import inf
 from pathlib import Path
@@ -28,39 +27,17 @@ from clsplat.gaussians import Gaussians
 from clsplat.images import atomic_output
 from clsplat.layers import HALF_MAX, Encoding, Header, deep_spec
 from clsplat.needs import frame_pixels
+from clsplat.picture_config import DeepConfig
 from clsplat.rendering import Renderer
 from clsplat.stages.deep import DEEP_FLOATS
 
 Float32 = NDArray[np.float32]
 
 CHANNELS = ("R", "G", "B", "A", "Z", "ZBack")
-_MOST_BINS = 256
 _OUTLIERS = 0.01
 """Share of the Gaussians in view that is nearer than the first bound, and that is further than the last."""
 _STRIP_FLOATS = 1 << 26
 """Of a strip's slices: 256 MiB."""
-
-
-@dataclass(frozen=True)
-class DeepConfig:
-    """Slices of a deep EXR."""
-
-    bins: int = 16
-    """Slices by depth, the most samples that a pixel has; each is as many times deeper as the one before."""
-    near: float = 0.0
-    """Depth at which the second slice begins, the first has all before it; 0 goes by what the frame has in view."""
-    far: float = 0.0
-    """Depth at which the last slice begins, which has all behind it; 0 goes by what the frame has in view."""
-
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
-        if not 1 <= self.bins <= _MOST_BINS:
-            raise InputError(f"--deep.bins {self.bins}: expected 1 to {_MOST_BINS}")
-        for flag, value in (("--deep.near", self.near), ("--deep.far", self.far)):
-            if not 0 <= value < inf:
-                raise InputError(f"{flag} {value}: expected a depth, or 0 for that of what is in view")
-        if self.near and self.far and not self.near < self.far:
-            raise InputError(f"--deep.far {self.far}: expected more than --deep.near {self.near}")
 
 
 def bin_bounds(gaussians: Gaussians, camera: Camera, config: DeepConfig) -> Float32:

@@ -8,8 +8,8 @@ of its frame (`Camera.window`), and its pixels have the bits that the frame's ha
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from clsplat.device.layout import TILE
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.layers import LAYERS
+from clsplat.picture_config import Filter, FramingConfig, parse_overscan, parse_region
 from clsplat.rendering import Renderer
 
 Float32 = NDArray[np.float32]
@@ -26,65 +27,11 @@ Layers = dict[str, NDArray[Any]]
 Draw = Callable[[Camera, Collection[str]], Layers]
 """(camera, names of layers) -> those layers, (height, width) or (height, width, channels); rgb over the background,
 so over black it is associated with alpha."""
-Filter = Literal["box", "blackman-harris"]
 
 COLOUR = ("rgb", "alpha")
 """What light is added up in; of the other layers there is no mean."""
 _RADII: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
 _FEATURES = {"normals": "normal", "position": "position", "motion": "motion"}
-_MOST_SAMPLES = 64
-
-
-@dataclass(frozen=True)
-class FramingConfig:
-    """Which pixels are rendered, and how finely."""
-
-    overscan: str = "0"
-    """Pixels beyond each edge of the frame, or a share of its width and height such as 5%. EXR files keep the frame as
-    their display window, others have a larger picture."""
-    region: str = ""
-    """Part of the frame to render alone, X,Y,WIDTH,HEIGHT in pixels from its top left corner; '' renders all of it. In
-    EXR files it is the data window."""
-    supersample: int = 1
-    """Samples of a pixel across and down: the frame is rendered so many times larger, and filtered in linear light."""
-    filter: Filter = "box"
-    """Of supersampling: the mean over the pixel, or a Blackman-Harris window three pixels wide, which is smoother."""
-
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
-        parse_overscan(self.overscan)
-        if self.region:
-            parse_region(self.region)
-        if self.region and parse_overscan(self.overscan) != (0, 0.0):
-            raise InputError("--overscan and --region exclude each other: a region lies within the frame")
-        if not 1 <= self.supersample <= _MOST_SAMPLES:
-            raise InputError(f"--supersample {self.supersample}: expected 1 to {_MOST_SAMPLES}")
-
-    @property
-    def on(self) -> bool:
-        """Whether anything is other than the plain frame."""
-        return bool(self.region) or self.supersample > 1 or parse_overscan(self.overscan) != (0, 0.0)
-
-
-def parse_overscan(text: str) -> tuple[int, float]:
-    """(pixels, 0) or (0, share) of "32" or "5%". Raises InputError."""
-    word = text.strip()
-    try:
-        pixels, share = (0, float(word[:-1]) / 100) if word.endswith("%") else (int(word), 0.0)
-    except ValueError:
-        pixels, share = -1, 0.0
-    if not (0 <= pixels <= 1 << 16 and 0 <= share <= 1):
-        raise InputError(f"--overscan {text}: expected pixels such as 32, or a share such as 5%, at most 100%")
-    return pixels, share
-
-
-def parse_region(text: str) -> tuple[int, int, int, int]:
-    """x, y, width, height of "100,50,640,480". Raises InputError."""
-    words = [word.strip() for word in text.split(",")]
-    if len(words) != 4 or not all(word.isdecimal() for word in words) or "0" in words[2:]:
-        raise InputError(f"--region {text}: expected X,Y,WIDTH,HEIGHT in pixels such as 100,50,640,480")
-    x, y, width, height = (int(word) for word in words)
-    return x, y, width, height
 
 
 def framed(camera: Camera, config: FramingConfig) -> Camera:

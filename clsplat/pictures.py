@@ -8,38 +8,18 @@ what comes out is converted. A strip is a window of the picture, so that it goes
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from clsplat.big_frames import strip_rows, write_in_strips
 from clsplat.camera import Camera
-from clsplat.colour import SRGB, ColourConfig, Colours
-from clsplat.errors import InputError
-from clsplat.framing import Draw, FramingConfig, Layers, drawn_by, framed, supersampled
+from clsplat.colour import SRGB, Colours
+from clsplat.framing import Draw, Layers, drawn_by, framed, supersampled
 from clsplat.gaussians import Gaussians
 from clsplat.layers import Encoding, Header, write_layers
+from clsplat.picture_config import PictureConfig
 from clsplat.rendering import Renderer
-from clsplat.sampling import SamplingConfig, sample_cameras, sampled
-
-
-@dataclass(frozen=True)
-class PictureConfig:
-    """What is made of a frame, beside its channels."""
-
-    colour: ColourConfig = field(default_factory=ColourConfig)
-    framing: FramingConfig = field(default_factory=FramingConfig)
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
-
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
-        self.framing.check()
-        self.sampling.check()
-
-    def check_deep(self) -> None:
-        """Raise InputError for what deep pictures have not."""
-        if self.sampling.on or self.framing.supersample > 1:
-            flag = "a shutter or a lens" if self.sampling.on else "--supersample"
-            raise InputError(f"deep EXR: {flag} has no deep samples, expected a frame without")
+from clsplat.sampling import sample_cameras, sampled
 
 
 class Pictures:

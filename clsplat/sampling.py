@@ -7,8 +7,7 @@ Samples have equal weights and fixed places: the same frame again has the same b
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
-from math import inf
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,89 +16,11 @@ from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.framing import COLOUR, Draw, Layers, reframed
 from clsplat.layers import LAYERS
+from clsplat.picture_config import SamplingConfig
 
 Float64 = NDArray[np.float64]
 
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
-_MOST_SAMPLES = 4096
-
-
-@dataclass(frozen=True)
-class SamplingConfig:
-    """Shutter and lens."""
-
-    samples: int = 16
-    """Frames that are rendered for one, where the shutter or the lens is open."""
-    shutter_angle: float = 0.0
-    """How long the shutter is open, in degrees of which 360 are from frame to frame, half before the frame and half
-    after it; 0 is a still camera."""
-    shutter_open: float | None = None
-    """When the shutter opens, in frames from the frame, such as -0.25; in place of the angle, with --shutter-close."""
-    shutter_close: float | None = None
-    """When the shutter closes, in frames from the frame, such as 0.25."""
-    f_stop: float | None = None
-    """Depth of field of a lens with this f-number, its focal length that of the camera on a sensor of --sensor-width;
-    none has everything in focus."""
-    aperture: float = 0.0
-    """Radius of the lens in the scene's units, in place of the f-number."""
-    focus: float = 0.0
-    """Depth that is in focus, along the camera's axis in the scene's units."""
-    sensor_width: float = 36.0
-    """Millimetres that the picture's width is on the sensor, for --f-stop."""
-    metres: float = 1.0
-    """Metres that a unit of the scene is, for --f-stop."""
-
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
-        if not 1 <= self.samples <= _MOST_SAMPLES:
-            raise InputError(f"--samples {self.samples}: expected 1 to {_MOST_SAMPLES}")
-        if not 0 <= self.shutter_angle <= 3600:
-            raise InputError(f"--shutter-angle {self.shutter_angle}: expected 0 to 3600 degrees")
-        if self.shutter_open is not None or self.shutter_close is not None:
-            if self.shutter_angle:
-                raise InputError("--shutter-angle and --shutter-open exclude each other")
-            if (
-                self.shutter_open is None
-                or self.shutter_close is None
-                or not (-inf < self.shutter_open < self.shutter_close < inf)
-            ):
-                times = f"--shutter-open {self.shutter_open} --shutter-close {self.shutter_close}"
-                raise InputError(f"{times}: expected two times, the second after the first")
-        for flag, value in (
-            ("--f-stop", self.f_stop),
-            ("--sensor-width", self.sensor_width),
-            ("--metres", self.metres),
-        ):
-            if value is not None and not 0 < value < inf:
-                raise InputError(f"{flag} {value}: expected a number above 0")
-        if not 0 <= self.aperture < inf:
-            raise InputError(f"--aperture {self.aperture}: expected a radius of at least 0")
-        if self.aperture and self.f_stop is not None:
-            raise InputError("--aperture and --f-stop exclude each other: both are the size of the lens")
-        if self.has_lens and not 0 < self.focus < inf:
-            raise InputError(f"--focus {self.focus}: expected the depth that is in focus, above 0")
-
-    @property
-    def shutter(self) -> tuple[float, float]:
-        """When it opens and closes, in frames from the frame."""
-        if self.shutter_open is not None and self.shutter_close is not None:
-            return self.shutter_open, self.shutter_close
-        return -self.shutter_angle / 720, self.shutter_angle / 720
-
-    @property
-    def moves(self) -> bool:
-        """Whether the camera is looked at at more than one time."""
-        return self.shutter[1] > self.shutter[0]
-
-    @property
-    def has_lens(self) -> bool:
-        """Whether it is more than a pinhole."""
-        return self.aperture > 0 or self.f_stop is not None
-
-    @property
-    def on(self) -> bool:
-        """Whether a frame is more than one sample."""
-        return self.moves or self.has_lens
 
 
 def sample_times(count: int) -> Float64:

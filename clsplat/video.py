@@ -7,7 +7,6 @@ import os
 import secrets
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -18,33 +17,12 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import TEMPORARY_SUFFIX
+from clsplat.picture_config import VideoConfig
 
 EXTENSION = ".mp4"
 _LUMA = (0.2126, 0.7152, 0.0722)
 _BLUE, _RED = np.float32(2 * (1 - 0.0722)), np.float32(2 * (1 - 0.2126))
 """What B - Y and R - Y reach, from end to end."""
-_PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
-
-
-@dataclass(frozen=True)
-class VideoConfig:
-    """How a video is encoded."""
-
-    fps: float = 24.0
-    """Frames a second."""
-    crf: int = 18
-    """Quality: 0 is the best, 51 the worst, 18 about the least that shows no loss."""
-    preset: str = "medium"
-    """How long the encoder looks for a smaller file, from ultrafast to veryslow."""
-
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
-        if not 0.01 <= self.fps <= 1000:
-            raise InputError(f"--video.fps {self.fps}: expected 0.01 to 1000 frames a second")
-        if not 0 <= self.crf <= 51:
-            raise InputError(f"--video.crf {self.crf}: expected 0 to 51")
-        if self.preset not in _PRESETS:
-            raise InputError(f"--video.preset {self.preset}: expected one of {', '.join(_PRESETS)}")
 
 
 def video_missing() -> str:

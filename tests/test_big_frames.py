@@ -16,10 +16,11 @@ from clsplat.big_frames import in_strips, strip_rows, strips, write_in_strips
 from clsplat.camera import Camera, Window
 from clsplat.device.context import open_device
 from clsplat.errors import InputError
-from clsplat.framing import FramingConfig, crop, drawn_by, framed, supersampled
+from clsplat.framing import crop, drawn_by, framed, supersampled
 from clsplat.layers import LAYERS, Encoding, Header, write_layers
+from clsplat.picture_config import FramingConfig, SamplingConfig
 from clsplat.rendering import Renderer
-from clsplat.sampling import SamplingConfig, sample_cameras, sampled
+from clsplat.sampling import sample_cameras, sampled
 
 CLOUD, CAMERA = scenes.random_cloud(3000, 8, 150, 200)
 EVERYTHING = tuple(LAYERS)

@@ -10,20 +10,11 @@ import OpenImageIO as oiio
 import pytest
 from scenes import one
 
-from clsplat.colour import (
-    LINEAR,
-    SRGB,
-    ColourConfig,
-    Colours,
-    comment,
-    linear_to_srgb,
-    photos_space,
-    recorded_space,
-    srgb_to_linear,
-)
+from clsplat.colour import LINEAR, SRGB, Colours, comment, linear_to_srgb, photos_space, recorded_space, srgb_to_linear
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.layers import Encoding, write_layers
+from clsplat.picture_config import ColourConfig
 
 HALF = 2.0**-11
 """What rounding to a half loses, relative."""

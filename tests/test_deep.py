@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from pipeline import shaped
 
 from clsplat.camera import Camera, Window
-from clsplat.colour import LINEAR, ColourConfig, Colours
-from clsplat.deep import DeepConfig, bin_bounds, depths_in_view, flattened, render_deep, write_deep
+from clsplat.colour import LINEAR, Colours
+from clsplat.deep import bin_bounds, depths_in_view, flattened, render_deep, write_deep
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.framing import crop
 from clsplat.gaussians import Gaussians
 from clsplat.layers import Encoding, Header, camera_matrices
+from clsplat.picture_config import ColourConfig, DeepConfig
 from clsplat.reference import deep as twin
 from clsplat.reference import render as reference
 from clsplat.rendering import Renderer

@@ -13,19 +13,9 @@ from compare import assert_close, assert_same_bits
 from clsplat.camera import Camera, Window
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.framing import (
-    Draw,
-    FramingConfig,
-    Layers,
-    crop,
-    drawn_by,
-    filter_taps,
-    framed,
-    parse_overscan,
-    reframed,
-    supersampled,
-)
+from clsplat.framing import Draw, Layers, crop, drawn_by, filter_taps, framed, reframed, supersampled
 from clsplat.layers import LAYERS
+from clsplat.picture_config import FramingConfig, parse_overscan
 from clsplat.reference import rays
 from clsplat.reference import render as reference
 from clsplat.rendering import Renderer

@@ -13,13 +13,12 @@ import scenes
 from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera
-from clsplat.colour import LINEAR, ColourConfig, linear_to_srgb, srgb_to_linear
+from clsplat.colour import LINEAR, linear_to_srgb, srgb_to_linear
 from clsplat.errors import InputError
-from clsplat.framing import FramingConfig
 from clsplat.layers import Encoding
-from clsplat.pictures import PictureConfig, Pictures
+from clsplat.picture_config import ColourConfig, FramingConfig, PictureConfig, SamplingConfig
+from clsplat.pictures import Pictures
 from clsplat.rendering import Renderer
-from clsplat.sampling import SamplingConfig
 
 CLOUD, CAMERA = scenes.random_cloud(1500, 8, 100, 70)
 

@@ -12,19 +12,12 @@ from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.framing import FramingConfig, crop, drawn_by, framed
+from clsplat.framing import crop, drawn_by, framed
 from clsplat.paths.shot import Shot, numbered
+from clsplat.picture_config import FramingConfig, SamplingConfig
 from clsplat.reference import render as reference
 from clsplat.rendering import Renderer
-from clsplat.sampling import (
-    SamplingConfig,
-    lens_points,
-    lens_radius,
-    sample_cameras,
-    sample_times,
-    sampled,
-    through_lens,
-)
+from clsplat.sampling import lens_points, lens_radius, sample_cameras, sample_times, sampled, through_lens
 
 CLOUD, CAMERA = scenes.random_cloud(1000, 8, 100, 70)
 

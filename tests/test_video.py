@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.video import VideoConfig, VideoWriter, check_video, write_video, yuv420
+from clsplat.picture_config import VideoConfig
+from clsplat.video import VideoWriter, check_video, write_video, yuv420
 
 av = pytest.importorskip("av")
 
