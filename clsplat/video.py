@@ -72,7 +72,7 @@ class VideoWriter:
         check_video(path)
         self._path = path
         self._target = Path(os.path.realpath(path))
-        self._temporary = self._target.with_name(f".{path.stem}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+        self._temporary = self._target.with_name(f".{self._target.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
         self._container: Any = None
         self._stream: Any = None
         self._size = (0, 0)
