@@ -13,6 +13,21 @@ from numpy.typing import NDArray
 Float64 = NDArray[np.float64]
 Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
 
+FRAME_CLAMP = 0.3
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where a picture lies in a frame, in pixels: x, y of its first pixel, negative beyond the frame's left and upper
+    edge; width, height of the frame. clamp: how far beyond the frame's edges the projection's Jacobian still follows a
+    Gaussian's mean, in halves of the frame's size; more only for a picture that shows more."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    clamp: float = FRAME_CLAMP
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -26,6 +41,10 @@ class Camera:
     orthographic, x and y, so 1 / fx is world units a pixel; fisheye (equidistant), the angle from the axis in radians;
     equirectangular, longitude and latitude in radians. near, far: depths in world units between which something is
     seen; depth is z, for fisheye and equirectangular the distance. Nothing applies `far` yet.
+
+    window: where the picture is a part of a frame, or more than it: width and height are the picture's, cx and cy are
+    measured from the frame's corner. What both show has the same bits where x and y are multiples of a tile and the
+    Jacobian's clamp is the same (docs/pictures.md).
     """
 
     width: int
@@ -39,6 +58,7 @@ class Camera:
     near: float = 0.01
     far: float = math.inf
     projection: Projection = "perspective"
+    window: Window | None = None
 
     @property
     def position(self) -> Float64:
@@ -53,8 +73,18 @@ class Camera:
         return replace(self, translation=self.translation + self.rotation @ origin)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view on another pixel grid: pixel centres at +0.5 make this a pure scaling."""
+        """The same view on another pixel grid: pixel centres at +0.5 make this a pure scaling.
+
+        Raises ValueError where a window's edges would not be on it.
+        """
         sx, sy = width / self.width, height / self.height
+        window = self.window
+        if window is not None:
+            edges = [window.x * sx, window.y * sy, window.width * sx, window.height * sy]
+            if any(edge != round(edge) for edge in edges):
+                raise ValueError(f"{window} of {self.width}x{self.height} resized to {width}x{height}: no whole pixels")
+            x, y, across, down = (round(edge) for edge in edges)
+            window = Window(x, y, across, down, window.clamp)
         return replace(
             self,
             width=width,
@@ -63,6 +93,7 @@ class Camera:
             fy=self.fy * sy,
             cx=self.cx * sx,
             cy=self.cy * sy,
+            window=window,
         )
 
 

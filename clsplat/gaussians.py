@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -67,11 +68,12 @@ class Gaussians:
 
         return read(path)
 
-    def save(self, path: str | os.PathLike[str], *, sh_degree: int | None = None) -> None:
+    def save(self, path: str | os.PathLike[str], *, sh_degree: int | None = None, comments: Sequence[str] = ()) -> None:
         """Write the 3DGS PLY that every tool reads, atomically, see `clsplat.ply.write`.
 
-        sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given.
+        sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given. comments: lines
+        of its header, such as `colour.comment`.
         """
         from clsplat.ply import write
 
-        write(path, self, sh_degree=sh_degree)
+        write(path, self, sh_degree=sh_degree, comments=comments)

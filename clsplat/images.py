@@ -11,8 +11,9 @@ from __future__ import annotations
 import os
 import secrets
 import struct
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -303,24 +304,46 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
     """Write a file of one part or several, (H, W, C) each with its OpenImageIO specification, atomically.
 
     Raises ClsplatError if writing fails."""
+    with atomic_output(path, specs, kind) as output:
+        for index, pixels in enumerate(parts):
+            if index > 0:
+                output.take(output.file.open(output.name, specs[index], "AppendSubimage"))
+            output.take(output.file.write_image(pixels))
+
+
+@dataclass(frozen=True, eq=False)
+class Output:
+    """file: OpenImageIO's, open under the temporary name `name`."""
+
+    file: Any
+    name: str
+    path: Path
+
+    def take(self, done: bool) -> None:
+        """What the file's methods give. Raises ClsplatError where that is failure."""
+        if not done:
+            raise ClsplatError(f"{self.path}: cannot be written: {_one_line(self.file.geterror())}")
+
+
+@contextmanager
+def atomic_output(path: Path, specs: Sequence[Any], kind: str) -> Iterator[Output]:
+    """A file to write that takes the place of `path` when the block ends well, and never exists otherwise.
+
+    specs: of its parts; raises ClsplatError if writing fails."""
     # Not through files.atomic_writer: OpenImageIO writes to a name, not to an open file.
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+    output = Output(oiio.ImageOutput.create(kind), str(temporary), path)
     try:
-        output: Any = oiio.ImageOutput.create(kind)
         # several parts have to be announced together
-        written = output.open(str(temporary), specs[0] if len(specs) == 1 else tuple(specs))
-        for index, pixels in enumerate(parts):
-            if index > 0:
-                written = written and output.open(str(temporary), specs[index], "AppendSubimage")
-            written = written and output.write_image(pixels)
-        reason = output.geterror()
-        if not (output.close() and written):
-            raise ClsplatError(f"{path}: cannot be written: {_one_line(reason or output.geterror())}")
+        output.take(output.file.open(output.name, specs[0] if len(specs) == 1 else tuple(specs)))
+        yield output
+        output.take(output.file.close())
         temporary.replace(target)
     except OSError as error:
         raise ClsplatError(f"{path}: cannot be written: {error.strerror}") from None
     finally:
+        output.file.close()
         with suppress(OSError):  # it is gone if all went well
             temporary.unlink()
 

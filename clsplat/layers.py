@@ -17,7 +17,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, Window
 from clsplat.config import Compression, ExrDepth, Parts
 from clsplat.errors import InputError
 from clsplat.images import image_size, unassociate, write_spec
@@ -51,7 +51,7 @@ LAYERS: dict[str, Layer] = {
 
 _MATRICES = {"worldToCamera": "worldtocamera", "worldToNDC": "worldtoscreen"}
 """OpenImageIO's names of them."""
-_HALF_MAX = np.float32(65504)
+HALF_MAX = np.float32(65504)
 _LARGEST_FLOAT_INDEX = 2**24
 
 EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -66,16 +66,6 @@ class Encoding:
     compression: Compression = "zip"
     bits: int = 8
     quality: int = 95
-
-
-@dataclass(frozen=True, eq=False)
-class Window:
-    """Where the pixels lie: x, y of the first in the display window, whose size is width x height."""
-
-    x: int
-    y: int
-    width: int
-    height: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,16 +103,17 @@ def check_format(path: str, channels: Iterable[str]) -> None:
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
-    """worldToCamera and worldToNDC of a perspective camera: x and y from -1 to 1 over the picture, z from -1 at the
-    near plane to 1 at infinity."""
+    """worldToCamera and worldToNDC of a perspective camera: x and y from -1 to 1 over the display window, z from -1 at
+    the near plane to 1 at infinity."""
     to_camera = np.eye(4)
     flip = np.diag([1.0, -1.0, -1.0])
     to_camera[:3, :3] = (flip @ camera.rotation).T
     to_camera[3, :3] = flip @ camera.translation
+    display = camera.window or camera
     projection = np.zeros((4, 4))  # of row vectors; the camera looks along -z, so that w = -z
-    projection[0, 0] = 2 * camera.fx / camera.width
-    projection[1, 1] = 2 * camera.fy / camera.height
-    projection[2] = [1 - 2 * camera.cx / camera.width, 2 * camera.cy / camera.height - 1, -1.0, -1.0]
+    projection[0, 0] = 2 * camera.fx / display.width
+    projection[1, 1] = 2 * camera.fy / display.height
+    projection[2] = [1 - 2 * camera.cx / display.width, 2 * camera.cy / display.height - 1, -1.0, -1.0]
     projection[3, 2] = -2 * camera.near
     return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
 
@@ -140,13 +131,18 @@ def write_layers(
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: no such folder to write {path.name} to")
     ordered = {name: layers[name] for name in LAYERS if name in layers}
-    if path.suffix.lower() == ".exr":
-        groups = _parts(tuple(ordered)) if encoding.parts == "several" else [tuple(ordered)]
-        pairs = [_exr_part(group, ordered, encoding, header, named=len(groups) > 1) for group in groups]
-        write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], "exr")
-    else:
-        pixels, spec = _picture(path.suffix.lower(), ordered, encoding, header)
-        write_spec(path, [pixels], [spec], path.suffix.lower()[1:])
+    pairs = encoded(path.suffix.lower(), ordered, encoding, header)
+    write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], path.suffix.lower()[1:])
+
+
+def encoded(
+    extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+) -> list[tuple[NDArray[Any], Any]]:
+    """(pixels, OpenImageIO's specification) of each part of a file. layers: in the order of LAYERS."""
+    if extension != ".exr":
+        return [_picture(extension, layers, encoding, header)]
+    groups = _parts(tuple(layers)) if encoding.parts == "several" else [tuple(layers)]
+    return [_exr_part(group, layers, encoding, header, named=len(groups) > 1) for group in groups]
 
 
 def is_whole(
@@ -211,7 +207,7 @@ def _exr_part(
         pixels = np.concatenate([_for_floats(name, layers[name]) for name in names], axis=2)
         formats = [oiio.HALF if kind == "colour" and encoding.depth == "half" else oiio.FLOAT for kind in kinds]
         half = np.array([one == oiio.HALF for one in formats])
-        pixels[:, :, half] = np.clip(pixels[:, :, half], -_HALF_MAX, _HALF_MAX)  # else it would become infinite
+        pixels[:, :, half] = np.clip(pixels[:, :, half], -HALF_MAX, HALF_MAX)  # else it would become infinite
         spec = _spec(pixels, formats[0] if len(set(formats)) == 1 else oiio.FLOAT, header)
         if len(set(formats)) > 1:
             spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
@@ -221,8 +217,7 @@ def _exr_part(
     spec.attribute("compression", encoding.compression)
     if named:
         spec.attribute("oiio:subimagename", LAYERS[names[0]].part)
-    for name, matrix in header.matrices.items():
-        spec.attribute(_MATRICES.get(name, name), oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
+    _add_matrices(spec, header)
     return np.ascontiguousarray(pixels), spec
 
 
@@ -261,6 +256,25 @@ def _planes(plane: NDArray[Any]) -> NDArray[Any]:
 def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, kind)
+    _add_header(spec, header)
+    return spec
+
+
+def deep_spec(width: int, height: int, header: Header) -> Any:
+    """Of a deep EXR, its channels and their formats left to say."""
+    spec = oiio.ImageSpec(width, height, 1, oiio.FLOAT)
+    spec.deep = True
+    _add_header(spec, header)
+    _add_matrices(spec, header)
+    return spec
+
+
+def _add_matrices(spec: Any, header: Header) -> None:
+    for name, matrix in header.matrices.items():
+        spec.attribute(_MATRICES.get(name, name), oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
+
+
+def _add_header(spec: Any, header: Header) -> None:
     if header.window is not None:
         spec.x, spec.y = header.window.x, header.window.y
         spec.full_x = spec.full_y = 0
@@ -270,4 +284,3 @@ def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
     spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes
     for name, value in header.attributes.items():
         spec.attribute(name, value)
-    return spec

@@ -21,11 +21,26 @@ _SMALL = 4096
 
 
 def plan_frame(
-    device: Device, gaussians: int, floats: int, camera: Camera, config: RasterizerConfig, features: int = 0
+    device: Device,
+    gaussians: int,
+    floats: int,
+    camera: Camera,
+    config: RasterizerConfig,
+    features: int = 0,
+    planes: int = 0,
 ) -> Plan:
     """Of rendering alone; floats: parameters of a Gaussian (`ShStorage.floats`); features: floats of each Gaussian's
-    that go into channels beside colour. Raises CapacityError."""
-    return _plan(device, gaussians, floats, [camera], config, training=False, slot=0, statistics=0, features=features)
+    that go into channels beside colour; planes: bytes of a pixel in further planes. Raises CapacityError."""
+    beside = {"slot": 0, "statistics": 0, "features": features, "more": planes}
+    return _plan(device, gaussians, floats, [camera], config, training=False, **beside)
+
+
+def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:
+    """How many pixels a frame may have, for its planes to leave three quarters of the device's memory to the model and
+    its pairs, and to be allocated at all."""
+    each = 21 + (4 * (features + 4) if features else 0) + planes
+    largest = max(12, 4 * (features + 2) if features else 0, planes)
+    return min(device.budget // (4 * each), device.max_allocation // largest)
 
 
 def plan_step(
@@ -56,6 +71,7 @@ def _plan(
     slot: int,
     statistics: int,
     features: int = 0,
+    more: int = 0,
 ) -> Plan:
     planes = loss = 0
     for camera in cameras:
@@ -66,6 +82,7 @@ def _plan(
         # image, transmittance, stops; ranges, counts_by_tile; in training target, its source, image_gradient
         own = 20 * pixels + 12 * tiles_x * tiles_y + ((24 + _SOURCE) * pixels + sums if training else 0)
         own += 4 * (features + 4) * pixels if features else 0  # with median, first, count and index
+        own += more * pixels
         loss = max(loss, scratch if training else 0)
         planes = max(planes, own)
     longest = max(gaussians, device.budget // 36)

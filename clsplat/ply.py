@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -105,12 +105,22 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         return gaussians
 
 
-def write(path: str | os.PathLike[str], gaussians: Gaussians, *, sh_degree: int | None = None) -> None:
+def write(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    *,
+    sh_degree: int | None = None,
+    comments: Sequence[str] = (),
+) -> None:
     """Write a binary little-endian 3DGS PLY of float32, atomically; the same Gaussians give the same bytes.
 
-    sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given. Raises ValueError
-    where it is lower than the model's, or an array is not as `Gaussians` says.
+    sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given. comments: lines of
+    the header, such as `colour.comment`. Raises ValueError where the degree is lower than the model's, a comment is no
+    line of ASCII, or an array is not as `Gaussians` says.
     """
+    for line in comments:
+        if not (line.isascii() and line.isprintable()):
+            raise ValueError(f"comment {line!r}: expected one line of ASCII")
     gaussians.check()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
@@ -119,7 +129,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, sh_degree: int 
     rest_names = [f"f_rest_{index}" for index in range(3 * padded)]
     names = [*POSITION, "nx", "ny", "nz", *DC, *rest_names, "opacity", *SCALE, *ROTATION]
     far, count = bool(gaussians.origin.any()), len(gaussians)
-    lines = ["ply", "format binary_little_endian 1.0"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     lines += [" ".join([*ORIGIN, *(repr(float(value)) for value in gaussians.origin)])] if far else []
     lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
     lines += [f"element {LOCAL} {count}", *(f"property float {name}" for name in POSITION)] if far else []

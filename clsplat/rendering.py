@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
-from clsplat.device.buffers import DeviceArray, Workspace, allocate
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device, open_device
 from clsplat.device.layout import CAMERA, PLAIN_SLOTS, WIDEST_SLOTS, SlotFields
 from clsplat.device.switches import kernel_defines
@@ -23,6 +23,7 @@ from clsplat.sh import check_half, coefficients_in_use, needed_degrees
 from clsplat.stages.adam import REFUSED
 from clsplat.stages.blend import Blended, blend, blend_grad
 from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
+from clsplat.stages.deep import DEEP_FLOATS, deep
 from clsplat.stages.duplicate import (
     MAX_PAIRS,
     Band,
@@ -182,6 +183,17 @@ class Rasterizer:
                 band,
                 frame.camera_array,
             )
+            del part  # as in `forward`
+        assert found is not None, "an image has a tile"
+        return found
+
+    def deep(self, frame: Frame, bounds: DeviceArray) -> DeviceArray:
+        """The frame in slices by depth, as `stages.deep` has them."""
+        device, found = self.device_of(frame.camera), None
+        for band in frame.bands:
+            part = self.part(frame, band)
+            of = (part.lists, frame.projected.splats, frame.blended, frame.camera.height, band, frame.camera_array)
+            found = deep(device, self.work, bounds, *of)
             del part  # as in `forward`
         assert found is not None, "an image has a tile"
         return found
@@ -385,6 +397,16 @@ class Renderer:
             index=whole[:, :, 1],
         )
 
+    def render_deep(self, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
+        """(bins, H, W, 6): the view in slices by depth, the next of which begins at each of the bounds (bins - 1,):
+        red, green, blue, associated with alpha; alpha; least and largest depth. All 0 where there is nothing."""
+        bins = len(bounds) + 1
+        on_device = self._hold(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
+        frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
+        found = self._rasterizer.deep(frame, upload(self.device, np.append(bounds, np.inf).astype(np.float32)))
+        planes = found.get()[:, :, : camera.height, : camera.width]
+        return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
+
     def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:
         self._background.set(np.asarray(background, np.float32))
         return self._rasterizer.forward(gaussians, camera, self._background, backward=False)
@@ -395,15 +417,17 @@ class Renderer:
         alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(image) if contiguous else image, alpha)
 
-    def _hold(self, gaussians: Gaussians, camera: Camera, features: int = 0) -> AnyGaussians:
-        """The model on the device, or on the host if a frame of this size leaves too little room for it."""
+    def _hold(self, gaussians: Gaussians, camera: Camera, features: int = 0, planes: int = 0) -> AnyGaussians:
+        """The model on the device, or on the host if a frame of this size leaves too little room for it. planes: bytes
+        of a pixel beside the picture's."""
         if self._sh is None or self._sh[0] is not gaussians:
             self._sh = self._held = None
             self._sh = (gaussians, held_sh(gaussians, self._rasterizer.config))
         sh = self._sh[1]
-        asked = (len(gaussians), sh.floats, camera.width, camera.height, features)
+        asked = (len(gaussians), sh.floats, camera.width, camera.height, features, planes)
         if self._planned != asked:
-            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, self._rasterizer.config, features)
+            config = self._rasterizer.config
+            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, config, features, planes)
             self._rasterizer.follow(plan)
             if plan.streamed or isinstance(self._held, HostGaussians):
                 self._held = None

@@ -34,10 +34,10 @@ static inline void motion_of(__constant float *camera, float x, float y, float z
   if (!(at_z.high > camera[CAMERA_NEAR])) return;
   float whole, rest;
   image_position(at_x.high, at_x.low, at_z.high, at_z.low, camera[CAMERA_FX], camera[CAMERA_FX_LOW],
-                 camera[CAMERA_CX], camera[CAMERA_CX_LOW], &whole, &rest);
+                 camera[CAMERA_CX], camera[CAMERA_CX_LOW], camera[CAMERA_WINDOW_X], &whole, &rest);
   motion[0] = (whole - splat[SPLAT_PIXEL_X]) + (rest - splat[SPLAT_SUB_X]);
   image_position(at_y.high, at_y.low, at_z.high, at_z.low, camera[CAMERA_FY], camera[CAMERA_FY_LOW],
-                 camera[CAMERA_CY], camera[CAMERA_CY_LOW], &whole, &rest);
+                 camera[CAMERA_CY], camera[CAMERA_CY_LOW], camera[CAMERA_WINDOW_Y], &whole, &rest);
   motion[1] = (whole - splat[SPLAT_PIXEL_Y]) + (rest - splat[SPLAT_SUB_Y]);
 }
 #endif

@@ -77,7 +77,8 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
 
 // The box of all directions within an angle of f whose tangent is `reach`.
 static inline void box_of(const float *f, float reach, __constant float *camera, Tangent *t) {
-  const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY], cx = camera[CAMERA_CX], cy = camera[CAMERA_CY];
+  const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
+  const float cx = camera[CAMERA_CX] - camera[CAMERA_WINDOW_X], cy = camera[CAMERA_CY] - camera[CAMERA_WINDOW_Y];
   const float cap = quarter_atan(reach, 1.0f), sine = reach / sqrt(fma1(reach, reach, 1.0f));
   t->whole_rows = 0;
 #if RAYS == 1

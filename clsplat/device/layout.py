@@ -19,10 +19,10 @@ _TRANSFORM = (
 
 _ROUNDED = (*_TRANSFORM, *("XMIN", "XMAX", "YMIN", "YMAX"), *("PX", "PY", "PZ"))
 
-CAMERA = (*_ROUNDED, "NEAR", "HAND", *(f"{name}_LOW" for name in _ROUNDED))
+CAMERA = (*_ROUNDED, "NEAR", "HAND", "WINDOW_X", "WINDOW_Y", *(f"{name}_LOW" for name in _ROUNDED))
 """A camera: `cam_from_world`, intrinsics, the limits of x/z and y/z in the Jacobian, its centre; near plane; 1, or -1
-where its rotation is a reflection; and what the rounding of them to float32 left, so that a mean's place on the image
-is good to 1e-6 pixels, and a needle's ellipse to 1e-4."""
+where its rotation is a reflection; the first pixel in its frame (`Camera.window`); and what the rounding of them to
+float32 left, so that a mean's place on the image is good to 1e-6 pixels, and a needle's ellipse to 1e-4."""
 
 SPLAT = (
     *("PIXEL_X", "PIXEL_Y", "SUB_X", "SUB_Y"),

@@ -101,6 +101,7 @@ def pixel_from_world(camera: Camera, points: Float64) -> tuple[Float64, Float64]
 
 
 def pixel_grid(camera: Camera) -> Float64:
-    """The centres of all pixels, (height * width, 2), row by row."""
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    """The centres of all pixels, (height * width, 2), row by row; in the frame, where the camera has a window."""
+    x, y = (camera.window.x, camera.window.y) if camera.window else (0, 0)
+    u, v = np.meshgrid(x + np.arange(camera.width) + 0.5, y + np.arange(camera.height) + 0.5)
     return np.stack([u.ravel(), v.ravel()], axis=1)

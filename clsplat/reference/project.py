@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, Window
 from clsplat.reference.sh import sh_basis, sh_basis_grad
 
 Float64 = NDArray[np.float64]
@@ -20,7 +20,6 @@ Bool = NDArray[np.bool_]
 
 ALPHA_MIN = 1.0 / 255.0
 LOW_PASS = 0.3
-FRUSTUM_MARGIN = 0.3
 COLOUR_LIMIT = 1e9
 
 
@@ -73,10 +72,11 @@ def rotation_matrices(quaternions: Float64) -> Float64:
 
 def frustum_limits(camera: Camera) -> Float64:
     """Lower and upper bound of x/z and y/z in the Jacobian, ((x, y), (x, y)): eq. (3)."""
-    size = np.array([camera.width, camera.height], np.float64)
+    window = camera.window or Window(0, 0, camera.width, camera.height)
+    size = np.array([window.width, window.height], np.float64)
     focal = np.array([camera.fx, camera.fy], np.float64)
     centre = np.array([camera.cx, camera.cy], np.float64)
-    margin = FRUSTUM_MARGIN * 0.5 * size / focal
+    margin = window.clamp * 0.5 * size / focal
     return np.stack([-centre / focal - margin, (size - centre) / focal + margin])
 
 
@@ -120,6 +120,8 @@ def project(
         z = geometry.p[:, 2]
         focal = np.array([camera.fx, camera.fy])
         means2d = focal * geometry.p[:, :2] / z[:, None] + np.array([camera.cx, camera.cy])
+        if camera.window is not None:
+            means2d -= [camera.window.x, camera.window.y]
 
         m1, m2 = geometry.half[:, 0], geometry.half[:, 1]
         length1, length2 = (m1 * m1).sum(axis=1), (m2 * m2).sum(axis=1)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, Window
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
@@ -230,7 +230,8 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
     if camera.projection == "equirectangular" and camera.width > (turn := 2 * np.pi * camera.fx) * (1 + 1e-6):
         wide = f"{camera.width} pixels wide, of which {turn:.1f} are a whole turn"
         raise InputError(f"an equirectangular camera is {wide}: expected no more")
-    half_w, half_h = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
+    window = camera.window or Window(0, 0, camera.width, camera.height)
+    half_w, half_h = 0.5 * window.width / camera.fx, 0.5 * window.height / camera.fy
     values = {
         "FX": camera.fx,
         "FY": camera.fy,
@@ -238,10 +239,12 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "CY": camera.cy,
         "NEAR": camera.near,
         "HAND": float(np.copysign(1.0, np.linalg.det(camera.rotation))),
-        "XMIN": -camera.cx / camera.fx - 0.3 * half_w,
-        "XMAX": (camera.width - camera.cx) / camera.fx + 0.3 * half_w,
-        "YMIN": -camera.cy / camera.fy - 0.3 * half_h,
-        "YMAX": (camera.height - camera.cy) / camera.fy + 0.3 * half_h,
+        "XMIN": -camera.cx / camera.fx - window.clamp * half_w,
+        "XMAX": (window.width - camera.cx) / camera.fx + window.clamp * half_w,
+        "YMIN": -camera.cy / camera.fy - window.clamp * half_h,
+        "YMAX": (window.height - camera.cy) / camera.fy + window.clamp * half_h,
+        "WINDOW_X": window.x,
+        "WINDOW_Y": window.y,
     }
     for row in range(3):
         values[f"T{row}"] = float(camera.translation[row])

@@ -32,8 +32,8 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
   floatL ray_x[OWNED], ray_y[OWNED], ray_z[OWNED];                                                                    \
   for (int k = 0; k < OWNED; ++k) {                                                                                   \
     const int cell = get_local_id(0) + k * ITEMS;                                                                     \
-    ray_of((float)tile_x + 0.5f + PIXELS_X(cell), (float)tile_y + 0.5f + PIXELS_Y(cell), camera, ray_x + k,           \
-           ray_y + k, ray_z + k);                                                                                     \
+    const float left = (float)tile_x + camera[CAMERA_WINDOW_X], top = (float)tile_y + camera[CAMERA_WINDOW_Y];        \
+    ray_of(left + 0.5f + PIXELS_X(cell), top + 0.5f + PIXELS_Y(cell), camera, ray_x + k, ray_y + k, ray_z + k);       \
   }
 #define SPLAT_HERE(splat)
 #define LOG2_ALPHA(splat, cell, k) log2_alpha_of_ray(ray_x[k], ray_y[k], ray_z[k], splat)

@@ -54,15 +54,17 @@ static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, 
   return (fmaL(-ratio, z, x) + fmaL(-ratio, z_low, x_low)) / z;
 }
 
-// (2): focal * (x / z) + centre, as whole pixels and the rest in [0, 1).
+// (2): focal * (x / z) + centre, as whole pixels from the window's first and the rest in [0, 1): the rest has the same bits
+// in every window.
 static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low, float focal, float focal_low,
-                                  float centre, float centre_low, floatL *whole, floatL *rest) {
+                                  float centre, float centre_low, float window, floatL *whole, floatL *rest) {
   const floatL ratio = x / z;
   const Double c = {(floatL)(centre),
                     fmaL((floatL)(focal), ratio_rest(ratio, x, x_low, z, z_low), (floatL)(centre_low))};
   const Double at = multiply_add2(focal, focal_low, ratio, c);
-  *whole = floorL(at.high);
-  *rest = (at.high - *whole) + at.low;
+  const floatL in_frame = floorL(at.high);
+  *whole = in_frame - window;
+  *rest = (at.high - in_frame) + at.low;
 }
 
 // From the camera's centre to the mean, along a world axis.

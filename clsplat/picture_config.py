@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of pictures (docs/pictures.md): with `config`, every default there is. Nothing slow is imported here, as the
+command line is made from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import inf
+from typing import Literal
+
+from clsplat.errors import InputError
+
+Filter = Literal["box", "blackman-harris"]
+
+_MOST_SUPERSAMPLES = 64
+_MOST_SAMPLES = 4096
+_MOST_BINS = 256
+_PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
+
+
+@dataclass(frozen=True)
+class ColourConfig:
+    """Which colour space pictures are written in."""
+
+    colorspace: str = ""
+    """Colour space of the pictures, a name of the OpenColorIO configuration such as ACEScg; '' is the model's own."""
+    model_colorspace: str = ""
+    """Colour space that the model was trained in; '' goes by the model file, and by sRGB where that says nothing."""
+    ocio_config: str = ""
+    """OpenColorIO configuration, a file or ocio://NAME; '' is $OCIO, or the studio configuration that is built in."""
+
+
+@dataclass(frozen=True)
+class FramingConfig:
+    """Which pixels are rendered, and how finely."""
+
+    overscan: str = "0"
+    """Pixels beyond each edge of the frame, or a share of its width and height such as 5%. EXR files keep the frame as
+    their display window, others have a larger picture."""
+    region: str = ""
+    """Part of the frame to render alone, X,Y,WIDTH,HEIGHT in pixels from its top left corner; '' renders all of it. In
+    EXR files it is the data window."""
+    supersample: int = 1
+    """Samples of a pixel across and down: the frame is rendered so many times larger, and filtered in linear light."""
+    filter: Filter = "box"
+    """Of supersampling: the mean over the pixel, or a Blackman-Harris window three pixels wide, which is smoother."""
+
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        parse_overscan(self.overscan)
+        if self.region:
+            parse_region(self.region)
+        if self.region and parse_overscan(self.overscan) != (0, 0.0):
+            raise InputError("--overscan and --region exclude each other: a region lies within the frame")
+        if not 1 <= self.supersample <= _MOST_SUPERSAMPLES:
+            raise InputError(f"--supersample {self.supersample}: expected 1 to {_MOST_SUPERSAMPLES}")
+
+    @property
+    def on(self) -> bool:
+        """Whether anything is other than the plain frame."""
+        return bool(self.region) or self.supersample > 1 or parse_overscan(self.overscan) != (0, 0.0)
+
+
+def parse_overscan(text: str) -> tuple[int, float]:
+    """(pixels, 0) or (0, share) of "32" or "5%". Raises InputError."""
+    word = text.strip()
+    try:
+        pixels, share = (0, float(word[:-1]) / 100) if word.endswith("%") else (int(word), 0.0)
+    except ValueError:
+        pixels, share = -1, 0.0
+    if not (0 <= pixels <= 1 << 16 and 0 <= share <= 1):
+        raise InputError(f"--overscan {text}: expected pixels such as 32, or a share such as 5%, at most 100%")
+    return pixels, share
+
+
+def parse_region(text: str) -> tuple[int, int, int, int]:
+    """x, y, width, height of "100,50,640,480". Raises InputError."""
+    words = [word.strip() for word in text.split(",")]
+    if len(words) != 4 or not all(word.isdecimal() for word in words) or "0" in words[2:]:
+        raise InputError(f"--region {text}: expected X,Y,WIDTH,HEIGHT in pixels such as 100,50,640,480")
+    x, y, width, height = (int(word) for word in words)
+    return x, y, width, height
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """Shutter and lens."""
+
+    samples: int = 16
+    """Frames that are rendered for one, where the shutter or the lens is open."""
+    shutter_angle: float = 0.0
+    """How long the shutter is open, in degrees of which 360 are from frame to frame, half before the frame and half
+    after it; 0 is a still camera."""
+    shutter_open: float | None = None
+    """When the shutter opens, in frames from the frame, such as -0.25; in place of the angle, with --shutter-close."""
+    shutter_close: float | None = None
+    """When the shutter closes, in frames from the frame, such as 0.25."""
+    f_stop: float | None = None
+    """Depth of field of a lens with this f-number, its focal length that of the camera on a sensor of --sensor-width;
+    none has everything in focus."""
+    aperture: float = 0.0
+    """Radius of the lens in the scene's units, in place of the f-number."""
+    focus: float = 0.0
+    """Depth that is in focus, along the camera's axis in the scene's units."""
+    sensor_width: float = 36.0
+    """Millimetres that the picture's width is on the sensor, for --f-stop."""
+    metres: float = 1.0
+    """Metres that a unit of the scene is, for --f-stop."""
+
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        if not 1 <= self.samples <= _MOST_SAMPLES:
+            raise InputError(f"--samples {self.samples}: expected 1 to {_MOST_SAMPLES}")
+        if not 0 <= self.shutter_angle <= 3600:
+            raise InputError(f"--shutter-angle {self.shutter_angle}: expected 0 to 3600 degrees")
+        if self.shutter_open is not None or self.shutter_close is not None:
+            if self.shutter_angle:
+                raise InputError("--shutter-angle and --shutter-open exclude each other")
+            if (
+                self.shutter_open is None
+                or self.shutter_close is None
+                or not (-inf < self.shutter_open < self.shutter_close < inf)
+            ):
+                times = f"--shutter-open {self.shutter_open} --shutter-close {self.shutter_close}"
+                raise InputError(f"{times}: expected two times, the second after the first")
+        for flag, value in (
+            ("--f-stop", self.f_stop),
+            ("--sensor-width", self.sensor_width),
+            ("--metres", self.metres),
+        ):
+            if value is not None and not 0 < value < inf:
+                raise InputError(f"{flag} {value}: expected a number above 0")
+        if not 0 <= self.aperture < inf:
+            raise InputError(f"--aperture {self.aperture}: expected a radius of at least 0")
+        if self.aperture and self.f_stop is not None:
+            raise InputError("--aperture and --f-stop exclude each other: both are the size of the lens")
+        if self.has_lens and not 0 < self.focus < inf:
+            raise InputError(f"--focus {self.focus}: expected the depth that is in focus, above 0")
+
+    @property
+    def shutter(self) -> tuple[float, float]:
+        """When it opens and closes, in frames from the frame."""
+        if self.shutter_open is not None and self.shutter_close is not None:
+            return self.shutter_open, self.shutter_close
+        return -self.shutter_angle / 720, self.shutter_angle / 720
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera is looked at at more than one time."""
+        return self.shutter[1] > self.shutter[0]
+
+    @property
+    def has_lens(self) -> bool:
+        """Whether it is more than a pinhole."""
+        return self.aperture > 0 or self.f_stop is not None
+
+    @property
+    def on(self) -> bool:
+        """Whether a frame is more than one sample."""
+        return self.moves or self.has_lens
+
+
+@dataclass(frozen=True)
+class PictureConfig:
+    """What is made of a frame, beside its channels."""
+
+    colour: ColourConfig = field(default_factory=ColourConfig)
+    framing: FramingConfig = field(default_factory=FramingConfig)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        self.framing.check()
+        self.sampling.check()
+
+    def check_deep(self) -> None:
+        """Raise InputError for what deep pictures have not."""
+        if self.sampling.on or self.framing.supersample > 1:
+            flag = "a shutter or a lens" if self.sampling.on else "--supersample"
+            raise InputError(f"deep EXR: {flag} has no deep samples, expected a frame without")
+
+
+@dataclass(frozen=True)
+class DeepConfig:
+    """Slices of a deep EXR."""
+
+    bins: int = 16
+    """Slices by depth, the most samples that a pixel has; each is as many times deeper as the one before."""
+    near: float = 0.0
+    """Depth at which the second slice begins, the first has all before it; 0 goes by what the frame has in view."""
+    far: float = 0.0
+    """Depth at which the last slice begins, which has all behind it; 0 goes by what the frame has in view."""
+
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        if not 1 <= self.bins <= _MOST_BINS:
+            raise InputError(f"--deep.bins {self.bins}: expected 1 to {_MOST_BINS}")
+        for flag, value in (("--deep.near", self.near), ("--deep.far", self.far)):
+            if not 0 <= value < inf:
+                raise InputError(f"{flag} {value}: expected a depth, or 0 for that of what is in view")
+        if self.near and self.far and not self.near < self.far:
+            raise InputError(f"--deep.far {self.far}: expected more than --deep.near {self.near}")
+
+
+@dataclass(frozen=True)
+class VideoConfig:
+    """How a video is encoded."""
+
+    fps: float = 24.0
+    """Frames a second."""
+    crf: int = 18
+    """Quality: 0 is the best, 51 the worst, 18 about the least that shows no loss."""
+    preset: str = "medium"
+    """How long the encoder looks for a smaller file, from ultrafast to veryslow."""
+
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        if not 0.01 <= self.fps <= 1000:
+            raise InputError(f"--video.fps {self.fps}: expected 0.01 to 1000 frames a second")
+        if not 0 <= self.crf <= 51:
+            raise InputError(f"--video.crf {self.crf}: expected 0 to 51")
+        if self.preset not in _PRESETS:
+            raise InputError(f"--video.preset {self.preset}: expected one of {', '.join(_PRESETS)}")

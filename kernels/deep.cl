@@ -1,0 +1,99 @@
+// A picture in slices by depth (docs/pictures.md, equations 70 to 73): the Gaussians of each bin of depths blended as if
+// they were alone, up to where the pixel ends in blend.cl. A tile's list is in order of depth, so that the bins come one
+// after the other. A group owns a tile, as in blend.cl.
+#include "shared/math.h"
+#include "shared/lanes.h"
+#include "shared/group.h"
+#include "shared/tile.h"
+#include "shared/cells.h"
+#include "shared/alpha.h"
+#include "shared/prefetch.h"
+
+#define DEEP_RED 0
+#define DEEP_GREEN 1
+#define DEEP_BLUE 2
+#define DEEP_ALPHA 3
+#define DEEP_FIRST 4
+#define DEEP_LAST 5
+
+// ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), stops (height, width) of blend.cl, for the
+// tiles from first_tile on; bounds (bins - 1): the depths at which the next bin begins, rising -> planes (bins,
+// DEEP_SIZE, height, width): colour associated with alpha, alpha, least and largest depth. All 0 where nothing is added.
+GROUP __kernel void deep(const int first_tile, const int tiles_x, const int height, const int bins,
+                         __constant float *bounds, __global const uint *ranges,
+                         __global const uint *gaussian_from_sorted, __global const float *splats,
+                         __global const int *stops, __global float *planes
+#ifdef RAYS
+                         , __constant float *camera
+#endif
+) {
+#if ITEMS > 1
+  __local int group_last;
+#endif
+  const int tile = first_tile + get_group_id(0);
+  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
+  const int begin = ranges[2 * get_group_id(0)];
+  const size_t stride = (size_t)tiles_x * TILE;
+  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
+
+  PIXEL_TABLES
+  RAY_TABLES
+  floatL values[DEEP_SIZE][OWNED]; // of the bin; DEEP_ALPHA: its transmittance
+  intL stop[OWNED];
+  int last = begin;
+  for (int k = 0; k < OWNED; ++k) {
+    const int cell = get_local_id(0) + k * ITEMS;
+    stop[k] = LOAD_CELL(int, stops + stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell), stride);
+    for (int field = 0; field < DEEP_SIZE; ++field) values[field][k] = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
+    last = max(last, maxL(stop[k]));
+  }
+#if ITEMS > 1
+  if (get_local_id(0) == 0) group_last = begin;
+  barrier(CLK_LOCAL_MEM_FENCE);
+  atomic_max(&group_last, last);
+  barrier(CLK_LOCAL_MEM_FENCE);
+  last = group_last;
+#endif
+
+  int i = begin;
+  for (int bin = 0; bin < bins; ++bin) {
+    for (; i < last; ++i) {
+      const uint gaussian = gaussian_from_sorted[i];
+      PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i + AHEAD < last ? i + AHEAD : last - 1]);
+      __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian;
+      const float depth = splat[SPLAT_DEPTH];
+      if (bin < bins - 1 && depth >= bounds[bin]) break;
+      SPLAT_HERE(splat)
+      const Reach reach = reach_of(splat, tile_x, tile_y);
+      FOR_CELLS(cell, reach) {
+        const int k = cell / ITEMS;
+        const floatL power = LOG2_ALPHA(splat, cell, k);
+        const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
+        if (ANYL(taken)) {
+          const floatL before = values[DEEP_ALPHA][k];
+          floatL alpha = exp2L(power);
+          alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
+          alpha = AS_FLOATL(AS_INTL(alpha) & taken);
+          const floatL weight = before * alpha;
+          values[DEEP_ALPHA][k] = fmaL(-before, alpha, before);
+          for (int channel = 0; channel < 3; ++channel)
+            values[DEEP_RED + channel][k] =
+                fmaL(weight, (floatL)(splat[SPLAT_RED + channel]), values[DEEP_RED + channel][k]);
+          const intL opening = taken & MASKL(before == 1.0f);
+          values[DEEP_FIRST][k] = opening ? (floatL)(depth) : values[DEEP_FIRST][k];
+          values[DEEP_LAST][k] = taken ? (floatL)(depth) : values[DEEP_LAST][k];
+        }
+      }
+    }
+    for (int k = 0; k < OWNED; ++k) {
+      const int cell = get_local_id(0) + k * ITEMS;
+      const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
+      for (int field = 0; field < DEEP_SIZE; ++field) {
+        const floatL value = values[field][k];
+        STORE_CELL(float, field == DEEP_ALPHA ? 1.0f - value : value,
+                   planes + plane * (DEEP_SIZE * bin + field) + pixel, stride);
+        values[field][k] = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
+      }
+    }
+  }
+}
