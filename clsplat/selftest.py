@@ -11,7 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,56 +19,12 @@ from typing import Any
 from clsplat.device.context import Device, all_devices
 from clsplat.device.source import kernel_root
 from clsplat.selftest_bench import Bench, Outcome, digest_of
+from clsplat.selftest_result import BOUNDS, FORWARD, INDICES, MARK, STAGES, Result
 from clsplat.selftest_scenes import scenes
 from clsplat.selftest_stages import RUN
 from clsplat.stages.blend import tile_items
 
-FORWARD = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend")
-"""What a frame needs."""
-STAGES = (*FORWARD, "loss", "blend_grad", "project_grad", "adam", "statistics")
-INDICES = ("project", "duplicate", "sort", "ranges")
-"""Those by whose counts and lists the next ones find their way."""
-
-BOUNDS: dict[str, tuple[float, str]] = {
-    "arithmetic": (3.01, "what OpenCL 1.2 allows a square root, 3 ulp; a division may have 2.5"),
-    "project": (256, "30 found, at opacities near 1; six times that for roots and divisions of 3 ulp, not 0.5"),
-    "duplicate": (0, "whole numbers"),
-    "sort": (0, "whole numbers"),
-    "ranges": (0, "whole numbers"),
-    "blend": (256, "11 found; 256 are 1.5e-5 of a colour of 0.5, under the 2e-5 that a frame may be off"),
-    "loss": (128, "9 found; the SSIM's quotients may have six times that"),
-    "blend_grad": (1024, "32 found; up to 64 divisions one after the other recover the transmittance"),
-    "project_grad": (512, "39 found, at opacities near 1; six times that for sloppy divisions"),
-    "adam": (32, "2 found; one root and one division"),
-    "statistics": (32, "1 found; one root"),
-}
-"""Ulp that a stage may be off, and why: what is found where every operation is rounded as IEEE 754 has it, with room
-for a GPU whose divisions and roots are not. A wrong operation is off by thousands."""
 DIGESTS = Path(__file__).with_name("selftest.json")
-
-
-@dataclass(frozen=True)
-class Result:
-    """What a stage came to, over all frozen scenes: the worst error as it is and in ulp; the bound in ulp; whether the
-    bits are those of the stored digest (None: none is stored for this shape); ms of all scenes; and in words what is
-    wrong beside the error, or empty.
-
-    where: what the worst error in ulp is of; otherwise: operations that round in another way than IEEE 754's."""
-
-    stage: str
-    absolute: float
-    ulp: float
-    bound: float
-    same_bits: bool | None
-    ms: float
-    trouble: str
-    where: str
-    otherwise: tuple[str, ...] = ()
-
-    @property
-    def passed(self) -> bool:
-        """Whether the stage can be trusted. Other bits alone do not condemn it."""
-        return not self.trouble and self.ulp <= self.bound
 
 
 @cache
@@ -135,10 +91,6 @@ def _result(name: str, benches: list[Bench], outcomes: list[Outcome]) -> Result:
         where=where,
         otherwise=outcomes[0].otherwise,
     )
-
-
-MARK = "clsplat-selftest "
-"""What a line that is meant for the parent begins with; drivers print lines of their own."""
 
 
 def _child(index: int, shape: tuple[int, int], *, quick: bool, forward: bool) -> None:

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from clsplat.cli import Selftest
 from clsplat.device.context import DeviceInfo, find_device, list_devices
 from clsplat.errors import DeviceError
-from clsplat.selftest import Result
+from clsplat.selftest_result import Result
 from clsplat.trust import Report, examine_device
 
 HEADER = ("stage", "worst error", "ulp", "allowed", "bits", "ms", "worst in")

@@ -26,7 +26,7 @@ from clsplat.device.shapes import Shape, saved_path, shape_of
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import DeviceError
 from clsplat.files import atomic_write
-from clsplat.selftest import FORWARD, MARK, STAGES, Result
+from clsplat.selftest_result import FORWARD, MARK, STAGES, Result
 
 PATIENCE = 300.0
 """Seconds without a word after which a driver counts as hung: the slowest that works builds a kernel in 60."""

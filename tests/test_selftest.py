@@ -19,8 +19,9 @@ from clsplat.device.context import Device, all_devices, list_devices
 from clsplat.device.program import BREAK
 from clsplat.device.shapes import shape_of
 from clsplat.errors import DeviceError, InputError
-from clsplat.selftest import BOUNDS, STAGES, Result, run
+from clsplat.selftest import run
 from clsplat.selftest_bench import error_of
+from clsplat.selftest_result import BOUNDS, STAGES, Result
 from clsplat.selftest_scenes import keys, scenes
 from clsplat.trust import Report, examine
 
