@@ -43,6 +43,7 @@ def adam(
     last four are counted the elements that got no step because it, or what it comes from, is not finite (`REFUSED`).
     """
     found = found or allocate(device, (4 + len(REFUSED),), np.uint32)
+    counts = found.buffer  # no array that a step goes through: it is touched where something is wrong
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     lanes = device.shape.lanes
     for group in GROUPS:
@@ -52,7 +53,7 @@ def adam(
                 continue
             updates = step // config.sh_rest_every
         rate, root = rates[group] / (1.0 - beta1**updates), (1.0 - beta2**updates) ** -0.5
-        constants = (rate, root, beta1, beta2, epsilon, limit_of(group) ** 2, found)
+        constants = (rate, root, beta1, beta2, epsilon, limit_of(group) ** 2, counts)
         arrays = (parameters[group], gradients[group], first[group], second[group])
         size, rows = parameters[group].size, parameters.count
         if size == 0:
