@@ -44,6 +44,9 @@ NPY_HEADER = re.compile(
 )
 """What np.save writes before an array of numbers."""
 
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, InputError, BadZipFile, NotImplementedError, RuntimeError)
+"""What reading a damaged checkpoint raises; the last two are zipfile's, of versions and passwords."""
+
 Arrays = dict[str, NDArray[Any]]
 T = TypeVar("T")
 
@@ -204,7 +207,7 @@ class Run:
             try:
                 checkpoint = _read_checkpoint(path)
                 break
-            except (OSError, ValueError, KeyError, EOFError, InputError, BadZipFile) as error:
+            except _DAMAGE as error:
                 found_wrong = plain(f"{path}: checkpoint is damaged and was passed over ({error})")
                 warnings.warn(found_wrong, stacklevel=2)
         if found and checkpoint is None:
