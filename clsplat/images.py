@@ -215,18 +215,13 @@ def open_image(path: Path, hints: Any = None) -> Any:
         known = file.read(8).startswith(SIGNATURES)
     if size > MAX_FILE_BYTES or (size > FREE_FILE_BYTES and not known):
         raise InputError(f"{path}: has {size} bytes and does not begin as a picture, expected at most {MAX_FILE_BYTES}")
-    try:
-        name = str(path)
-        source = oiio.ImageInput.open(name, hints) if hints is not None else oiio.ImageInput.open(name)
-    except UnicodeEncodeError:
-        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it") from None
+    name = str(path)
+    if name.encode("utf-8", "replace").decode() != name:
+        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it")
+    source = oiio.ImageInput.open(name, hints) if hints is not None else oiio.ImageInput.open(name)
     if source is None:
         raise InputError(f"{path}: does not decode: {_one_line(error_of(oiio))}; expected an image")
-    try:
-        spec = source.spec()
-        _ = spec.channelnames
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: does not decode: the names of its channels are no text") from None
+    spec = source.spec()
     shown = max(spec.width, 0) * max(spec.height, 0), max(spec.full_width, 0) * max(spec.full_height, 0)
     floats = max(shown) * spec.nchannels
     if spec.depth > 1 or min(spec.width, spec.height, spec.full_width, spec.full_height) < 1:

@@ -240,8 +240,8 @@ def _read_checkpoint(path: Path) -> Checkpoint:
 
 
 class _Bounded:
-    """A file that is never asked for more than it has: room is made beforehand for what `read` is asked for, and zipfile
-    asks for what a header says."""
+    """A file that is never asked for more than it has: `read` makes room for all that it is asked for, and zipfile asks
+    for what a header says."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self._size = file, os.fstat(file.fileno()).st_size

@@ -222,7 +222,7 @@ def stress(
         finally:
             worker.close()
 
-    memory_disk = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    memory_disk = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108  # a folder in it is made safely
     with tempfile.TemporaryDirectory(prefix="clsplat-hostile-", dir=memory_disk) as scratch:
         threads = [threading.Thread(target=work, args=(index, scratch)) for index in range(jobs)]
         for thread in threads:
