@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import TEMPORARY_SUFFIX, is_file
+from clsplat.files import TEMPORARY_SUFFIX, is_file, open_input
 
 Float32 = NDArray[np.float32]
 Metadata = Mapping[str, str | int | float]
@@ -37,6 +37,12 @@ MAX_PIXELS = 1 << 28
 FREE_FLOATS, FLOATS_A_BYTE = 48 << 20, 4096
 """A picture may have so many channel values whatever its file's length is, and so many for each byte of it: more than
 any real picture, compressed, as deflate makes at most 1032 bytes of one."""
+MAX_FILE_BYTES, FREE_FILE_BYTES = 1 << 30, 1 << 26
+SIGNATURES = (
+    *(PNG_SIGNATURE, b"\xff\xd8\xff", b"\x76\x2f\x31\x01", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"#?"),
+    *(b"RIFF", b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"PF", b"Pf"),
+)
+"""How pictures begin that are larger than FREE_FILE_BYTES: some decoders read the whole of what is not theirs."""
 # libjpeg's notes about data that it can do without; every other message means that pixels are lost
 HARMLESS = ("extraneous bytes",)
 
@@ -205,26 +211,26 @@ def _open(path: Path) -> Any:
 
 def open_image(path: Path, hints: Any = None) -> Any:
     """OpenImageIO's input of a file, whose header makes sense. Raises InputError."""
-    try:
-        name = str(path)
-        source = oiio.ImageInput.open(name, hints) if hints is not None else oiio.ImageInput.open(name)
-    except UnicodeEncodeError:
-        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it") from None
+    size = path.stat().st_size
+    with open_input(path, "a picture") as file:
+        known = file.read(8).startswith(SIGNATURES)
+    if size > MAX_FILE_BYTES or (size > FREE_FILE_BYTES and not known):
+        raise InputError(f"{path}: has {size} bytes and does not begin as a picture, expected at most {MAX_FILE_BYTES}")
+    name = str(path)
+    if name.encode("utf-8", "replace").decode() != name:
+        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it")
+    source = oiio.ImageInput.open(name, hints) if hints is not None else oiio.ImageInput.open(name)
     if source is None:
         raise InputError(f"{path}: does not decode: {_one_line(error_of(oiio))}; expected an image")
-    try:
-        spec = source.spec()
-        _ = spec.channelnames
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: does not decode: the names of its channels are no text") from None
+    spec = source.spec()
     shown = max(spec.width, 0) * max(spec.height, 0), max(spec.full_width, 0) * max(spec.full_height, 0)
     floats = max(shown) * spec.nchannels
     if spec.depth > 1 or min(spec.width, spec.height, spec.full_width, spec.full_height) < 1:
         raise InputError(f"{path}: is {spec.width} x {spec.height} x {spec.depth} pixels, expected a flat picture")
-    if max(shown) > MAX_PIXELS or floats > max(FREE_FLOATS, FLOATS_A_BYTE * path.stat().st_size):
+    if max(shown) > MAX_PIXELS or floats > max(FREE_FLOATS, FLOATS_A_BYTE * size):
         raise InputError(
             f"{path}: says that it is {spec.width} x {spec.height} pixels of {spec.nchannels} channels, shown as "
-            f"{spec.full_width} x {spec.full_height}, in {path.stat().st_size} bytes; is it damaged?"
+            f"{spec.full_width} x {spec.full_height}, in {size} bytes; is it damaged?"
         )
     return source
 
@@ -294,6 +300,8 @@ def _check_png_is_whole(path: Path) -> None:
         while position + 12 <= size:
             file.seek(position)
             length, kind = struct.unpack(">I4s", file.read(8))
+            if not kind.isalpha():
+                break
             position += 12 + length
             if kind == b"IEND" and position <= size:
                 return

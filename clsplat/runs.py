@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, BinaryIO, Literal, TypeVar, get_args, get_origin, get_type_hints
 from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
@@ -232,10 +232,12 @@ def _read_checkpoint(path: Path) -> Checkpoint:
     Not by np.load, which takes an array's size from its header, and unpacks what was packed.
     """
     arrays: Arrays = {}
-    with open_input(path, "a checkpoint") as file, ZipFile(file) as archive:
+    with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
+        left = os.fstat(file.fileno()).st_size
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
-            if member.compress_type != ZIP_STORED or name == member.filename or name in arrays:
+            left -= member.file_size
+            if member.compress_type != ZIP_STORED or name == member.filename or name in arrays or left < 0:
                 raise ValueError(f"its member {member.filename[:80]!r} is none of a checkpoint's")
             arrays[name] = _array(archive.read(member), name)
     record = parse_json(arrays.pop(STATE_KEY).tobytes())
@@ -251,6 +253,19 @@ def _read_checkpoint(path: Path) -> Checkpoint:
             if _digest(array) != digests[name]:
                 raise ValueError(f"{name} is not what was written: its sha256 differs")
     return Checkpoint(step, arrays, state)
+
+
+class _Bounded:
+    """A file that is never asked for more than it has: `read` makes room for all that it is asked for, and zipfile asks
+    for what a header says."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
+        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+
+    def read(self, size: int = -1) -> bytes:
+        left = max(self._size - self.tell(), 0)
+        return self._file.read(left if size < 0 else min(size, left))
 
 
 def _array(data: bytes, name: str) -> NDArray[Any]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from clsplat import colmap, transforms
 from clsplat.camera import Camera
-from clsplat.errors import InputError
+from clsplat.errors import InputError, plain
 from clsplat.images import downscale, find_images, image_size, name_all, read_image, require_images
 from clsplat.transforms import Frame
 from clsplat.undistort import Lens, undistort
@@ -230,7 +230,7 @@ def load_scene(
     else:
         bounds = camera_bounds([view.camera for view in views], box)
     name = path.resolve().name if path.is_dir() else path.resolve().parent.name
-    return Scene(name, views, points, colors, bounds, heard)
+    return Scene(name, views, points, colors, bounds, [plain(warning) for warning in heard])
 
 
 def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = None) -> tuple[Float64, Float64]:

@@ -367,12 +367,10 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
         if missing := [name for name in "xyz" if name not in kinds]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
         coloured = all(name in kinds for name in RGB)
-        parts: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = [
-            (np.empty((0, 3)), np.empty((0, 3), np.float32))
-        ]
+        parts: list[tuple[Float64, Float32]] = [(np.empty((0, 3)), np.empty((0, 3), np.float32))]
         for block in ply.read_vertices(file, header, path, "point"):
             points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
-            colors = np.full(points.shape, 0.5, np.float32)
+            colors: Float32 = np.full(points.shape, 0.5, np.float32)
             if coloured:
                 with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, refused below
                     colors = np.stack([block[name] for name in RGB], axis=1).astype(np.float32)

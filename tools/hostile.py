@@ -205,6 +205,8 @@ def make_record(folder: Path) -> None:
 def read_scene(folder: Path) -> None:
     """Everything of a scene that is looked at before training: cameras, points, every picture."""
     scene = load_scene(folder)
+    if bad := [warning for warning in scene.warnings if not warning.isprintable()]:
+        raise AssertionError(f"a warning that is not a plain line: {bad[0][:300]!r}")
     scene.check_pictures()
     for view in scene.views:
         view.load()

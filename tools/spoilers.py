@@ -271,7 +271,7 @@ def _archive(data: bytes, rng: random.Random) -> bytes:
         )
     elif kind == 4:
         compression = zipfile.ZIP_DEFLATED
-        zeros = np.zeros(rng.choice((10, 60_000_000)), np.float32)
+        zeros = np.zeros(rng.choice((10, 15_000_000)), np.float32)
         buffer = io.BytesIO()
         np.save(buffer, zeros)
         content = buffer.getvalue()

@@ -40,6 +40,8 @@ from hostile import READERS, Reader, spoil
 from clsplat.errors import ClsplatError
 
 MIB = 1 << 20
+SPOILING = 30
+"""Seconds that making a case may take, beside reading it."""
 
 
 @dataclass
@@ -96,7 +98,7 @@ def _status(name: str) -> float:
         return next(int(line.split()[1]) / 1024 for line in file if line.startswith(name))
 
 
-def _work(tasks: Connection, names: list[str], seed: int, memory: int, scratch: str) -> None:
+def _work(tasks: Connection, names: list[str], seed: int, memory: int, most_seconds: float, scratch: str) -> None:
     """A worker: gets (reader, first, stop), answers ("case", number), then ("done", seconds, MiB, refused, trouble)."""
     import signal
 
@@ -128,6 +130,8 @@ def _work(tasks: Connection, names: list[str], seed: int, memory: int, scratch: 
                 seconds, peak = time.perf_counter() - start, _status("VmHWM") - before
                 if peak > memory and not trouble:
                     trouble = f"{peak:.0f} MiB of memory"
+                if seconds > most_seconds and not trouble:
+                    trouble = f"{seconds:.0f} s"
             tasks.send(("done", seconds, peak, refused, trouble))
         tasks.send(("end",))
 
@@ -136,7 +140,7 @@ class _Worker:
     """A process that is started again where a case has ended it or taken too long."""
 
     def __init__(self, names: list[str], seed: int, memory: int, seconds: float, scratch: str) -> None:
-        self.arguments, self.seconds = (names, seed, memory, scratch), seconds
+        self.arguments, self.seconds = (names, seed, memory, seconds, scratch), seconds
         self._start()
 
     def _start(self) -> None:
@@ -152,7 +156,7 @@ class _Worker:
             case, trouble, started = first, "", False
             try:
                 while True:
-                    if not self.pipe.poll(self.seconds if started else 120):
+                    if not self.pipe.poll(self.seconds + SPOILING if started else 120):
                         trouble = f"not done after {self.seconds:g} s"
                         break
                     answer = self.pipe.recv()
@@ -218,7 +222,8 @@ def stress(
         finally:
             worker.close()
 
-    with tempfile.TemporaryDirectory(prefix="clsplat-hostile-") as scratch:
+    memory_disk = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108  # a folder in it is made safely
+    with tempfile.TemporaryDirectory(prefix="clsplat-hostile-", dir=memory_disk) as scratch:
         threads = [threading.Thread(target=work, args=(index, scratch)) for index in range(jobs)]
         for thread in threads:
             thread.start()

@@ -1,0 +1,647 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that were made to do harm: one line that names the file, in bounded memory and time. A sample of what
+`tools/stress_files.py` does at length, and each defect that it found, by name."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import random
+import struct
+import tracemalloc
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import stress_files
+from hostile import (
+    READERS,
+    Reader,
+    make_colmap_binary,
+    make_colmap_text,
+    make_photos,
+    make_ply,
+    make_run,
+    make_transforms,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stress_files import stress, verdict
+
+from clsplat import colmap, images, ply, runs, sfm, transforms
+from clsplat.config import TrainConfig
+from clsplat.errors import InputError, plain
+from clsplat.images import find_images, image_size, read_image
+from clsplat.scene import load_scene
+
+
+def refusal(read: Callable[[], object]) -> str:
+    """The message of the InputError, which is one line."""
+    with pytest.raises(InputError) as caught:
+        read()
+    assert str(caught.value).isprintable()
+    return str(caught.value)
+
+
+def peak_of(read: Callable[[], object]) -> int:
+    """Bytes that Python and NumPy had at most while `read` was refused."""
+    tracemalloc.start()
+    try:
+        refusal(read)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+# The sample
+
+
+def test_a_sample_of_every_reader() -> None:
+    tallies = stress(list(READERS), 500, seed=7, jobs=2)
+    assert {name: tally.failures for name, tally in tallies.items() if tally.failures} == {}
+    assert sum(tally.cases for tally in tallies.values()) >= 490
+    refused = {name for name, tally in tallies.items() if tally.refused}
+    assert refused >= {"ply", "colmap-bin", "colmap-txt", "transforms", "config"}, "nothing was spoilt"
+
+
+def broken(**changes: Any) -> Reader:
+    """A reader with these changes."""
+    return Reader(**{"name": "x", "make": lambda _: None, "files": (), "kinds": (), **changes})
+
+
+@pytest.mark.parametrize(
+    ("error", "found"),
+    [
+        (ValueError("x"), "ValueError"),
+        (MemoryError(), "MemoryError"),
+        (InputError("no name"), "names no file"),
+        (RecursionError("x"), "RecursionError"),
+        (SystemExit(1), "SystemExit"),
+    ],
+)
+def test_a_verdict_can_be_bad(error: BaseException, found: str, tmp_path: Path) -> None:
+    def read(_: Path) -> None:
+        raise error
+
+    assert found in verdict(broken(read=read), tmp_path)[1]
+
+
+def test_a_verdict_can_be_good(tmp_path: Path) -> None:
+    def read(folder: Path) -> None:
+        raise InputError(f"{folder / 'a.ply'}: is none")
+
+    assert verdict(broken(read=read), tmp_path) == (True, "")
+    assert verdict(broken(read=lambda _: None), tmp_path) == (False, "")
+
+
+def test_a_crash_and_a_loop_are_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = tmp_path / "hostile_fakes.py"
+    module.write_text(
+        "import os, time\n"
+        "def make(folder): (folder / 'a').write_bytes(b'12')\n"
+        "def read(folder):\n"
+        "    data = (folder / 'a').read_bytes()\n"
+        "    if data == b'12': return\n"
+        "    if len(data) % 2: os.abort()\n"
+        "    time.sleep(60)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    # in the children `hostile` gets a reader of ours: they import it anew
+    (tmp_path / "sitecustomize.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(Path(stress_files.__file__).parent)!r})\n"
+        "import hostile, hostile_fakes\n"
+        "kinds = ('truncate', 'append')\n"
+        "fake = hostile.Reader('fake', hostile_fakes.make, hostile_fakes.read, ('a',), kinds)\n"
+        "hostile.READERS['fake'] = fake\n"
+    )
+    monkeypatch.setitem(READERS, "fake", broken(name="fake", read=lambda _: None))
+    monkeypatch.setattr(stress_files, "SPOILING", 0)
+    tally = stress(["fake"], 4, seed=1, seconds=0.5)["fake"]
+    assert tally.cases == 4
+    troubles = " ".join(trouble for _, trouble in tally.failures)
+    assert "the process ended, status -6" in troubles
+    assert "not done after 0.5 s" in troubles
+
+
+def test_a_case_can_be_repeated(tmp_path: Path) -> None:
+    def files(folder: Path) -> dict[str, bytes]:
+        kept = stress_files.keep(folder, "colmap-txt", 12, 3)
+        return {str(path.relative_to(kept)): path.read_bytes() for path in kept.rglob("*") if path.is_file()}
+
+    assert files(tmp_path / "a") == files(tmp_path / "b")
+
+
+# Whatever is read
+
+
+def test_messages_are_one_plain_line() -> None:
+    assert str(InputError("a\nb\x1b[31m\u202e\udcff\0")) == r"a\nb\x1b[31m\u202e\udcff\x00"
+    assert plain("Kölner Dom \U0001f4a9.png") == "Kölner Dom \U0001f4a9.png"
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def loop(path: Path) -> None:
+    path.symlink_to(path.name)
+
+
+def folder(path: Path) -> None:
+    path.mkdir()
+
+
+def zeros(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def huge(path: Path) -> None:
+    with open(path, "wb") as file:
+        file.truncate(1 << 33)  # takes no room on the disk
+
+
+PLACES = (pipe, loop, folder, zeros, huge)
+
+
+@pytest.mark.parametrize("place", PLACES, ids=lambda place: place.__name__)
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (make_ply, "model.ply"),
+        (make_colmap_binary, "sparse/0/images.bin"),
+        (make_colmap_text, "sparse/0/points3D.txt"),
+        (make_transforms, "transforms.json"),
+        (make_transforms, "cloud.ply"),
+        (make_run, "run/config.toml"),
+        (make_photos, "photos/a.png"),
+    ],
+    ids=["ply", "colmap", "colmap text", "transforms", "cloud", "config", "photo"],
+)
+def test_what_is_no_plain_file(
+    make: Callable[[Path], None], name: str, place: Callable[[Path], None], tmp_path: Path
+) -> None:
+    make(tmp_path)
+    (tmp_path / name).unlink()
+    place(tmp_path / name)
+    reader = {"model.ply": "ply", "run/config.toml": "config", "photos/a.png": "photos"}.get(name, "transforms")
+    refused, trouble = verdict(READERS[reader], tmp_path)
+    assert trouble == ""
+    # points may be missing, which is a warning or nothing; a folder is no photo
+    assert refused or name in ("cloud.ply", "sparse/0/points3D.txt") or place is folder
+
+
+# PLY
+
+
+def model(tmp_path: Path, content: bytes) -> Path:
+    path = tmp_path / "model.ply"
+    path.write_bytes(content)
+    return path
+
+
+def ascii_model(rows: list[str], count: int | None = None) -> bytes:
+    names = [*ply.REQUIRED]
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(rows) if count is None else count}"]
+    return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", *rows, ""]).encode()
+
+
+def test_names_in_a_ply_header_are_made_plain(tmp_path: Path) -> None:
+    path = model(tmp_path, b"ply\nformat ascii 1.0\nelement ver\0\x1btex 3\nend_header\n")
+    assert r"ver\x00\x1btex" in refusal(lambda: ply.read(path))
+
+
+def test_one_long_word_is_no_table_of_long_words(tmp_path: Path) -> None:
+    row = " ".join(["0.5"] * len(ply.REQUIRED))
+    path = model(tmp_path, ascii_model([row] * 200 + [row[:-3] + "0." + "5" * 500_000]))
+    assert peak_of(lambda: ply.read(path)) < 20e6
+    path = model(tmp_path, ascii_model([row, row + "9" * 2_000_000]))
+    assert "line of more than" in refusal(lambda: ply.read(path))
+
+
+def test_text_cannot_claim_more_rows_than_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ply, "BLOCK_ROWS", 4)
+    row = " ".join(["0.5"] * len(ply.REQUIRED))
+    path = model(tmp_path, ascii_model([row] * 9, 10**8))
+    assert peak_of(lambda: ply.read(path)) < 1e6
+
+
+def test_wide_rows_are_read_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_ply(tmp_path)
+    whole = ply.read(tmp_path / "model.ply")
+    monkeypatch.setattr(ply, "MAX_BLOCK_BYTES", 200)
+    np.testing.assert_array_equal(ply.read(tmp_path / "model.ply").sh, whole.sh)
+    make_ply(tmp_path, "ascii")
+    monkeypatch.setattr(ply, "MAX_BLOCK_WORDS", 70)
+    np.testing.assert_array_equal(ply.read(tmp_path / "model.ply").sh, whole.sh)
+
+
+def test_a_clouds_property_twice(tmp_path: Path) -> None:
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "x"))
+    for form in ("binary_little_endian", "ascii"):
+        path = model(tmp_path, f"ply\nformat {form} 1.0\nelement vertex 1\n{names}end_header\n1 2 3 4 5 6 7 8".encode())
+        assert "property x twice" in refusal(lambda path=path: transforms.read_point_cloud(path))
+
+
+def test_a_cloud_claims_at_most_what_it_has(tmp_path: Path) -> None:
+    names = "".join(f"property float {name}\n" for name in "xyz")
+    for form in ("binary_little_endian", "ascii"):
+        path = model(tmp_path, f"ply\nformat {form} 1.0\nelement vertex {10**15}\n{names}end_header\n1 2 3\n".encode())
+        assert peak_of(lambda path=path: transforms.read_point_cloud(path)) < 2e6
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.text(max_size=12), max_size=8), st.integers(-(10**30), 10**30), st.binary(max_size=64))
+def test_any_ply_header(tmp_path_factory: pytest.TempPathFactory, words: list[str], count: int, body: bytes) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.ply"
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property float {word}" for word in (*ply.REQUIRED, *words)]
+    path.write_bytes("\n".join([*lines, "end_header", ""]).encode("utf-8", "surrogatepass") + body)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert path.name in refusal(lambda: ply.read(path))
+
+
+# COLMAP
+
+
+def test_numbers_of_any_length_in_a_models_text(tmp_path: Path) -> None:
+    make_colmap_text(tmp_path)
+    path = tmp_path / "sparse/0/points3D.txt"
+    for word in ("9" * 400, "9" * 5000, "1e999", "1e300", "nan"):
+        path.write_text(f"1 {word if '9' not in word[1:] else 0} 0 0 {word if '9' in word[1:] else 0} 0 0 0\n")
+        assert str(path) in refusal(lambda: colmap.read_model(path.parent))
+
+
+def test_far_cameras_are_refused(tmp_path: Path) -> None:
+    make_colmap_text(tmp_path)
+    path = tmp_path / "sparse/0/images.txt"
+    path.write_text("1 1 0 0 0 1e200 0 0 1 a.png\n\n")
+    assert "has the pose" in refusal(lambda: colmap.read_model(path.parent))
+
+
+@pytest.mark.parametrize("window", [1, 30, 100])
+def test_binary_models_are_read_a_window_at_a_time(
+    window: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_colmap_binary(tmp_path)
+    whole = colmap.read_model(tmp_path / "sparse/0")
+    monkeypatch.setattr(colmap, "WINDOW", window)
+    parts = colmap.read_model(tmp_path / "sparse/0")
+    assert [image.name for image in parts.images] == [image.name for image in whole.images]
+    np.testing.assert_array_equal(parts.points, whole.points)
+    np.testing.assert_array_equal(parts.images[2].translation, whole.images[2].translation)
+
+
+@pytest.mark.parametrize(
+    "name", ["..\\..\\x.png", "C:\\x.png", "C:x.png", "\\\\host\\x.png", "/x.png", "a/../../x.png", "a\nb", ""]
+)
+def test_names_that_leave_the_images_folder(name: str) -> None:
+    assert not colmap.safe_name(name)
+
+
+@pytest.mark.parametrize("name", ["a.png", "sub/a.png", "..a.png", "a..b/c.png", "Kölner Dom.jpg"])
+def test_names_that_do_not(name: str) -> None:
+    assert colmap.safe_name(name)
+
+
+# transforms.json
+
+
+def change(tmp_path: Path, **values: object) -> Path:
+    make_transforms(tmp_path)
+    path = tmp_path / "transforms.json"
+    document = json.loads(path.read_text())
+    for key, value in values.items():
+        target = document if key in document else document["frames"][1]
+        target[key] = value
+    path.write_text(json.dumps(document))
+    return path
+
+
+OUTSIDE = (
+    "../../etc/passwd",
+    "/etc/passwd",
+    "../images/a.png",
+    "images/../../x.png",
+    "..\\x.png",
+    "images\\..\\..\\x.png",
+    "..",
+)
+
+
+@pytest.mark.parametrize("listed", OUTSIDE)
+@pytest.mark.parametrize("key", ["file_path", "ply_file_path"])
+def test_no_file_outside_the_scenes_folder(key: str, listed: str, tmp_path: Path) -> None:
+    path = change(tmp_path / "scene", **{key: listed})
+    assert "inside the scene's folder" in refusal(lambda: load_scene(path.parent))
+
+
+def test_a_scene_is_not_left_from_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = change(tmp_path / "scene", file_path="../x.png")
+    monkeypatch.chdir(path.parent)
+    assert "inside the scene's folder" in refusal(lambda: load_scene(Path(path.name)))
+
+
+def test_files_inside_by_their_absolute_name_or_by_a_link(tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
+    assert len(load_scene(change(folder, file_path=str(folder / "images/b.png")).parent).views) == 3
+    (folder / "images").rename(tmp_path / "pictures")
+    (folder / "images").symlink_to(tmp_path / "pictures")
+    assert len(load_scene(folder).views) == 3
+
+
+@pytest.mark.parametrize("value", [10**400, [[10**400] * 4] * 4, [[1e200, 0, 0, 0]] * 4, [[None] * 4] * 4, "x", {}])
+def test_poses_that_are_none(value: object, tmp_path: Path) -> None:
+    path = change(tmp_path, transform_matrix=value)
+    assert "frame 1" in refusal(lambda: transforms.read_transforms(path))
+
+
+@pytest.mark.parametrize("key", ["fl_x", "w", "k1", "cx", "aabb_scale", "scale", "offset"])
+def test_numbers_that_are_none(key: str, tmp_path: Path) -> None:
+    for value in (10**400, 1e200, [10**400] * 3, "x", [[]]):
+        path = change(tmp_path / "scene", **{key: value})
+        assert path.name in refusal(lambda path=path: transforms.read_transforms(path))
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"a":' * 100_000, "9" * 5000, '{"frames": [' + "9" * 5000 + "]}", "\ufeff{}"]
+)
+def test_documents_that_are_none(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "transforms.json"
+    path.write_text(text, "utf-8")
+    assert str(path) in refusal(lambda: transforms.read_transforms(path))
+
+
+def test_names_that_no_file_can_have(tmp_path: Path) -> None:
+    for name in ("x" * 300, "y/" * 3000, "images/" + "z" * 255):
+        path = change(tmp_path / "scene", file_path=name)
+        assert "are missing" in refusal(lambda path=path: transforms.read_transforms(path))
+
+
+def test_only_the_listed_folders_are_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = change(tmp_path)
+    walked: list[str] = []
+    real = os.walk
+    monkeypatch.setattr(os, "walk", lambda top, **kw: (walked.append(w[0]) or w for w in real(top, **kw)))
+    (tmp_path / "images" / "deep" / "deeper").mkdir(parents=True)
+    load_scene(path)
+    assert not any("deep" in each for each in walked)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.floats() | st.integers() | st.text(),
+        lambda each: (
+            st.lists(each)
+            | st.dictionaries(st.sampled_from(["frames", "file_path", "transform_matrix", "fl_x", "w", "h"]), each)
+        ),
+    )
+)
+def test_any_document(tmp_path_factory: pytest.TempPathFactory, document: Any) -> None:
+    path = tmp_path_factory.getbasetemp() / "transforms.json"
+    path.write_text(json.dumps(document))
+    assert str(path) in refusal(lambda: transforms.read_transforms(path))
+
+
+# Pictures
+
+
+def test_links_that_go_round(tmp_path: Path) -> None:
+    make_photos(tmp_path)
+    for name in ("a", "b", "c"):
+        (tmp_path / "photos" / name).symlink_to(".")
+        (tmp_path / name).symlink_to("photos")
+    assert [path.name for path in find_images(tmp_path)] == ["a.png", "b.png", "picture.jpg"]
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def test_a_png_of_100_000_by_100_000_pixels(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0))
+    path.write_bytes(images.PNG_SIGNATURE + head + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b""))
+    for read in (image_size, read_image):
+        assert "does not decode" in refusal(lambda read=read: read(path))  # OpenImageIO's own limit
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0))
+    path.write_bytes(images.PNG_SIGNATURE + head + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b""))
+    for read in (image_size, read_image):
+        assert "30000 x 30000" in refusal(lambda read=read: read(path))
+
+
+def exr(path: Path, width: int, height: int, full: int) -> Path:
+    spec = oiio.ImageSpec(width, height, 3, oiio.HALF)
+    spec.full_width = spec.full_height = full
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    assert output.write_image(np.zeros((height, width, 3), np.float32))
+    assert output.close()
+    return path
+
+
+def test_an_exr_shown_as_100_000_by_100_000_pixels(tmp_path: Path) -> None:
+    path = exr(tmp_path / "a.exr", 8, 8, 100_000)
+    assert peak_of(lambda: read_image(path)) < 1e6
+    assert read_image(exr(path, 8, 8, 3000)).shape == (3000, 3000, 3)
+
+
+def test_large_flat_pictures_are_pictures(tmp_path: Path) -> None:
+    """What compresses best of what there is."""
+    path = tmp_path / "a.png"
+    images.write_image(path, np.zeros((3000, 4000), np.uint8))
+    assert path.stat().st_size < 40_000
+    assert read_image(path).shape == (3000, 4000, 3)
+
+
+def test_a_decoder_that_says_what_is_no_text() -> None:
+    class Decoder:
+        def geterror(self) -> str:
+            return b"\xff".decode()
+
+    assert images.error_of(Decoder()) == "in words that are no text"
+
+
+def test_a_png_of_empty_chunks_takes_no_long_look(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    with open(path, "wb") as file:
+        file.write(images.PNG_SIGNATURE)
+        file.truncate(1 << 29)
+    with pytest.raises(InputError):
+        images._check_png_is_whole(path)
+
+
+def test_names_that_no_scene_can_list(tmp_path: Path) -> None:
+    make_photos(tmp_path)
+    for name in ("a\nb.png", "\udcff.png"):
+        odd = tmp_path / "photos" / name
+        odd.write_bytes((tmp_path / "photos" / "a.png").read_bytes())
+        assert "rename it" in refusal(lambda: sfm.sfm_photos.find_photos(tmp_path / "photos"))
+        odd.unlink()
+
+
+def test_a_picture_whose_name_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "\udcff.png"
+    make_photos(tmp_path)
+    path.write_bytes((tmp_path / "photos" / "a.png").read_bytes())
+    assert "rename it" in refusal(lambda: read_image(path))
+
+
+def test_warnings_of_a_scene_are_plain_lines(tmp_path: Path) -> None:
+    make_colmap_text(tmp_path)
+    for name in ("a\nb.png", "\udcff.png"):
+        (tmp_path / "images" / name).write_bytes(b"")
+    assert [warning.isprintable() for warning in load_scene(tmp_path).warnings] == [True]
+
+
+# Runs
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('clsplat = "1"\n[train]\niterations = ' + "9" * 400, "iterations"),
+        ('clsplat = "1"\n[train]\niterations = ' + "9" * 5000, "TOML"),
+        ('clsplat = "1"\n[train.optimiser]\nbeta1 = nan', "beta1"),
+        ('clsplat = "1"\n[train.density]\nsplit_factor = ' + "9" * 400, "split_factor"),
+        ('clsplat = "1"\nx = ' + "[" * 5000 + "]" * 5000, "TOML"),
+    ],
+    ids=["long", "longer", "nan", "long float", "nested"],
+)
+def test_settings_that_are_none(text: str, named: str, tmp_path: Path) -> None:
+    make_run(tmp_path)
+    path = tmp_path / "run/config.toml"
+    path.write_text(text)
+    message = refusal(lambda: runs.Run.open(path.parent))
+    assert str(path) in message
+    assert named in message
+
+
+@pytest.mark.parametrize(
+    "line", ['{"step": [1]}', '{"step": "1"}', '{"step": true}', '{"step": null}', "[" * 50_000, "[]"]
+)
+def test_metrics_that_are_none_are_left_out(line: str, tmp_path: Path) -> None:
+    make_run(tmp_path)
+    run = runs.Run.open(tmp_path / "run")
+    with open(run.metrics_path, "a") as file:
+        file.write(f'{line}\n{{"step": 9}}\n')
+    assert [record["step"] for record in run.read_metrics()] == [1, 2, 9]
+    run.truncate_metrics(2)
+    assert run.metrics_path.read_text().count("\n") == 2
+    run.eval_path.write_text(line)
+    assert run.model_record()["step"] == 2
+
+
+def archive(path: Path, members: list[tuple[str, bytes]], compression: int = zipfile.ZIP_STORED) -> None:
+    with warnings.catch_warnings(), zipfile.ZipFile(path, "w", compression) as file:
+        warnings.simplefilter("ignore")
+        for name, data in members:
+            file.writestr(name, data)
+
+
+def saved(values: Any, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, values, **options)
+    return buffer.getvalue()
+
+
+def state(text: bytes) -> tuple[str, bytes]:
+    return ("state.json.npy", saved(np.frombuffer(text, np.uint8)))
+
+
+GOOD = state(b'{"step": 2, "state": {}}')
+WEIGHTS = saved(np.arange(12, dtype=np.float32).reshape(4, 3))
+CHECKPOINTS: dict[str, tuple[list[tuple[str, bytes]], int]] = {
+    "claim": (
+        [GOOD, ("a.npy", WEIGHTS.replace(b"(4, 3), }   ", b"(40000000, 3), }"[:12] + b"   "))],
+        zipfile.ZIP_STORED,
+    ),
+    "packed": ([GOOD, ("a.npy", saved(np.zeros(10**6)))], zipfile.ZIP_DEFLATED),
+    "pickle": ([GOOD, ("a.npy", saved(np.array([{}], object), allow_pickle=True))], zipfile.ZIP_STORED),
+    "twice": ([GOOD, ("a.npy", WEIGHTS), ("a.npy", WEIGHTS)], zipfile.ZIP_STORED),
+    "foreign": ([GOOD, ("../../a", WEIGHTS)], zipfile.ZIP_STORED),
+    "no state": ([("a.npy", WEIGHTS)], zipfile.ZIP_STORED),
+    "nested": ([state(b"[" * 100_000)], zipfile.ZIP_STORED),
+    "no step": ([state(b'{"step": "2", "state": {}}')], zipfile.ZIP_STORED),
+    "negative step": ([state(b'{"step": -2, "state": {}}')], zipfile.ZIP_STORED),
+    "infinite step": ([state(b'{"step": 1e999, "state": {}}')], zipfile.ZIP_STORED),
+    "no dictionary": ([state(b'{"step": 2, "state": []}')], zipfile.ZIP_STORED),
+}
+
+
+@pytest.mark.parametrize("kind", CHECKPOINTS)
+def test_checkpoints_that_are_none_are_passed_over(kind: str, tmp_path: Path) -> None:
+    make_run(tmp_path)
+    run = runs.Run.open(tmp_path / "run")
+    archive(run.checkpoints_path / "step-0000002.npz", *CHECKPOINTS[kind])
+    with pytest.warns(UserWarning, match="checkpoint is damaged"):
+        checkpoint = run.load_latest_checkpoint()
+    assert checkpoint is not None
+    assert checkpoint.step == 1
+
+
+def test_a_checkpoint_may_be_made_so(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    run = runs.Run.open(tmp_path / "run")
+    archive(run.checkpoints_path / "step-0000002.npz", [GOOD, ("a.npy", WEIGHTS)])
+    checkpoint = run.load_latest_checkpoint()
+    assert checkpoint is not None
+    np.testing.assert_array_equal(checkpoint.arrays["a"], np.arange(12, dtype=np.float32).reshape(4, 3))
+    checkpoint.arrays["a"][0] = 1  # training goes on in it
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.float32(3),
+        np.zeros((0, 3)),
+        np.ones(4, bool),
+        np.asfortranarray(np.ones((4, 3))),
+        np.arange(3, dtype=">u2"),
+        np.zeros(2, complex),
+    ],
+)
+def test_every_array_of_numbers_comes_back(array: Any, tmp_path: Path) -> None:
+    run = runs.Run.create(tmp_path / "run", TrainConfig())
+    run.save_checkpoint(1, {"a": np.asarray(array)}, {})
+    checkpoint = run.load_latest_checkpoint()
+    assert checkpoint is not None
+    assert checkpoint.arrays["a"].dtype == array.dtype
+    np.testing.assert_array_equal(checkpoint.arrays["a"], array)
+
+
+def test_a_checkpoints_directory_claims_at_most_what_it_has(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    path = tmp_path / "run/checkpoints/step-0000002.npz"
+    data = bytearray(path.read_bytes())
+    end = data.rindex(b"PK\5\6")
+    data[end + 12 : end + 16] = struct.pack("<I", 0xFFFFFFF0)
+    path.write_bytes(data)
+    tracemalloc.start()
+    with pytest.warns(UserWarning, match="checkpoint is damaged"):
+        runs.Run.open(tmp_path / "run").load_latest_checkpoint()
+    assert tracemalloc.get_traced_memory()[1] < 1e7
+    tracemalloc.stop()
+
+
+# Results of structure from motion
+
+
+@pytest.mark.parametrize(
+    "text", ["{}", "[]", "null", "[" * 100_000, '{"unregistered": 3}', '{"unregistered": [3]}', "{"]
+)
+def test_records_that_are_none(text: str, tmp_path: Path) -> None:
+    (tmp_path / "sfm.json").write_text(text)
+    assert str(tmp_path / "sfm.json") in refusal(lambda: sfm.unregistered(tmp_path))
+
+
+def test_spoiling_is_a_matter_of_the_seed_alone() -> None:
+    assert stress_files.numbered(0, "ply", 1).random() == random.Random("0 ply 1").random()
