@@ -40,12 +40,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     subprocess.run(command(arguments.render, whole, arguments.extension), check=True, stdout=subprocess.DEVNULL)
     seconds = time.monotonic() - start
     wanted = read(whole)
+    ends = sorted(path.stat().st_mtime for path in whole.iterdir())
+    pace = (ends[-1] - ends[0]) / max(len(ends) - 1, 1)
     chance = random.Random(arguments.seed)
     kills, troubles = [], []
     for _ in range(arguments.kills):
         more = chance.randint(0, len(wanted) // (arguments.kills + 1))
         # a little more than the time of a frame, so that a kill may come at any point of it
-        delay = chance.uniform(0, 1.5 * seconds / len(wanted))
+        delay = chance.uniform(0, 1.5 * pace)
         kills.append(kill(command(arguments.render, killed, arguments.extension), killed, more, delay))
         troubles += [name for name, data in read(killed).items() if name[0] != "." and wanted.get(name) != data]
     finished = subprocess.run(
