@@ -23,8 +23,8 @@ BAND = 1e-4
 MOST_IN_BAND = {"many_per_tile": 0.03}
 """Of the pixels: some hundred layers have a decision each, of which 2e-4 are in the band; elsewhere there are few."""
 STEP = 1e-8
-"""Next to the near plane a step of 1e-6 moves a Gaussian by a hundredth of a pixel, and some across the band. The loss, of a
-size of 100, is rounded to 1e-14, a slope so to 1e-6 of gradients of a size of 1 to 1000."""
+"""Next to the near plane a step of 1e-6 moves a Gaussian by a hundredth of a pixel, and some across the band. The loss,
+of a size of 100, is rounded to 1e-14, a slope so to 1e-6 of gradients of a size of 1 to 1000."""
 
 
 @cache
