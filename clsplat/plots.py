@@ -114,11 +114,11 @@ def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
 
 
 def plot_grid(path: Path, panels: Sequence[Panel], title: str, columns: int = 3) -> None:
-    """Panels in rows, their lines without markers, one legend for all."""
+    """Panels in rows with one scale of y, their lines without markers, one legend for all."""
     rows = -(-len(panels) // columns)
     figure = import_module("matplotlib.figure").Figure(figsize=(4.4 * columns, 2.9 * rows + 0.8), layout="constrained")
     figure.suptitle(title, fontsize=9)
-    grid = figure.subplots(rows, columns, squeeze=False).flat
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=True).flat
     for axes, panel in zip(grid, panels, strict=False):
         for name, points in panel.measured.items():
             if points:

@@ -53,12 +53,13 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
   floatL dx = FROM_CAMERA(means, X, 0), dy = FROM_CAMERA(means, Y, 1), dz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(dx, dx, fmaL(dy, dy, dz * dz)));
+  const intL seen = (length > 0.0f) & (length < FARTHEST);
   IntLanes opaque, valid;
   opaque.all = opacity > ALPHA_MIN;
 #ifdef NO_OPACITY_CULL
-  valid.all = p.valid & (length > 0.0f);
+  valid.all = p.valid & seen;
 #else
-  valid.all = p.valid & opaque.all & (length > 0.0f);
+  valid.all = p.valid & opaque.all & seen;
 #endif
   if (!ANYL(valid.all)) return;
 

@@ -11,14 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import stress_kernels
+import stress_stages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stress_cases import GRADIENT_NORM, GRADIENT_TAIL, PROJECTION, STRESSORS
 from stress_frames import SCENES, compare_8k
 from stress_frames import compare as compare_frame
 from stress_projection import compare
+from stress_stages import stages
 
 from clsplat.device.context import Device
+from clsplat.reference.loss import l1_dssim
 from clsplat.stages import project as stage
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -52,7 +55,7 @@ def test_projection_and_its_gradient_under(name: str, default_device: Device) ->
 @pytest.mark.parametrize("name", [name for name in SCENES if name not in stress_kernels.SLOW])
 def test_frames_and_their_gradients_of(name: str, device: Device) -> None:
     found = stress_kernels.frames(device, name, 2, seed=1)
-    # of so few Gaussians the 99.9th percentile is the largest, see above
+    # of so few Gaussians the 99.9th percentile is nearly the largest, see above
     assert [fault for fault in found["faults"] if "99.9" not in fault] == []
 
 
@@ -106,6 +109,16 @@ def test_a_culled_gaussian_is_found(default_device: Device, monkeypatch: pytest.
     monkeypatch.setattr(stage, "pack_camera", near)
     row = stress_kernels.judged("ordinary", stress_kernels.projections(default_device, "ordinary", 500, seed=0))
     assert any("culled, visible" in fault for fault in row["faults"])
+
+
+def test_stages_by_themselves(device: Device) -> None:
+    assert stages(device, seed=1, many=4)["faults"] == []
+
+
+def test_a_wrong_loss_is_found(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stress_stages, "l1_dssim", lambda x, y, weight: l1_dssim(x, y, weight + 1e-3))
+    faults = stages(default_device, seed=1, many=2)["faults"]
+    assert any(fault.startswith("loss gradient") for fault in faults)
 
 
 def test_command(tmp_path: Path) -> None:

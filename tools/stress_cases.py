@@ -263,6 +263,9 @@ log2 o, of size 8, leaves four digits."""
 GRADIENT_NORM, GRADIENT_TAIL = 1e-4, 1e-3
 """In norm over a batch, and for the 99.9th percentile of Gaussians. The largest may be any: a gradient can vanish."""
 
+FRAME_TAIL = 5e-3
+"""As GRADIENT_TAIL, for one kind of frames, of a few thousand Gaussians: there chance has more single numbers near
+zero, and needles have the error of their ends. All kinds together have to be within GRADIENT_TAIL."""
 FRAME = 2e-5
 """Of a pixel's colour outside the band, relative to the frame's brightest: a few dozen roundings of 6e-8, and the ends
 of needles, which are off as said of "offset", there by 64 / 0.55 * 2^-24 = 7e-6."""
@@ -294,7 +297,12 @@ STRESSORS: dict[str, Stressor] = {
     "depths": Stressor(depths, "depth"),
     "opacities": Stressor(opacities, "logit"),
     "quaternions": Stressor(quaternions, "|q|"),
-    "far_world": Stressor(far_world, "distance from the world's origin"),
+    "far_world": Stressor(
+        far_world,
+        "distance from the world's origin",
+        {"position": 1e-5},
+        "3e6 units in two floats leave 3e6 * 2^-48 = 1e-8 a product and sum, four of them, times fy / z = 660 / 3",
+    ),
     "off_centre": Stressor(off_centre, "principal point from the middle, image sizes"),
     "focal_lengths": Stressor(focal_lengths, "focal length, px"),
     "colours": Stressor(colours, "factor on the SH"),

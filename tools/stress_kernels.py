@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 from measuring import Result, heading, machine, number, options_parser, reporting, require, show
 from numpy.typing import NDArray
-from stress_cases import BAND_SHARE, FRAME, GRADIENT_NORM, GRADIENT_TAIL, PROJECTION, STRESSORS
+from stress_cases import BAND_SHARE, FRAME, FRAME_TAIL, GRADIENT_NORM, GRADIENT_TAIL, PROJECTION, STRESSORS
 from stress_frames import SCENES, FrameOutcome, compare_8k
 from stress_frames import compare as compare_frame
 from stress_projection import ERRORS, compare
+from stress_stages import BOUNDS, stages
 
 from clsplat.device.context import Device, open_device
 from clsplat.plots import Panel, check_plot, plot_grid
@@ -35,8 +36,11 @@ CASES_A_FRAME = 20_000
 """For each frame of every kind as many cases in all."""
 CASES_A_LARGE_FRAME = 500_000
 """As CASES_A_FRAME, for what takes seconds: 10,000 Gaussians on a pixel, 7680 x 4320."""
+CASES_A_STAGE = 10_000
+"""As CASES_A_FRAME, for a pair of pictures, and for 200 Gaussians' steps of Adam; these are not counted."""
 SLOW = ("one_pixel",)
 PLOTTED = {"shape": "whitening, largest", "position": "position (px), largest", "d log_scales": "d scales, 99.9 %"}
+STAGES = "stages"
 FLOOR = 1e-9
 """Where no error at all is drawn."""
 
@@ -121,8 +125,8 @@ def judged(name: str, tally: Tally) -> Result:
     return {"cases": tally.cases, "shown": tally.shown, "errors": rows, "faults": faults}
 
 
-def frames(device: Device, name: str, many: int, seed: int) -> Result:
-    """A row of frames of one kind."""
+def frames(device: Device, name: str, many: int, seed: int, every: Tally | None = None) -> Result:
+    """A row of frames of one kind; every: gathers gradients of all kinds."""
     image = flips = 0.0
     pixels = band = cases = broken = 0
     tally = Tally()
@@ -137,8 +141,10 @@ def frames(device: Device, name: str, many: int, seed: int) -> Result:
         cases += count
         image, flips = max(image, found.image), max(flips, found.flips)
         pixels, band, broken = pixels + found.pixels, band + found.band, broken + (not found.finite)
-        tally.add_norms(found.norms)
-        tally.add_errors(found.each)
+        for gathered in (tally, every):
+            if gathered is not None:
+                gathered.add_norms(found.norms)
+                gathered.add_errors(found.each)
     faults = [f"{broken} frames not finite"] if broken else []
     if image > FRAME:
         faults.append(f"image {image:.2g} over {FRAME:g}")
@@ -150,8 +156,8 @@ def frames(device: Device, name: str, many: int, seed: int) -> Result:
         gradients[group] = row
         if row["norm"] > GRADIENT_NORM:
             faults.append(f"d {group} in norm {row['norm']:.2g} over {GRADIENT_NORM:g}")
-        if row["p999"] > GRADIENT_TAIL:
-            faults.append(f"d {group} of 99.9 % {row['p999']:.2g} over {GRADIENT_TAIL:g}")
+        if row["p999"] > FRAME_TAIL:
+            faults.append(f"d {group} of 99.9 % {row['p999']:.2g} over {FRAME_TAIL:g}")
     return {
         "cases": cases,
         "frames": many,
@@ -200,12 +206,14 @@ def table(result: Result) -> list[str]:
         worst = [max((g[key] for g in row["gradients"].values()), default=0.0) for key in ("norm", "p999")]
         numbers = f"{row['cases']:9,}  {row['frames']:8}  {row['image']:8.1e}  {share:8.1e}"
         lines.append(f"{name:15} {numbers}  {worst[0]:8.1e} / {worst[1]:8.1e}")
-    faults = [
-        f"{name}: {fault}"
-        for part in ("projection", "frames")
-        for name, row in result[part].items()
-        for fault in row["faults"]
-    ]
+    tail = max((row["p999"] for row in result["frame_gradients"].values()), default=0.0)
+    lines.append(f"{'all':15} {'':55}{tail:8.1e}")
+    if "stages" in result:
+        lines += ["", f"{'by themselves':15}     error     bound"]
+        lines += [f"{name:15}  {error:8.1e}  {BOUNDS[name]:8.1e}" for name, error in result["stages"]["errors"].items()]
+    rows = {**result["projection"], **result["frames"], "frames": {"faults": result["frame_faults"]}}
+    rows["stages"] = result.get("stages", {"faults": []})
+    faults = [f"{name}: {fault}" for name, row in rows.items() for fault in row["faults"]]
     cases = f"{result['cases']:,} cases in {result['seconds']:.0f} s"
     return [*lines, "", cases + (": all within their bounds" if not faults else ", FAULTS:"), *faults]
 
@@ -215,10 +223,12 @@ def stress(device: Device, cases: int, seed: int, names: Sequence[str]) -> tuple
     start = time.perf_counter()
     result: Result = {**machine(device, 1), "seed": seed, "projection": {}, "frames": {}}
     panels = []
+    every = Tally()
     of_frames = [name for name in (*SCENES, "8k") if name in names]
     for name in of_frames:
         many = 1 + cases // (CASES_A_LARGE_FRAME if name in (*SLOW, "8k") else CASES_A_FRAME)
-        result["frames"][name] = frames(device, name, many, seed)
+        result["frames"][name] = frames(device, name, many, seed, every)
+    result["frame_gradients"] = {group: _summary(every.joined(group)) for group in every.errors}
     left = cases - sum(row["cases"] for row in result["frames"].values())
     chosen = [name for name in STRESSORS if name in names]
     for index, name in enumerate(chosen):
@@ -229,8 +239,13 @@ def stress(device: Device, cases: int, seed: int, names: Sequence[str]) -> tuple
         if not STRESSORS[name].finite:
             panels.append(panel(name, tally))
     rows = [*result["projection"].values(), *result["frames"].values()]
+    far = {group: row["p999"] for group, row in result["frame_gradients"].items() if row["p999"] > GRADIENT_TAIL}
+    result["frame_faults"] = [f"d {group} of 99.9 % {tail:.2g} over {GRADIENT_TAIL:g}" for group, tail in far.items()]
     result["cases"] = sum(row["cases"] for row in rows)
-    result["faults"] = sum(len(row["faults"]) for row in rows)
+    if STAGES in names:
+        result["stages"] = stages(device, seed, 4 + cases // CASES_A_STAGE)
+        rows.append(result["stages"])
+    result["faults"] = len(result["frame_faults"]) + sum(len(row["faults"]) for row in rows)
     result["seconds"] = time.perf_counter() - start
     return result, panels
 
@@ -244,7 +259,7 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
 
     def work() -> int:
-        everything = (*STRESSORS, *SCENES, "8k")
+        everything = (*STRESSORS, *SCENES, "8k", STAGES)
         names = options.only.split(",") if options.only else everything
         for name in names:
             require(name in everything, f"--only {name}: expected some of {', '.join(everything)}")

@@ -1,6 +1,8 @@
 // From LANES Gaussians' parameters to their ellipses on the image: what projection and its gradient both need.
 // Equation numbers are those of docs/gradients.md.
 
+// So that no sum of what they are factors of overflows: of distances in world units and of axes in pixels.
+#define FARTHEST 1e18f
 // Where `refine` is called for: longest axis over the ellipse's short one, and an axis over what is seen of it. Up to
 // there float32 is good to 3e-5.
 #define REFINE_FROM 64.0f
@@ -199,7 +201,9 @@ static inline int project_gaussians(const uint *row, __global const float *means
   floatL longest = p->s[0] > p->s[1] ? p->s[0] : p->s[1];
   longest = longest > p->s[2] ? longest : p->s[2];
   const floatL across2 = fmaL(p->jx, p->jx, p->jy * p->jy);
-  intL which = longest * longest * across2 * (p->sxx + p->syy) > REFINE_FROM * REFINE_FROM * p->det;
+  const floatL longest2 = longest * longest * across2;
+  p->valid &= longest2 < FARTHEST * FARTHEST;
+  intL which = longest2 * (p->sxx + p->syy) > REFINE_FROM * REFINE_FROM * p->det;
   for (int k = 0; k < 3; ++k)
     which |= across2 > FORESHORTENED * FORESHORTENED * fmaL(p->b1[k], p->b1[k], p->b2[k] * p->b2[k]);
   if (ANYL(which & p->valid)) {

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stages that are neither projection nor blending: elementary functions, loss, Adam, each by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from measuring import Result
+from numpy.typing import NDArray
+
+from clsplat.config import OptimiserConfig
+from clsplat.device.buffers import Workspace, allocate, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_grid
+from clsplat.device.layout import TILE
+from clsplat.reference.adam import adam as exact_adam
+from clsplat.reference.loss import l1_dssim
+from clsplat.stages.adam import adam
+from clsplat.stages.loss import loss
+from clsplat.stages.project import GROUPS, allocate_gaussians, group_shapes
+
+Array = NDArray[Any]
+
+BOUNDS = {
+    "exp": 2.4e-7,
+    "log2": 2.4e-7,
+    "sigmoid": 3.6e-7,
+    "exp2": 2.1e-7,
+    "loss": 1e-5,
+    "loss gradient": 4e-4,
+    "adam": 1e-4,
+}
+"""exp, sigmoid: 2 and 3 ulp; exp2: 0.8e-7 of its polynomial and rounding. log2: absolute under 1. loss: relative to at
+least 1, a sum of partial sums. loss gradient: in norm; a variance is a difference of windowed moments, of values up to
+1.5 three roundings of 1.3e-7 each, which C2 = 9e-4 is added to. adam: of a step, as beta2 in float32 is 1e-8 off in
+1 - beta2 = 1e-3, 1e-5 of a step, and a few roundings."""
+
+
+def elementary(device: Device, rng: np.random.Generator, count: int) -> Result:
+    """Largest errors: relative, of log2 relative to at least 1."""
+    out = allocate(device, (4, count), np.float32)
+    kernel = device.kernels("probe").probe_elementary
+
+    def probe(x: Array) -> Array:
+        launch_grid(device, kernel, (count,), upload(device, x.astype(np.float32)), out, count)
+        return out.get().astype(float)
+
+    def worst(row: int, low: float, high: float, function: Callable[[Array], Array], least: float = 0.0) -> float:
+        x = rng.uniform(low, high, count).astype(np.float32)
+        wanted = function(x.astype(float))
+        return float((np.abs(probe(x)[row] - wanted) / np.maximum(np.abs(wanted), least)).max())
+
+    return {
+        "exp": worst(0, -87, 87, np.exp),
+        "log2": worst(1, 1e-3, 1, np.log2, 1.0),
+        "sigmoid": worst(2, -80, 80, lambda x: 1 / (1 + np.exp(-x))),
+        "exp2": worst(3, -8.5, 0, np.exp2),
+    }
+
+
+def _pictures(rng: np.random.Generator) -> tuple[Array, Array]:
+    """A render and a photograph: noise, flat, dark, nearly the same."""
+    height, width = (int(rng.choice([1, 5, 16, 17, 40])) for _ in range(2))
+    y = rng.random((height, width, 3)) ** rng.choice([0.2, 1.0, 8.0])
+    if rng.random() < 0.3:
+        y[:] = rng.random(3)
+    apart = 10 ** rng.uniform(-4, 0)
+    x = np.clip(y + rng.normal(0, apart, y.shape), 0, 1.5)
+    return x.astype(np.float32), np.clip(y, 0, 1).astype(np.float32)
+
+
+def losses(device: Device, rng: np.random.Generator, many: int) -> Result:
+    """Of many pairs of pictures: the loss's error, and its gradient's in norm."""
+    worst = {"loss": 0.0, "loss gradient": 0.0}
+    work = Workspace(device)
+
+    def padded(image: Array) -> Array:
+        height, width, _ = image.shape
+        planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
+        planes[:, :height, :width] = image.transpose(2, 0, 1)
+        return planes
+
+    for _ in range(many):
+        x, y = _pictures(rng)
+        height, width, _ = x.shape
+        result = loss(device, work, upload(device, padded(x)), upload(device, padded(y)), width, height, 0.2)
+        wanted, gradient = l1_dssim(x.astype(float), y.astype(float), 0.2)
+        got = result.gradient.get()[:, :height, :width].transpose(1, 2, 0)
+        worst["loss"] = max(worst["loss"], abs(result.read()[0] - wanted) / max(1.0, wanted))
+        size = float(np.linalg.norm(gradient))
+        if size > 0:
+            off = float(np.linalg.norm(got - gradient)) / size
+            worst["loss gradient"] = max(worst["loss gradient"], off)
+    return worst
+
+
+def steps(device: Device, rng: np.random.Generator, many: int) -> Result:
+    """Of steps of Adam with gradients of 1e-20 to 1e6, from moments of any size: the largest error, in steps."""
+    worst, count, rate = 0.0, 200, 1e-2
+    shapes = group_shapes(count, 4)
+    counts = upload(device, np.ones(count, np.uint32))
+    rates = dict.fromkeys(GROUPS, rate)
+    for _ in range(many):
+        p, g, m, v = (allocate_gaussians(device, count, 4, zero=True) for _ in range(4))
+        step = int(rng.choice([1, 2, 10, 1000, 30_000, 10_000_000]))
+        wanted = {}
+        for group in GROUPS:
+            size = 10 ** rng.uniform(-15, 6, shapes[group])
+            gradient = (rng.standard_normal(shapes[group]) * size).astype(np.float32)
+            first = (rng.standard_normal(shapes[group]) * size * (step > 1)).astype(np.float32)
+            second = (rng.random(shapes[group]) * size**2 * (step > 1)).astype(np.float32)
+            for array, values in ((g, gradient), (m, first), (v, second)):
+                array[group].set(values)
+            arrays = (array.astype(float) for array in (gradient, first, second))
+            wanted[group] = exact_adam(np.zeros(shapes[group]), *arrays, step, rate)[0]
+        adam(device, step, rates, OptimiserConfig(), p, g, m, v, counts)
+        for group in GROUPS:
+            off = np.abs(p[group].get() - wanted[group]) / np.maximum(np.abs(wanted[group]), rate)
+            worst = max(worst, float(off.max()))
+    return {"adam": worst}
+
+
+def stages(device: Device, seed: int, many: int) -> Result:
+    """Errors by name, with their bounds and what is over one."""
+    rng = np.random.default_rng([seed, 77])
+    found = {**elementary(device, rng, 1000 * many), **losses(device, rng, many), **steps(device, rng, many)}
+    faults = [f"{name} {error:.2g} over {BOUNDS[name]:g}" for name, error in found.items() if not error <= BOUNDS[name]]
+    return {"errors": found, "faults": faults}
