@@ -23,8 +23,18 @@ from clsplat.selftest_result import BOUNDS, FORWARD, INDICES, MARK, STAGES, Resu
 from clsplat.selftest_scenes import scenes
 from clsplat.selftest_stages import RUN
 from clsplat.stages.blend import tile_items
+from clsplat.stages.channels import WIDTHS, Features
+from clsplat.stages.deep import DEEP_FLOATS
 
 DIGESTS = Path(__file__).with_name("selftest.json")
+_FEATURES = Features.of(WIDTHS).defines
+BUILT_WITH: dict[str, dict[str, object]] = {
+    "features": {**_FEATURES, "LANES": 1},
+    "channels": _FEATURES,
+    "deep": {"DEEP_SIZE": DEEP_FLOATS},
+    "project_rays": {"LANES": 1},
+}
+"""Of the kernels that are not built without."""
 
 
 @cache
@@ -106,7 +116,7 @@ def _child(index: int, shape: tuple[int, int], *, quick: bool, forward: bool) ->
         start = time.perf_counter()
         for path in sorted(kernel_root().glob("*.cl")):
             tell(begins=f"building {path.name}")
-            device.kernels(path.stem)
+            device.kernels(path.stem, **BUILT_WITH.get(path.stem, {}))
         tell(built=time.perf_counter() - start)
     for result in run(device, quick=quick, stages=stages, say=lambda name: tell(begins=name)):
         tell(result=asdict(result))
