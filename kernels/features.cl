@@ -41,7 +41,7 @@ static inline InCamera in_camera(__constant float *camera, float x, float y, flo
 // What a value of the camera has grown by.
 #define GROWN(name) ((after[CAMERA_##name] - camera[CAMERA_##name]) + (after[CAMERA_##name##_LOW] - camera[CAMERA_##name##_LOW]))
 
-// Angles by what the coordinates have grown by (68), (69): a small motion is nothing beside the rounding of two angles.
+// Angles by what the coordinates have grown by (74), (75): a small motion is nothing beside the rounding of two angles.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
                              __global float *motion) {
   motion[0] = motion[1] = 0.0f;
