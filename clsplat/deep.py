@@ -55,12 +55,13 @@ def bin_bounds(gaussians: Gaussians, camera: Camera, config: DeepConfig) -> Floa
 def depths_in_view(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
     """Depths of the means that are in front of the camera and, if it has an image plane, in its frame."""
     p = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
-    if camera.projection != "perspective":
+    if camera.projection not in ("perspective", "orthographic"):
         distances: NDArray[np.float64] = np.linalg.norm(p, axis=1)
         return distances[distances > camera.near]
     p = p[p[:, 2] > camera.near]
     frame = camera.window or camera
-    x, y = camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy
+    by = p[:, 2] if camera.projection == "perspective" else 1.0
+    x, y = camera.fx * p[:, 0] / by + camera.cx, camera.fy * p[:, 1] / by + camera.cy
     return np.asarray(p[(x >= 0) & (x <= frame.width) & (y >= 0) & (y <= frame.height), 2])
 
 

@@ -103,18 +103,29 @@ def check_format(path: str, channels: Iterable[str]) -> None:
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
-    """worldToCamera and worldToNDC of a perspective camera: x and y from -1 to 1 over the display window, z from -1 at
-    the near plane to 1 at infinity."""
+    """worldToCamera and worldToNDC of row vectors, for a camera that has an image plane; none for others.
+
+    The camera looks along -z, y is up. NDC: x and y from -1 to 1 over the display window; z from -1 at the near plane
+    to 1 at infinity, or of an orthographic camera at its far plane; if that has none, 1 more a world unit.
+    """
+    if camera.projection not in ("perspective", "orthographic"):
+        return {}
     to_camera = np.eye(4)
     flip = np.diag([1.0, -1.0, -1.0])
     to_camera[:3, :3] = (flip @ camera.rotation).T
     to_camera[3, :3] = flip @ camera.translation
     display = camera.window or camera
-    projection = np.zeros((4, 4))  # of row vectors; the camera looks along -z, so that w = -z
+    centre = np.array([2 * camera.cx / display.width - 1, 1 - 2 * camera.cy / display.height])
+    projection = np.zeros((4, 4))
     projection[0, 0] = 2 * camera.fx / display.width
     projection[1, 1] = 2 * camera.fy / display.height
-    projection[2] = [1 - 2 * camera.cx / display.width, 2 * camera.cy / display.height - 1, -1.0, -1.0]
-    projection[3, 2] = -2 * camera.near
+    if camera.projection == "perspective":  # w = -z
+        projection[2] = [*-centre, -1.0, -1.0]
+        projection[3, 2] = -2 * camera.near
+    else:
+        along = 2 / (camera.far - camera.near) if np.isfinite(camera.far) else 1.0
+        projection[2, 2] = -along
+        projection[3] = [*centre, -1.0 - along * camera.near, 1.0]
     return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
 
 

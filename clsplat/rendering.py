@@ -54,8 +54,12 @@ from clsplat.stages.project import (
 from clsplat.stages.ranges import TileLists, tile_lists
 
 Float32 = NDArray[np.float32]
-PROJECTION_DEFINES: dict[str, dict[str, object]] = {"equirectangular": {"RAYS": 1}, "fisheye": {"RAYS": 2}}
-"""What the kernels are built with for a camera that has no image plane."""
+PROJECTION_DEFINES: dict[str, dict[str, object]] = {
+    "orthographic": {"ORTHOGRAPHIC": True},
+    "equirectangular": {"RAYS": 1},
+    "fisheye": {"RAYS": 2},
+}
+"""What the kernels are built with for a camera that is no pinhole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +259,10 @@ class Rasterizer:
         return screen
 
     def pair_gradients(self, frame: Frame, image_gradient: DeviceArray, *, fields: SlotFields = PLAIN_SLOTS) -> Slots:
-        """The gradient of blending: of every pair, or with several bands their sums by Gaussian."""
+        """The gradient of blending: of every pair, or with several bands their sums by Gaussian. Raises InputError for
+        another projection than perspective, which has none."""
+        if (kind := frame.camera.projection) != "perspective":
+            raise InputError(f"a gradient is asked for of a camera that is {kind}, expected a perspective one")
         device, work, projected = self.device, self.work, frame.projected
         sums = None
         for band in frame.bands:
@@ -366,12 +373,14 @@ class Renderer:
         """As `render`, with what the view has beside colour (docs/channels.md).
 
         wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None.
-        Raises InputError for motion of a camera without an image plane.
+        Raises InputError for motion from one projection to another.
         """
-        if "motion" in wanted and camera.projection in PROJECTION_DEFINES:
-            raise InputError(f"motion is not defined for {camera.projection} cameras")
         of = Features.of(wanted)
         after = after or camera
+        if "motion" in wanted and after.projection != camera.projection:
+            raise InputError(
+                f"motion goes from a camera to one that is {after.projection}, expected {camera.projection}"
+            )
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
         camera, after = camera.from_origin(origin), after.from_origin(origin)
         on_device = self._hold(gaussians, camera, of.floats) if isinstance(gaussians, Gaussians) else gaussians

@@ -103,9 +103,8 @@ def shade(renderer: Any, gaussians: Gaussians, task: Task, options: RenderOption
 
 
 def header(task: Task, options: RenderOptions) -> Header:
-    """Frame, model and version; the matrices of a perspective camera."""
-    matrices = camera_matrices(task.camera) if task.camera.projection == "perspective" else {}
-    return Header({**options.attributes, "clsplat:frame": task.number}, matrices)
+    """Frame, model and version; the matrices of a camera that has them."""
+    return Header({**options.attributes, "clsplat:frame": task.number}, camera_matrices(task.camera))
 
 
 def open_shader(

@@ -4,10 +4,11 @@
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/gaussian.h"
+#include "shared/angles.h"
 
 #ifdef FEATURE_NORMAL
-// (62): the axis of the smallest scale, in the world, on the side of it that the camera sees; (dx, dy, dz): from the
-// camera to the mean.
+// (62): the axis of the smallest scale, in the world, on the side of it that the camera sees; (dx, dy, dz): where that
+// looks, at the mean.
 static inline void normal_of(__global const float *q, __global const float *log_scales, float dx, float dy, float dz,
                              __global float *normal) {
   const int first = log_scales[1] < log_scales[0] ? 1 : 0;
@@ -26,7 +27,62 @@ static inline void normal_of(__global const float *q, __global const float *log_
 
 #ifdef FEATURE_MOTION
 // (64): from the mean's place on the image to that under another camera, in pixels; 0 where that has it behind its near
-// plane. Whole pixels and the rest are subtracted apart, as a float32 of their sum would be cut.
+// plane.
+#ifdef RAYS
+typedef struct {
+  Double at[3];
+} InCamera;
+
+static inline InCamera in_camera(__constant float *camera, float x, float y, float z) {
+  const InCamera p = {{CAMERA_ROW(0), CAMERA_ROW(1), CAMERA_ROW(2)}};
+  return p;
+}
+
+// What a value of the camera has grown by.
+#define GROWN(name) ((after[CAMERA_##name] - camera[CAMERA_##name]) + (after[CAMERA_##name##_LOW] - camera[CAMERA_##name##_LOW]))
+
+// Angles by what the coordinates have grown by (74), (75): a small motion is nothing beside the rounding of two angles.
+static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
+                             __global float *motion) {
+  motion[0] = motion[1] = 0.0f;
+  const InCamera here = in_camera(camera, x, y, z), there = in_camera(after, x, y, z);
+  float p[3], q[3], d[3];
+  for (int k = 0; k < 3; ++k) {
+    p[k] = here.at[k].high;
+    q[k] = there.at[k].high;
+    d[k] = subtract2(there.at[k], here.at[k]).high;
+  }
+  const float distance = sqrt(fma1(q[0], q[0], fma1(q[1], q[1], q[2] * q[2])));
+  if (!(distance > after[CAMERA_NEAR] && distance < 1e15f)) return;
+#if RAYS == 1
+  const float level = sqrt(fma1(p[0], p[0], p[2] * p[2])), level_there = sqrt(fma1(q[0], q[0], q[2] * q[2]));
+  const float sum = level + level_there;
+  const float grown = sum > 0.0f ? fma1(d[0], p[0] + q[0], d[2] * (p[2] + q[2])) / sum : 0.0f;
+  const float turned = signed_atan(fma1(d[0], p[2], -(d[2] * p[0])), fma1(p[0], q[0], p[2] * q[2]));
+  const float risen = signed_atan(fma1(d[1], level, -(grown * p[1])), fma1(p[1], q[1], level * level_there));
+  // the longitude nearest to that of the frame's middle, which is where the mean is shown (docs/cameras.md, 6)
+  const float middle = 0.5f * (camera[CAMERA_XMIN] + camera[CAMERA_XMAX]), longitude = signed_atan(p[0], p[2]);
+  const float turns = floorL(fma1(longitude - middle, 0.5f / HALF_TURN, 0.5f));
+  const float a = fma1(turns, -2.0f * HALF_TURN, longitude), b = signed_atan(p[1], level);
+  motion[0] = fma1(after[CAMERA_FX], turned, fma1(GROWN(FX), a, GROWN(CX)));
+  motion[1] = fma1(after[CAMERA_FY], risen, fma1(GROWN(FY), b, GROWN(CY)));
+#else
+  const float across = sqrt(fma1(p[0], p[0], p[1] * p[1])), across_there = sqrt(fma1(q[0], q[0], q[1] * q[1]));
+  if (!(across > 0.0f || p[2] > 0.0f) || !(across_there > 0.0f || q[2] > 0.0f)) return; // straight behind: no pixel
+  const float sum = across + across_there;
+  const float grown = sum > 0.0f ? fma1(d[0], p[0] + q[0], d[1] * (p[1] + q[1])) / sum : 0.0f;
+  const float turned = signed_atan(fma1(grown, p[2], -(d[2] * across)), fma1(across, across_there, p[2] * q[2]));
+  const float c = across > 0.0f ? p[0] / across : 0.0f, s = across > 0.0f ? p[1] / across : 0.0f;
+  const float theta = half_atan(across, p[2]);
+  const float slope = across_there > 0.0f ? half_atan(across_there, q[2]) / across_there : 1.0f / q[2];
+  const float along_x = fma1(slope, fma1(-grown, c, d[0]), turned * c);
+  const float along_y = fma1(slope, fma1(-grown, s, d[1]), turned * s);
+  motion[0] = fma1(after[CAMERA_FX], along_x, fma1(GROWN(FX), theta * c, GROWN(CX)));
+  motion[1] = fma1(after[CAMERA_FY], along_y, fma1(GROWN(FY), theta * s, GROWN(CY)));
+#endif
+}
+#else
+// Whole pixels and the rest are subtracted apart, as a float32 of their sum would be cut.
 static inline void motion_of(__constant float *camera, float x, float y, float z, __global const float *splat,
                              __global float *motion) {
   const Double at_x = CAMERA_ROW(0), at_y = CAMERA_ROW(1), at_z = CAMERA_ROW(2);
@@ -41,9 +97,10 @@ static inline void motion_of(__constant float *camera, float x, float y, float z
   motion[1] = (whole - splat[SPLAT_PIXEL_Y]) + (rest - splat[SPLAT_SUB_Y]);
 }
 #endif
+#endif
 
 // tile_counts (n): 0 where not visible; camera: the frame's own; after: the one that motion goes to; splats (n,
-// SPLAT_SIZE) -> features (n, FEATURES), written where visible.
+// SPLAT_SIZE) -> features (n, FEATURES), written where visible. All of one projection.
 __kernel void features(const uint n, __constant float *camera, __constant float *after,
                        __global const uint *tile_counts, __global const float *means,
                        __global const float *quaternions, __global const float *log_scales,
@@ -57,8 +114,12 @@ __kernel void features(const uint n, __constant float *camera, __constant float 
   row[FEATURE_DEPTH] = splat[SPLAT_DEPTH];
 #endif
 #ifdef FEATURE_NORMAL
-  normal_of(quaternions + 4 * i, log_scales + 3 * i, x - camera[CAMERA_PX], y - camera[CAMERA_PY],
-            z - camera[CAMERA_PZ], row + FEATURE_NORMAL);
+#ifdef ORTHOGRAPHIC
+  const float d[3] = {camera[CAMERA_R20], camera[CAMERA_R21], camera[CAMERA_R22]};
+#else
+  const float d[3] = {x - camera[CAMERA_PX], y - camera[CAMERA_PY], z - camera[CAMERA_PZ]};
+#endif
+  normal_of(quaternions + 4 * i, log_scales + 3 * i, d[0], d[1], d[2], row + FEATURE_NORMAL);
 #endif
 #ifdef FEATURE_POSITION
   row[FEATURE_POSITION] = x;
@@ -66,6 +127,10 @@ __kernel void features(const uint n, __constant float *camera, __constant float 
   row[FEATURE_POSITION + 2] = z;
 #endif
 #ifdef FEATURE_MOTION
+#ifdef RAYS
+  motion_of(camera, after, x, y, z, row + FEATURE_MOTION);
+#else
   motion_of(after, x, y, z, splat, row + FEATURE_MOTION);
+#endif
 #endif
 }

@@ -1,5 +1,5 @@
-// Projection (Kerbl et al. 2023, section 4; docs/gradients.md, equations 1 to 13, 44 to 47 and 53 to 57): each Gaussian to
-// its ellipse, colour, depth and number of tiles. A work-item has LANES Gaussians: in vectors as far as all have the same
+// Projection (Kerbl et al. 2023, section 4; docs/gradients.md, equations 1 to 13, 44 to 47 and 53 to 57; orthographic:
+// docs/cameras.md, 15 to 17): each Gaussian to its ellipse, colour, depth and number of tiles. A work-item has LANES Gaussians: in vectors as far as all have the same
 // to do, then the visible ones by turns.
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -84,9 +84,15 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   field[SPLAT_HALF_W].all = opacity > ALPHA_MIN ? field[SPLAT_HALF_W].all : (floatL)(-1e30f);
   field[SPLAT_HALF_H].all = opacity > ALPHA_MIN ? field[SPLAT_HALF_H].all : (floatL)(-1e30f);
 #endif
+#ifdef ORTHOGRAPHIC // (17)
+  dx = (floatL)(camera[CAMERA_R20]);
+  dy = (floatL)(camera[CAMERA_R21]);
+  dz = (floatL)(camera[CAMERA_R22]);
+#else
   dx = dx / length;
   dy = dy / length;
   dz = dz / length;
+#endif
   Lanes basis[16];
 #ifdef SH_CACHE
   const floatL cx = dx - GATHER(sh_cache, 6, 0), cy = dy - GATHER(sh_cache, 6, 1), cz = dz - GATHER(sh_cache, 6, 2);

@@ -7,30 +7,11 @@
 #include "shared/tile.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
+#include "shared/angles.h"
 #include "shared/rays.h"
 
 // Slack of a box in pixels, over TILE_SLACK: what float32 angles lose of a picture 32768 wide.
 #define BOX_SLACK 0.1f
-
-// atan(y / x) for y, x >= 0, not both 0, to 6e-8 of it: minimax in the square of the smaller ratio.
-static inline float quarter_atan(float y, float x) {
-  const int steep = y > x;
-  const float ratio = steep ? x / y : y / x, t = ratio * ratio;
-  float p = fma1(t, 2.849871991e-03f, -1.606855914e-02f);
-  p = fma1(t, p, 4.269140586e-02f);
-  p = fma1(t, p, -7.504285127e-02f);
-  p = fma1(t, p, 1.064092964e-01f);
-  p = fma1(t, p, -1.420364380e-01f);
-  p = fma1(t, p, 1.999261975e-01f);
-  p = fma1(t, p, -3.333307207e-01f);
-  p = fma1(t * p, ratio, ratio);
-  return steep ? QUARTER_TURN - p : p;
-}
-
-// The angle of (x, y) from the x axis, y >= 0, up to half a turn.
-static inline float half_atan(float y, float x) {
-  return x < 0.0f ? HALF_TURN - quarter_atan(y, -x) : quarter_atan(y, x);
-}
 
 typedef struct {
   float e1[3], e2[3]; // right and down on the tangent plane

@@ -17,6 +17,7 @@ from clsplat.errors import InputError
 from clsplat.images import write_image
 from clsplat.paths import choose_shot, read_shot
 from clsplat.paths.keyed import FILE, KEY
+from clsplat.paths.shot import Shot
 from clsplat.reference.cameras import cam_from_pixel
 from clsplat.stages.project import pack_camera
 
@@ -295,11 +296,23 @@ def test_paths_made_of_cameras(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=f"--count {count}: expected 1 to 1,000,000 frames"):
             choose_shot(path, path="turntable", count=count)
     fisheye = write(tmp_path / "f.json", camera_path(camera_type="fisheye"))
-    with pytest.raises(InputError, match="its cameras are fisheye, --path needs perspective"):
+    with pytest.raises(InputError, match="its cameras are fisheye, --path needs perspective or orthographic"):
         choose_shot(fisheye, path="turntable")
-    choose_shot(fisheye).check()
-    with pytest.raises(InputError, match="--channels motion: frame 1 is fisheye, expected a perspective camera"):
-        choose_shot(fisheye).check(["rgb", "motion"])
+    ahead = key(position=[0, 0, -4], world_from_cam=[1, 0, 0, 0])
+    aside = key(frame=9, position=[4, 0, 0], world_from_cam=[math.sqrt(0.5), 0, -math.sqrt(0.5), 0])
+    flat = own(projection="orthographic", fov_x=None, pixel_size=0.02, keys=[ahead, aside])
+    turned = choose_shot(write(tmp_path / "o.json", flat), path="turntable", count=7).cameras
+    assert {(camera.projection, round(camera.fx, 9)) for camera in turned} == {("orthographic", 50.0)}
+
+
+def test_motion_stays_in_a_projection(tmp_path: Path) -> None:
+    for kind in ("fisheye", "equirectangular"):
+        choose_shot(write(tmp_path / "f.json", camera_path(camera_type=kind))).check(["rgb", "motion"])
+    shot = read_shot(write(tmp_path / "f.json", camera_path()))
+    mixed = Shot((shot.frames[0], replace(shot.frames[1], camera=replace(shot.cameras[1], projection="orthographic"))))
+    mixed.check(["rgb", "depth"])
+    with pytest.raises(InputError, match="motion: frame 2 is orthographic, expected perspective as frame 1 is"):
+        mixed.check(["rgb", "motion"])
 
 
 def test_a_far_plane_is_told_of(tmp_path: Path) -> None:
@@ -324,8 +337,6 @@ def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
 
 
 def test_the_kernels_refuse_what_they_do_not_have(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="orthographic cameras are not rendered yet, expected another projection"):
-        pack_camera(replace(first(tmp_path), projection="orthographic"))
     panorama = first(tmp_path, projection="equirectangular", fov_x=360)
     pack_camera(panorama)
     with pytest.raises(InputError, match=r"of which 60\.0 are a whole turn: expected no more"):

@@ -87,12 +87,12 @@ def test_the_same_bits_in_every_shape(device: Device) -> None:
         assert_same_bits(other, first)
 
 
-@pytest.mark.parametrize("projection", ["perspective", "equirectangular", "fisheye"])
+@pytest.mark.parametrize("projection", ["perspective", "orthographic", "equirectangular", "fisheye"])
 @pytest.mark.parametrize("bins", [1, 12])
 def test_flattened_it_is_the_picture(default_device: Device, projection: str, bins: int) -> None:
     gaussians, camera = scenes.random_cloud(3000, 8, 150, 100)
     if projection != "perspective":
-        focal = 150 / (2 * np.pi) if projection == "equirectangular" else 140.0
+        focal = {"orthographic": 30.0, "equirectangular": 150 / (2 * np.pi), "fisheye": 140.0}[projection]
         camera = replace(camera, fx=focal, fy=focal, projection=projection)  # type: ignore[arg-type]
     renderer = Renderer(default_device)
     slices = render_deep(renderer, gaussians, camera, bin_bounds(gaussians, camera, DeepConfig(bins=bins)))

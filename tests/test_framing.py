@@ -4,19 +4,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
 import scenes
 from compare import assert_close, assert_same_bits
 
-from clsplat.camera import Camera, Window
+from clsplat.camera import Camera, Projection, Window
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.framing import Draw, Layers, crop, drawn_by, filter_taps, framed, reframed, supersampled
 from clsplat.layers import LAYERS
 from clsplat.picture_config import FramingConfig, parse_overscan
-from clsplat.reference import rays
+from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
 from clsplat.rendering import Renderer
 
@@ -33,6 +34,8 @@ def camera_of(projection: str) -> Camera:
         return replace(camera, fx=focal, fy=focal, cx=70.3, cy=48.1, projection="equirectangular")
     if projection == "fisheye":
         return replace(camera, fx=140.0, fy=138.0, cx=70.3, cy=48.1, projection="fisheye")
+    if projection == "orthographic":
+        return replace(camera, fx=30.0, fy=31.0, projection="orthographic")
     return camera
 
 
@@ -41,19 +44,15 @@ def drawer(device: Device, camera: Camera) -> Draw:
     return drawn_by(Renderer(device), PERSPECTIVE[0], after=after)
 
 
-def names_of(projection: str) -> tuple[str, ...]:
-    return tuple(name for name in EVERYTHING if projection == "perspective" or name != "motion")
-
-
 def assert_same(part: Layers, whole: Layers, rows: slice, columns: slice) -> None:
     assert part.keys() == whole.keys()
     for name, values in part.items():
         assert_same_bits(values, np.ascontiguousarray(whole[name][rows, columns]))
 
 
-@pytest.mark.parametrize("projection", ["perspective", "equirectangular", "fisheye"])
+@pytest.mark.parametrize("projection", get_args(Projection))
 def test_a_region_has_the_bits_of_the_frame(device: Device, projection: str) -> None:
-    camera, names = camera_of(projection), names_of(projection)
+    camera, names = camera_of(projection), EVERYTHING
     draw = drawer(device, camera)
     whole = draw(camera, names)
     assert whole["alpha"].max() > 0.5
@@ -63,12 +62,12 @@ def test_a_region_has_the_bits_of_the_frame(device: Device, projection: str) -> 
         assert_same(draw(picture, names), whole, slice(y, y + height), slice(x, x + width))
 
 
-@pytest.mark.parametrize("projection", ["perspective", "fisheye"])
+@pytest.mark.parametrize("projection", ["perspective", "orthographic", "fisheye"])
 @pytest.mark.parametrize(("overscan", "across", "down"), [("16", 16, 16), ("7", 7, 7), ("15%", 22, 15)])
 def test_overscan_has_the_frame_within(
     default_device: Device, projection: str, overscan: str, across: int, down: int
 ) -> None:
-    camera, names = camera_of(projection), names_of(projection)
+    camera, names = camera_of(projection), EVERYTHING
     draw = drawer(default_device, camera)
     picture = framed(camera, FramingConfig(overscan=overscan))
     assert (picture.width, picture.height) == (WIDTH + 2 * across, HEIGHT + 2 * down)
@@ -98,7 +97,9 @@ def test_the_twins_have_windows_too() -> None:
     np.testing.assert_allclose(part, whole[5:16, 7:27], rtol=0, atol=1e-12)
     focal = camera.width / (2 * np.pi)
     panorama = replace(camera, fx=focal, fy=focal, projection="equirectangular")
-    pictures = [rays.render(gaussians, each, (0, 0, 0)).image for each in (panorama, crop(panorama, 7, 5, 20, 11))]
+    pictures = [
+        every_pixel.render(gaussians, each, (0, 0, 0)).image for each in (panorama, crop(panorama, 7, 5, 20, 11))
+    ]
     np.testing.assert_allclose(pictures[1], pictures[0][5:16, 7:27], rtol=0, atol=1e-12)
 
 

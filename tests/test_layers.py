@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from clsplat.layers import (
     parse_channels,
     write_layers,
 )
+from clsplat.reference.cameras import pixel_from_world
 
 WIDTH, HEIGHT = 21, 13
 
@@ -131,6 +133,21 @@ def test_matrices_put_a_point_on_its_pixel() -> None:
     np.testing.assert_allclose((0.5 - 0.5 * ndc[1]) * HEIGHT, pixel[1], rtol=1e-12)
     near = np.array([0, 0, -camera.near, 1]) @ np.linalg.inv(matrices["worldToCamera"]) @ matrices["worldToNDC"]
     np.testing.assert_allclose(near[2] / near[3], -1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("far", [np.inf, 20.0])
+def test_matrices_of_an_orthographic_camera(far: float) -> None:
+    camera = replace(tilted_camera(WIDTH, HEIGHT, 9.0), far=far, near=0.5, projection="orthographic")
+    matrices = camera_matrices(camera)
+    points = np.array([[0.3, -0.2, 4.0], [1.0, 2.0, 7.0]])
+    pixels, depths = pixel_from_world(camera, points)
+    ndc = np.concatenate([points, np.ones((2, 1))], axis=1) @ matrices["worldToNDC"]
+    np.testing.assert_allclose(ndc[:, 3], 1, rtol=1e-12)
+    np.testing.assert_allclose((0.5 + 0.5 * ndc[:, 0]) * WIDTH, pixels[:, 0], rtol=1e-12)
+    np.testing.assert_allclose((0.5 - 0.5 * ndc[:, 1]) * HEIGHT, pixels[:, 1], rtol=1e-12)
+    wanted = -1 + (depths - 0.5) * (2 / 19.5 if far == 20.0 else 1)
+    np.testing.assert_allclose(ndc[:, 2], wanted, rtol=1e-12)
+    assert camera_matrices(replace(camera, projection="fisheye")) == {}
 
 
 def test_a_window(tmp_path: Path) -> None:

@@ -63,8 +63,8 @@ def choose_shot(
     if path is not None:
         from clsplat.paths.generated import PATHS
 
-        if shot.frames[0].camera.projection != "perspective":
-            raise InputError(f"{cameras}: its cameras are {shot.frames[0].camera.projection}, --path needs perspective")
+        if (kind := shot.frames[0].camera.projection) not in ("perspective", "orthographic"):
+            raise InputError(f"{cameras}: its cameras are {kind}, --path needs perspective or orthographic ones")
         shot = Shot(numbered(PATHS[path](shot.cameras, COUNT if count is None else count)), shot.warnings)
     shot = shot if frames is None else shot.only(frames)
     far = min(frame.camera.far for frame in shot.frames)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
@@ -56,13 +57,15 @@ class Shot:
         return Shot(tuple(frame for frame in self.frames if frame.number in asked), warnings)
 
     def check(self, channels: Iterable[str] = ()) -> None:
-        """Raises InputError for a frame whose projection is not rendered, or not with these channels."""
-        for frame in self.frames:
-            kind = frame.camera.projection
-            if kind == "orthographic":
-                raise InputError(f"frame {frame.number}: {kind} cameras are not rendered yet, expected perspective")
-            if kind != "perspective" and "motion" in channels:
-                raise InputError(f"--channels motion: frame {frame.number} is {kind}, expected a perspective camera")
+        """Raises InputError where these channels are not defined: motion from one projection to another."""
+        if "motion" not in channels:
+            return
+        for before, frame in pairwise(self.frames):
+            kind, wanted = frame.camera.projection, before.camera.projection
+            if kind != wanted:
+                raise InputError(
+                    f"--channels motion: frame {frame.number} is {kind}, expected {wanted} as frame {before.number} is"
+                )
 
     def at(self, frame: float) -> Camera:
         """The camera at a frame that need not be whole, such as within a shutter's time: interpolated as keys are."""

@@ -4,14 +4,15 @@ docs/channels.md."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN, footprint
-from clsplat.reference.project import ALPHA_MIN, Projected, rotation_matrices
+from clsplat.reference.cameras import period, pixel_from_world, wrapped
+from clsplat.reference.project import ALPHA_MIN, Projected, rotation_matrices, view_directions
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -37,23 +38,21 @@ class Channels:
 def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> Float64:
     """(62): (N, 3), the axis of the smallest scale, the first of equal ones, turned to the camera."""
     axes = rotation_matrices(quaternions)[np.arange(len(means)), :, np.argmin(log_scales, axis=1)]
-    away = ((means - camera.position) * axes).sum(axis=1)
+    away = (view_directions(means, camera)[0] * axes).sum(axis=1)
     return np.where(away[:, None] > 0, -axes, axes)
 
 
-def image_positions(means: Float64, camera: Camera) -> tuple[Float64, NDArray[np.bool_]]:
-    """Pixels (N, 2), and whether the mean is in front of the near plane."""
-    p = means @ camera.rotation.T + camera.translation
-    in_front = p[:, 2] > camera.near
-    z = np.where(in_front, p[:, 2], 1.0)
-    return np.stack([camera.fx * p[:, 0] / z + camera.cx, camera.fy * p[:, 1] / z + camera.cy], axis=1), in_front
-
-
 def motions(means: Float64, camera: Camera, after: Camera) -> Float64:
-    """(64): (N, 2) in pixels."""
-    there, in_front = image_positions(means, after)
-    here, _ = image_positions(means, camera)
-    return np.where(in_front[:, None], there - here, 0.0)
+    """(64): (N, 2) in pixels, of any projection; of a panorama by the shorter way around."""
+    (here, _), (there, depths) = pixel_from_world(camera, means), pixel_from_world(after, means)
+    if camera.projection == "equirectangular":
+        # where the mean is shown may depend on the image's middle; a window's is that of its frame
+        frame = camera.window or camera
+        here[:, 0] = wrapped(replace(camera, width=frame.width), here[:, 0])
+        turned = (there[:, 0] - after.cx) / after.fx - (here[:, 0] - camera.cx) / camera.fx
+        there[:, 0] -= np.round(turned / (2 * np.pi)) * period(after)
+    moved = (depths > after.near) & np.isfinite(here + there).all(axis=1)
+    return np.where(moved[:, None], there - here, 0.0)
 
 
 def channels(

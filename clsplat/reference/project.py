@@ -81,25 +81,33 @@ def frustum_limits(camera: Camera) -> Float64:
 
 
 def _geometry(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> _Geometry:
-    """Eqs. (1), (3), (4), (5)."""
+    """Eqs. (1), (3), (4), (5); orthographic: (16) of docs/cameras.md."""
     p = means @ camera.rotation.T + camera.translation
-    z = p[:, 2]
-    raw = p[:, :2] / z[:, None]
-    low, high = frustum_limits(camera)
-    ratios = np.clip(raw, low, high)
     jacobian = np.zeros((len(p), 2, 3), p.dtype)
-    jacobian[:, 0, 0] = camera.fx / z
-    jacobian[:, 1, 1] = camera.fy / z
-    jacobian[:, 0, 2] = -camera.fx * ratios[:, 0] / z
-    jacobian[:, 1, 2] = -camera.fy * ratios[:, 1] / z
+    if camera.projection == "orthographic":
+        ratios, unclamped = np.zeros((len(p), 2)), np.zeros((len(p), 2), np.bool_)
+        jacobian[:, 0, 0] = camera.fx
+        jacobian[:, 1, 1] = camera.fy
+    else:
+        z = p[:, 2]
+        raw = p[:, :2] / z[:, None]
+        low, high = frustum_limits(camera)
+        ratios, unclamped = np.clip(raw, low, high), (raw > low) & (raw < high)
+        jacobian[:, 0, 0] = camera.fx / z
+        jacobian[:, 1, 1] = camera.fy / z
+        jacobian[:, 0, 2] = -camera.fx * ratios[:, 0] / z
+        jacobian[:, 1, 2] = -camera.fy * ratios[:, 1] / z
     rotations = rotation_matrices(quaternions)
     scales = np.exp(log_scales)
     half = jacobian @ camera.rotation @ (rotations * scales[:, None, :])
-    return _Geometry(p, ratios, (raw > low) & (raw < high), jacobian, rotations, scales, half)
+    return _Geometry(p, ratios, unclamped, jacobian, rotations, scales, half)
 
 
 def view_directions(means: Float64, camera: Camera) -> tuple[Float64, Float64]:
-    """Unit vectors from the camera to the means (N, 3), and the distances (N, 1)."""
+    """Unit vectors from the camera to the means (N, 3), and the distances (N, 1). An orthographic camera looks along
+    its axis everywhere, as if from infinitely far: (17) of docs/cameras.md."""
+    if camera.projection == "orthographic":
+        return np.tile(camera.rotation[2], (len(means), 1)), np.full((len(means), 1), np.inf)
     offsets = means - camera.position
     distances: Float64 = np.linalg.norm(offsets, axis=1, keepdims=True)
     return offsets / distances, distances
@@ -114,12 +122,14 @@ def project(
     camera: Camera,
     sh_degree: int,
 ) -> Projected:
-    """Eqs. (1) to (13): arrays as in `Gaussians`, float64; sh_degree is the one in use, bands above it are unread."""
+    """Eqs. (1) to (13), of an orthographic camera with (15) to (17) of docs/cameras.md: arrays as in `Gaussians`,
+    float64; sh_degree is the one in use, bands above it are unread."""
     with np.errstate(all="ignore"):  # what overflows or divides by zero is culled below
         geometry = _geometry(means, quaternions, log_scales, camera)
         z = geometry.p[:, 2]
         focal = np.array([camera.fx, camera.fy])
-        means2d = focal * geometry.p[:, :2] / z[:, None] + np.array([camera.cx, camera.cy])
+        by = z[:, None] if camera.projection == "perspective" else 1.0
+        means2d = focal * geometry.p[:, :2] / by + np.array([camera.cx, camera.cy])
         if camera.window is not None:
             means2d -= [camera.window.x, camera.window.y]
 
@@ -140,7 +150,9 @@ def project(
         basis = sh_basis(directions, sh_degree)
         colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]))
 
-        visible = (z > camera.near) & (opacities > ALPHA_MIN) & (det > 0) & (colors < COLOUR_LIMIT).all(axis=1)
+        visible = (
+            (z > max(camera.near, 0.0)) & (opacities > ALPHA_MIN) & (det > 0) & (colors < COLOUR_LIMIT).all(axis=1)
+        )
         for values in (means2d, whitening, conics, half_extents, colors):
             visible &= np.isfinite(values).all(axis=1)
 
@@ -240,7 +252,9 @@ def project_grad_covariances(
     d_opacities: Float64,
     d_colors: Float64,
 ) -> dict[str, Float64]:
-    """As `project_grad`, from what `project` made and the gradient by the covariances (N, 3): xx, xy, yy of (28)."""
+    """As `project_grad`, from what `project` made and the gradient by the covariances (N, 3): xx, xy, yy of (28). Of
+    perspective cameras alone."""
+    assert camera.projection == "perspective"
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
     x, y, z = geometry.p.T

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Equirectangular and fisheye pictures in float64, every Gaussian at every pixel: twin of kernels/project_rays.cl and
-of blending there. Equation numbers are those of docs/cameras.md."""
+"""Gaussians of equirectangular and fisheye pictures in float64: twin of kernels/project_rays.cl and of a ray's alphas.
+Equation numbers are those of docs/cameras.md."""
 
 from __future__ import annotations
 
@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
-from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN
-from clsplat.reference.cameras import cam_from_pixel, pixel_grid
 from clsplat.reference.project import ALPHA_MIN, LOW_PASS, rotation_matrices, view_directions
 from clsplat.reference.render import parameters
 from clsplat.reference.sh import sh_basis
-from clsplat.reference.sort import depth_order
 
 Float64 = NDArray[np.float64]
 
@@ -34,16 +31,6 @@ class Tangents:
     opacities: Float64
     colors: Float64
     visible: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """image (H, W, 3), alpha (H, W), depth (H, W): mean distance by weight; margin (H, W): as of `reference.blend`."""
-
-    image: Float64
-    alpha: Float64
-    depth: Float64
-    margin: Float64
 
 
 def footprints(directions: Float64, camera: Camera) -> tuple[Float64, Float64, Float64]:
@@ -88,37 +75,11 @@ def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
     return Tangents(directions, right, down, covariances, depths, opacities, colors, visible)
 
 
-def render(gaussians: Gaussians, camera: Camera, background: Float64 | tuple[float, float, float]) -> Picture:
-    """(14), then front to back by distance, as equations 14 to 16 of docs/gradients.md. A pixel without a ray shows the
-    background."""
-    t = tangents(gaussians, camera)
-    _, rays = cam_from_pixel(camera, pixel_grid(camera))
-    rays = np.nan_to_num(rays)
-    count = len(rays)
-    image, depth, total = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
-    transmittance, alive, margin = np.ones(count), np.ones(count, np.bool_), np.full(count, 0.05)
-    for gaussian in depth_order(t.depths, t.visible):
-        along = rays @ t.directions[gaussian]
-        ahead = along > 0
-        safe = np.where(ahead, along, 1.0)
-        at = np.stack([rays @ t.right[gaussian], rays @ t.down[gaussian]], axis=1) / safe[:, None]
-        q = np.einsum("ni,ij,nj->n", at, np.linalg.inv(t.covariances[gaussian]), at)
-        raw = np.where(ahead, t.opacities[gaussian] * np.exp(-0.5 * q), 0.0)
-        alpha = np.minimum(ALPHA_MAX, raw)
-        seen = alive & (alpha >= ALPHA_MIN)
-        after = transmittance * (1 - alpha)
-        added = seen & (after > TRANSMITTANCE_MIN)
-        near = np.minimum(np.abs(raw / ALPHA_MIN - 1), np.abs(raw / ALPHA_MAX - 1))
-        near = np.minimum(near, np.where(seen, np.abs(after / TRANSMITTANCE_MIN - 1), np.inf))
-        margin = np.where(alive, np.minimum(margin, near), margin)
-        weight = np.where(added, transmittance * alpha, 0.0)
-        image += weight[:, None] * t.colors[gaussian]
-        depth += weight * t.depths[gaussian]
-        total += weight
-        transmittance = np.where(added, after, transmittance)
-        alive &= added | ~seen
-    image += transmittance[:, None] * np.asarray(background, np.float64)
-    size = (camera.height, camera.width)
-    mean_depth = np.divide(depth, total, out=np.zeros(count), where=total > 0)
-    alpha_plane = 1 - transmittance
-    return Picture(image.reshape(*size, 3), alpha_plane.reshape(size), mean_depth.reshape(size), margin.reshape(size))
+def ray_alphas(t: Tangents, gaussian: int, rays: Float64) -> Float64:
+    """(14): one Gaussian's opacity times its falloff along unit directions (P, 3) in the camera; 0 where all are 0."""
+    along = rays @ t.directions[gaussian]
+    ahead = along > 0
+    safe = np.where(ahead, along, 1.0)
+    at = np.stack([rays @ t.right[gaussian], rays @ t.down[gaussian]], axis=1) / safe[:, None]
+    q = np.einsum("ni,ij,nj->n", at, np.linalg.inv(t.covariances[gaussian]), at)
+    return np.where(ahead, t.opacities[gaussian] * np.exp(-0.5 * q), 0.0)

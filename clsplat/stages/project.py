@@ -223,10 +223,8 @@ def download_gaussians(gaussians: AnyGaussians) -> Gaussians:
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
     """A camera in the order of `layout.CAMERA`: its values rounded to float32, and as _LOW what that left of them.
 
-    Raises InputError for a projection that the kernels do not have.
+    Raises InputError for a panorama of more than a whole turn.
     """
-    if camera.projection == "orthographic":
-        raise InputError("orthographic cameras are not rendered yet, expected another projection")
     if camera.projection == "equirectangular" and camera.width > (turn := 2 * np.pi * camera.fx) * (1 + 1e-6):
         wide = f"{camera.width} pixels wide, of which {turn:.1f} are a whole turn"
         raise InputError(f"an equirectangular camera is {wide}: expected no more")
@@ -237,7 +235,7 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "FY": camera.fy,
         "CX": camera.cx,
         "CY": camera.cy,
-        "NEAR": camera.near,
+        "NEAR": max(camera.near, 0.0),  # what is behind has no place in the order of depth
         "HAND": float(np.copysign(1.0, np.linalg.det(camera.rotation))),
         "XMIN": -camera.cx / camera.fx - window.clamp * half_w,
         "XMAX": (window.width - camera.cx) / camera.fx + window.clamp * half_w,

@@ -1,5 +1,6 @@
 // From LANES Gaussians' parameters to their ellipses on the image: what projection and its gradient both need.
-// Equation numbers are those of docs/gradients.md.
+// Equation numbers are those of docs/gradients.md. With ORTHOGRAPHIC the image is linear in x and y, not in x/z and y/z
+// (docs/cameras.md, equations 15 to 17).
 
 // So that no sum of what they are factors of overflows: of distances in world units and of axes in pixels.
 #define FARTHEST 1e18f
@@ -12,7 +13,7 @@ typedef struct {
   intL valid;            // not to be culled
   floatL x, y, z;        // mean in the camera's frame
   floatL lx, ly, lz;     // what rounding it to float32 left
-  floatL rx, ry;         // x/z and y/z as the Jacobian takes them, clamped
+  floatL rx, ry;         // x/z and y/z as the Jacobian takes them, clamped; orthographic: 0
   floatL jx, jy;         // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
   floatL q[4];           // unit quaternion w x y z
   floatL length;         // of the raw one
@@ -51,16 +52,22 @@ static inline Double camera_row(__constant float *r, __constant float *r_low, fl
   return multiply_add2(r[2], r_low[2], z, sum);
 }
 
-// x/z - ratio in two floats' terms: what is left of the quotient.
+// What a place on the image is linear in, and in two floats' terms what is left of it: of the quotient x/z, or of x.
+#ifdef ORTHOGRAPHIC
+#define RATIO(x, z) (x)
+static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) { return x_low; }
+#else
+#define RATIO(x, z) ((x) / (z))
 static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) {
   return (fmaL(-ratio, z, x) + fmaL(-ratio, z_low, x_low)) / z;
 }
+#endif
 
 // (2): focal * (x / z) + centre, as whole pixels from the window's first and the rest in [0, 1): the rest has the same bits
 // in every window.
 static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low, float focal, float focal_low,
                                   float centre, float centre_low, float window, floatL *whole, floatL *rest) {
-  const floatL ratio = x / z;
+  const floatL ratio = RATIO(x, z);
   const Double c = {(floatL)(centre),
                     fmaL((floatL)(focal), ratio_rest(ratio, x, x_low, z, z_low), (floatL)(centre_low))};
   const Double at = multiply_add2(focal, focal_low, ratio, c);
@@ -98,9 +105,13 @@ static inline void covariance(Projection *p) {
 // The rest of x/z as the Jacobian takes it: of a limit where it is clamped.
 static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
                                   float low_rest, float high, float high_rest) {
+#ifdef ORTHOGRAPHIC
+  return (floatL)(0.0f);
+#else
   const floatL rest = ratio_rest(ratio, x, x_low, z, z_low);
   const floatL above = ratio == low ? (floatL)(low_rest) : rest;
   return ratio == high ? (floatL)(high_rest) : above;
+#endif
 }
 
 // (57): J A and its minors once more, in two floats up to where nothing cancels any more, for the lanes of `which`.
@@ -182,10 +193,16 @@ static inline int project_gaussians(const uint *row, __global const float *means
   p->s[1] = expL(GATHER(log_scales, 3, 1));
   p->s[2] = expL(GATHER(log_scales, 3, 2));
 
+#ifdef ORTHOGRAPHIC
+  p->rx = p->ry = (floatL)(0.0f);
+  p->jx = (floatL)(camera[CAMERA_FX]);
+  p->jy = (floatL)(camera[CAMERA_FY]);
+#else
   p->rx = clampL(p->x / p->z, camera[CAMERA_XMIN], camera[CAMERA_XMAX]);
   p->ry = clampL(p->y / p->z, camera[CAMERA_YMIN], camera[CAMERA_YMAX]);
   p->jx = camera[CAMERA_FX] / p->z;
   p->jy = camera[CAMERA_FY] / p->z;
+#endif
   const floatL area = camera[CAMERA_HAND] * p->jx * p->jy;
   for (int k = 0; k < 3; ++k) {
     p->a2[k] = a[6 + k];

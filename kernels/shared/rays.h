@@ -1,9 +1,7 @@
 // Pixels as rays, of equirectangular (RAYS == 1) and fisheye (RAYS == 2) cameras: equations (4) and (5) of
 // docs/cameras.md, in the camera's axes. Needs lanes.h; its own functions, for the same bits on every driver.
 #include "shared/elementary.h"
-
-#define HALF_TURN 3.14159265f
-#define QUARTER_TURN 1.57079633f
+#include "shared/angles.h"
 
 // sin(x) for |x| up to a little over a quarter turn, to 2e-8 of it: minimax in x^2.
 static inline floatL sinL(floatL x) {

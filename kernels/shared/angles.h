@@ -1,0 +1,29 @@
+// Angles of directions: scalars, with the same bits on every driver. Needs math.h.
+#define HALF_TURN 3.14159265f
+#define QUARTER_TURN 1.57079633f
+
+// atan(y / x) for y, x >= 0, not both 0, to 6e-8 of it: minimax in the square of the smaller ratio.
+static inline float quarter_atan(float y, float x) {
+  const int steep = y > x;
+  const float ratio = steep ? x / y : y / x, t = ratio * ratio;
+  float p = fma1(t, 2.849871991e-03f, -1.606855914e-02f);
+  p = fma1(t, p, 4.269140586e-02f);
+  p = fma1(t, p, -7.504285127e-02f);
+  p = fma1(t, p, 1.064092964e-01f);
+  p = fma1(t, p, -1.420364380e-01f);
+  p = fma1(t, p, 1.999261975e-01f);
+  p = fma1(t, p, -3.333307207e-01f);
+  p = fma1(t * p, ratio, ratio);
+  return steep ? QUARTER_TURN - p : p;
+}
+
+// The angle of (x, y) from the x axis, y >= 0, up to half a turn.
+static inline float half_atan(float y, float x) {
+  return x < 0.0f ? HALF_TURN - quarter_atan(y, -x) : quarter_atan(y, x);
+}
+
+// The same for any y, and 0 for (0, 0).
+static inline float signed_atan(float y, float x) {
+  if (!(x != 0.0f || y != 0.0f)) return 0.0f;
+  return y < 0.0f ? -half_atan(-y, x) : half_atan(y, x);
+}

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Orthographic pictures against a float64 twin that has every Gaussian at every pixel, and against closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import scenes
+from compare import assert_close, assert_close_images, assert_same_bits
+from pipeline import BACKGROUND, Pipeline, shaped
+
+from clsplat.camera import Camera
+from clsplat.config import RasterizerConfig
+from clsplat.deep import bin_bounds, depths_in_view, render_deep
+from clsplat.device.context import Device, list_devices, open_device
+from clsplat.errors import InputError
+from clsplat.framing import crop, on_tiles
+from clsplat.picture_config import DeepConfig
+from clsplat.reference import deep as deep_twin
+from clsplat.reference import every_pixel
+from clsplat.reference import render as reference
+from clsplat.reference.cameras import pixel_from_world
+from clsplat.reference.project import rotation_matrices
+from clsplat.rendering import ChannelResult, Renderer, RenderResult
+
+FEATURES = ("normal", "position", "motion")
+
+
+def orthographic(scene: scenes.Scene, middle: float = 4.0) -> scenes.Scene:
+    """The scene through a camera that shows at the depth `middle` what its own did."""
+    gaussians, camera = scene
+    return gaussians, replace(camera, fx=camera.fx / middle, fy=camera.fy / middle, projection="orthographic")
+
+
+def moved(camera: Camera) -> Camera:
+    """A step, a turn of a degree and more pixels a unit."""
+    turn = np.array([[np.cos(0.02), 0.0, np.sin(0.02)], [0.0, 1.0, 0.0], [-np.sin(0.02), 0.0, np.cos(0.02)]])
+    step = np.array([-0.07, 0.03, -0.05])
+    return replace(
+        camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation + step, fx=1.02 * camera.fx
+    )
+
+
+SCENES = {
+    "one": scenes.one,
+    "overlap": scenes.overlap,
+    "saturating": scenes.saturating,
+    "off_frustum": scenes.off_frustum,
+    "needles": scenes.needles,
+    "equal_depth": scenes.equal_depth,
+    "cloud": lambda: scenes.random_cloud(600, 8, 70, 50),
+}
+
+
+@cache
+def expected(name: str) -> every_pixel.Picture:
+    gaussians, camera = orthographic(SCENES[name]())
+    return every_pixel.render(gaussians, camera, BACKGROUND, moved(camera))
+
+
+def drawn(device: Device, scene: scenes.Scene) -> tuple[RenderResult, ChannelResult]:
+    gaussians, camera = scene
+    renderer = Renderer(device)
+    return renderer.render_channels(gaussians, camera, FEATURES, after=moved(camera), background=BACKGROUND)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_against_the_twin(device: Device, name: str) -> None:
+    image, found = drawn(device, orthographic(SCENES[name]()))
+    wanted = expected(name)
+    unsure = wanted.margin < 3e-4
+    assert unsure.mean() < 0.1
+    # As of a perspective frame: sums of a few hundred float32 products of order one.
+    assert_close_images(image.image, wanted.image, 2e-5, ignore=unsure)
+    assert_close_images(image.alpha, wanted.alpha, 2e-5, ignore=unsure)
+    solid = (wanted.alpha > 0.5) & ~unsure
+    assert solid.any()
+    # The issue's bound, relative to what a value is made of.
+    for field, plane in {"depth": found.depth, **found.fields}.items():
+        of, got = (values.reshape(*solid.shape, -1)[solid] for values in (getattr(wanted, field), plane))
+        size = np.abs(of).max(axis=1, keepdims=True)
+        assert_close(got / size, of / size, absolute=1e-4, name=field)
+
+
+@pytest.mark.parametrize("name", ["overlap", "needles", "off_frustum"])
+def test_projection(device: Device, name: str) -> None:
+    scene = orthographic(SCENES[name]())
+    run, wanted = Pipeline.run(device, scene), reference.forward(*scene).projected
+    shown = run.visible
+    assert shown.any() and not np.any(shown & ~wanted.visible)
+    means2d = run.splat("PIXEL_X", "PIXEL_Y").astype(np.float64) + run.splat("SUB_X", "SUB_Y")
+    # The bounds of perspective cameras (test_project.py), for their reasons.
+    assert_close(means2d[shown], wanted.means2d[shown], relative=1e-7, absolute=1e-6)
+    assert_close(run.splat("DEPTH")[shown, 0], wanted.depths[shown], relative=1e-6)
+    assert_close(run.splat("RED", "GREEN", "BLUE")[shown], wanted.colors[shown], absolute=2e-6)
+    whitening = wanted.whitening[shown]
+    scale = np.abs(whitening).max(axis=1, keepdims=True)
+    k = np.sqrt(np.log2(np.e) / 2)
+    assert_close(run.splat("L11", "L12", "L22")[shown] / k / scale, whitening / scale, absolute=1e-5)
+
+
+def test_the_twin_is_the_definition_of_the_projection() -> None:
+    # The mean goes where pixel_from_world has it, and the covariance there is the world's through its derivative, of
+    # which central differences are exact, as it is linear.
+    gaussians, camera = orthographic(scenes.overlap())
+    arrays = reference.parameters(gaussians)
+    means = arrays["means"]
+    projected = reference.forward(gaussians, camera).projected
+    pixels, depths = pixel_from_world(camera, means)
+    np.testing.assert_allclose(projected.means2d, pixels, atol=1e-12)
+    np.testing.assert_allclose(projected.depths, depths, atol=1e-12)
+    steps = [pixel_from_world(camera, means + d)[0] - pixel_from_world(camera, means - d)[0] for d in 0.5 * np.eye(3)]
+    jacobian = np.stack(steps, axis=2)
+    axes = rotation_matrices(arrays["quaternions"]) * np.exp(arrays["log_scales"])[:, None, :]
+    covariance = jacobian @ axes @ axes.transpose(0, 2, 1) @ jacobian.transpose(0, 2, 1) + 0.3 * np.eye(2)
+    wanted = np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], axis=1)
+    np.testing.assert_allclose(projected.covariances, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_the_same_bits_in_every_shape(device: Device) -> None:
+    scene = orthographic(scenes.random_cloud(2000, 8, 150, 100))
+    first, *others = (drawn(shaped(device, *shape), scene) for shape in ((8, 1), (1, 1), (1, 64), (4, 1), (8, 16)))
+    for other in others:
+        assert_same_pictures(other, first)
+
+
+def test_the_same_bits_on_every_driver() -> None:
+    scene = orthographic(scenes.random_cloud(2000, 8, 150, 100))
+    first, *others = (drawn(open_device(str(info.index)), scene) for info in list_devices())
+    for other in others:
+        assert_same_pictures(other, first)
+
+
+def assert_same_pictures(got: tuple[RenderResult, ChannelResult], wanted: tuple[RenderResult, ChannelResult]) -> None:
+    for one, of in zip(got, wanted, strict=True):
+        for name, values in vars(of).items():
+            if name != "fields":
+                assert_same_bits(getattr(one, name), values)
+    for name in FEATURES:
+        assert_same_bits(got[1].fields[name], wanted[1].fields[name])
+
+
+@pytest.mark.parametrize("change", [{"frustum_cull": False}, {"opacity_cull": False}, {"tile_test": "square"}])
+def test_exact_switches_change_no_bit(default_device: Device, change: dict[str, bool]) -> None:
+    gaussians, camera = orthographic(scenes.off_frustum())
+    plain = Renderer(default_device).render(gaussians, camera, BACKGROUND)
+    other = Renderer(default_device, config=RasterizerConfig(**change)).render(gaussians, camera, BACKGROUND)  # type: ignore[arg-type]
+    assert_same_bits(other.image, plain.image)
+    assert_same_bits(other.alpha, plain.alpha)
+
+
+def test_what_is_deeper_is_as_large_and_has_the_same_colour(device: Device) -> None:
+    # A disc at 2 and at 200 units, of SH that depends on the direction: the same picture.
+    rng = np.random.default_rng(3)
+    sh = scenes.random_sh(rng, 1)
+    camera = replace(scenes.straight_camera(48, 32, 10.0), projection="orthographic")
+    pictures = []
+    for depth in (2.0, 200.0):
+        gaussians = scenes.make_gaussians(
+            np.array([[0.75, -0.5, depth]]), np.array([[1.0, 0, 0, 0]]), np.log([[0.5, 0.25, 0.5]]), np.array([0.8]), sh
+        )
+        pictures.append(Renderer(device).render(gaussians, camera))
+    assert_same_bits(pictures[1].image, pictures[0].image)
+    assert_same_bits(pictures[1].alpha, pictures[0].alpha)
+    # By hand: ten pixels a unit, variances 5^2 + 0.3 and 2.5^2 + 0.3. Rounded a few times: 1e-6.
+    x, y = np.meshgrid(np.arange(48) + 0.5 - (24 + 7.5), np.arange(32) + 0.5 - (16 - 5.0))
+    alpha = 0.8 * np.exp(-0.5 * (x * x / 25.3 + y * y / 6.55))
+    assert_close(pictures[0].alpha, np.where(alpha >= 1 / 255, alpha, 0), absolute=1e-6)
+
+
+def test_the_near_plane(device: Device) -> None:
+    gaussians, camera = orthographic(scenes.one())
+    renderer = Renderer(device)
+    assert renderer.render(gaussians, replace(camera, near=3.99)).alpha.any()
+    assert not renderer.render(gaussians, replace(camera, near=4.0)).alpha.any()
+    behind = replace(camera, translation=np.array([0.0, 0.0, -5.0]))
+    for near in (0.01, -10.0):  # nothing is behind the camera, as depths are sorted as they are
+        assert not renderer.render(gaussians, replace(behind, near=near)).alpha.any()
+
+
+def test_a_wall(device: Device) -> None:
+    # One flat Gaussian, tilted 45 degrees about x: its normal looks back along the view, also far off the axis, where
+    # a pinhole would see the other side; and what it moves by is the step in pixels, whatever its depth.
+    half = np.sqrt(0.5)
+    gaussians = scenes.make_gaussians(
+        np.array([[0.0, 30.0, 2.0]]),
+        np.array([[np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0]]),
+        np.log([[3.0, 3.0, 1e-3]]),
+        np.array([0.9]),
+        np.zeros((1, 1, 3)),
+    )
+    camera = replace(scenes.straight_camera(20, 12, 2.0), cy=6 - 60.0, projection="orthographic")
+    after = replace(camera, translation=np.array([0.25, 0.5, 1.0]))
+    for view, sign in ((camera, 1.0), (replace(camera, cy=6 - 30.0, projection="perspective"), -1.0)):
+        found = Renderer(device).render_channels(gaussians, view, ("normal",))[1]
+        assert_close(found.fields["normal"][6, 10], [0.0, sign * half, -sign * half], absolute=1e-6)
+    found = Renderer(device).render_channels(gaussians, camera, FEATURES, after=after)[1]
+    assert_close(found.depth[6, 10], 2.0, relative=1e-6)
+    assert_close(found.fields["position"][6, 10], [0.0, 30.0, 2.0], relative=1e-6)
+    assert_close(found.fields["motion"][6, 10], [0.5, 1.0], absolute=1e-5)
+
+
+def test_windows_and_little_memory_change_no_bit() -> None:
+    gaussians, camera = orthographic(scenes.random_cloud(20_000, 4, 300, 200, degree=1))
+    whole = drawn(open_device(), (gaussians, camera))
+    part, rows, columns = on_tiles(crop(camera, 37, 21, 100, 60))
+    after = replace(moved(camera), width=part.width, height=part.height, window=part.window)
+    image, found = Renderer().render_channels(gaussians, part, FEATURES, after=after, background=BACKGROUND)
+    cut = np.s_[21:81, 37:137]
+    assert_same_bits(np.ascontiguousarray(image.image[rows, columns]), np.ascontiguousarray(whole[0].image[cut]))
+    for name in FEATURES:
+        got, wanted = found.fields[name][rows, columns], whole[1].fields[name][cut]
+        assert_same_bits(np.ascontiguousarray(got), np.ascontiguousarray(wanted))
+    limit = 8 << 20
+    device = open_device(None, limit)
+    assert_same_pictures(drawn(device, (gaussians, camera)), whole)
+    assert device.memory.peak <= limit
+
+
+def test_deep_slices(device: Device) -> None:
+    gaussians, camera = orthographic(scenes.random_cloud(600, 8, 70, 50))
+    pixels, depths = pixel_from_world(camera, reference.parameters(gaussians)["means"])
+    seen = ((pixels >= 0) & (pixels <= [70, 50])).all(axis=1)
+    assert 0 < seen.sum() < len(gaussians)
+    np.testing.assert_allclose(depths_in_view(gaussians, camera), depths[seen], rtol=1e-12)
+    bounds = bin_bounds(gaussians, camera, DeepConfig(bins=5))
+    got = render_deep(Renderer(device), gaussians, camera, bounds)
+    forward = reference.forward(gaussians, camera, margins=True)
+    wanted = deep_twin.deep(forward.projected, forward.order, camera.width, camera.height, bounds)
+    assert forward.blended.margin is not None
+    sure = forward.blended.margin > 1e-4
+    for values, of in zip(got, wanted, strict=True):
+        # As of a perspective frame (test_deep.py).
+        assert_close(values[sure][:, :4], of[sure][:, :4], absolute=2e-5)
+        assert_close(values[sure][:, 4:], of[sure][:, 4:], relative=1e-6, absolute=1e-6)
+
+
+def test_it_is_not_trained_with(default_device: Device) -> None:
+    gaussians, camera = orthographic(scenes.one())
+    run = Pipeline.run(default_device, (gaussians, camera))
+    with pytest.raises(InputError, match="asked for of a camera that is orthographic, expected a perspective one"):
+        run.backward(np.ones((camera.height, camera.width, 3)))
+
+
+def test_colours_are_kept_while_the_direction_is(default_device: Device) -> None:
+    gaussians, camera = orthographic(scenes.overlap())
+    renderer = Renderer(default_device, config=RasterizerConfig(sh_angle=1.0))
+    first = renderer.render(gaussians, camera)
+    step = replace(camera, translation=camera.translation + np.array([0.4, 0.0, 0.0]))
+    assert_same_bits(renderer.render(gaussians, step).image, Renderer(default_device).render(gaussians, step).image)
+    assert_same_bits(renderer.render(gaussians, camera).image, first.image)
