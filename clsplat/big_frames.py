@@ -5,23 +5,23 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.device.context import Device
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
 from clsplat.framing import Draw, Layers, crop
 from clsplat.images import atomic_output
 from clsplat.layers import LAYERS, Encoding, Header, check_format, encoded
 from clsplat.needs import frame_pixels
-from clsplat.picture_config import FramingConfig
+from clsplat.picture_config import STRIP_PIXELS, FramingConfig
 
-STRIP_PIXELS = 1 << 24
-"""Pixels that are on the host at once, before filtering: about a gigabyte with every layer."""
+if TYPE_CHECKING:
+    from clsplat.device.context import Device
+
 _FEATURE_FLOATS = {"normals": 3, "position": 3, "motion": 2}
 
 

@@ -33,6 +33,7 @@ from clsplat.config import (
     bundled,
 )
 from clsplat.errors import ClsplatError, InputError
+from clsplat.picture_config import ColourConfig, DeepConfig, FramingConfig, SamplingConfig, VideoConfig
 
 Flag = Annotated[bool, FlagCreatePairsOff]
 Output = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
@@ -156,9 +157,9 @@ class Render:
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
     nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
-    """Where the images go, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG. {name} is the
-    image's name without its extension, sub-folders included, or else the frame's number; ####, %04d and {frame} are
-    the frame's number."""
+    """Where the images go, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG; or the name of a
+    video of all frames, such as turn.mp4. {name} is the image's name without its extension, sub-folders included, or
+    else the frame's number; ####, %04d and {frame} are the frame's number."""
     path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
     """A path made from the cameras, in place of the cameras themselves: around what they look at, the same twice while
     rising and sinking, or through them in their order, smoothed. Its frames count from 1."""
@@ -193,6 +194,13 @@ class Render:
     """Height in pixels; follows from the width, or from the camera, if not given."""
     scale: float = 1.0
     """Size relative to the camera's, where neither width nor height is given."""
+    colour: Annotated[ColourConfig, arg(name="")] = field(default_factory=ColourConfig)
+    framing: Annotated[FramingConfig, arg(name="")] = field(default_factory=FramingConfig)
+    sampling: Annotated[SamplingConfig, arg(name="")] = field(default_factory=SamplingConfig)
+    deep: Flag = False
+    """Write deep EXR: of each pixel colour, alpha and depth in slices of the scene. docs/pictures.md has how."""
+    slices: Annotated[DeepConfig, arg(name="deep")] = field(default_factory=DeepConfig)
+    video: VideoConfig = field(default_factory=VideoConfig)
     preset: Annotated[Preset | None, arg(metavar="exact|default|fast")] = None
     """Bundle of rasterizer settings; the run's own, or the default's, if not given. A --rasterizer flag goes before
     it."""
@@ -368,7 +376,9 @@ def parse(arguments: Sequence[str]) -> Verb:
 
         bundle = PRESETS[verb.preset] if verb.preset else Run.open(verb.model).config.rasterizer
         if bundle != RasterizerConfig():
-            unset: dict[str, Any] = dict.fromkeys(("alpha", "json", "skip_existing", "dry_run", "profile"), False)
+            unset: dict[str, Any] = dict.fromkeys(
+                ("alpha", "deep", "json", "skip_existing", "dry_run", "profile"), False
+            )
             render = replace(verb, rasterizer=bundle, **unset)
             verb = _tyro(Render, arguments[1:], prog="clsplat render", default=render)
     return verb

@@ -84,6 +84,7 @@ class Colours:
         config = config or ColourConfig()
         self._source = config.ocio_config or os.environ.get("OCIO", "") or BUILT_IN
         self._loaded: Any = None
+        self._matrices: dict[tuple[str, str], Float32 | None] = {}
         flag = "--model-colorspace" if config.model_colorspace else "the model's colour space"
         self.model = self._known(config.model_colorspace or recorded, flag)
         self.output = self._known(config.colorspace, "--colorspace") if config.colorspace else self.model
@@ -149,6 +150,23 @@ class Colours:
 
     def _by_ocio(self, rgb: Float32, source: str, target: str) -> Float32:
         names = self._ocio_name(source), self._ocio_name(target)
+        if names not in self._matrices:
+            linear = all(self._config.isColorSpaceLinear(name) for name in names)
+            self._matrices[names] = self._matrix(*names) if linear else None
+        if (matrix := self._matrices[names]) is None:
+            return self._converted(rgb, *names)
+        red, green, blue = (rgb[:, :, index, None] for index in range(3))  # no sum of a library's, whose order varies
+        return np.asarray(red * matrix[0] + green * matrix[1] + blue * matrix[2], np.float32)
+
+    def _matrix(self, source: str, target: str) -> Float32 | None:
+        """(3, 3), a row for each channel of the source; None where one does not do. Each conversion by OpenImageIO
+        loads the configuration anew, which takes longer than a frame."""
+        light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [4, -1, 2], [0.2, 0.01, 0.5]]], np.float32)
+        found = self._converted(light, source, target)
+        exact = np.allclose(light[0, 3:] @ found[0, :3], found[0, 3:], rtol=1e-5, atol=1e-5)  # of float32 sums up to 4
+        return found[0, :3] if exact else None
+
+    def _converted(self, rgb: Float32, *names: str) -> Float32:
         pixels = oiio.ImageBuf(np.ascontiguousarray(rgb, np.float32))
         result = oiio.ImageBufAlgo.colorconvert(pixels, *names, unpremult=False, colorconfig=self._source)
         if reason := result.geterror():

@@ -20,24 +20,22 @@ from numpy.typing import NDArray
 from clsplat.big_frames import strips
 from clsplat.camera import Camera
 from clsplat.colour import Colours
+from clsplat.device.context import Device
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
 from clsplat.framing import on_tiles
 from clsplat.gaussians import Gaussians
 from clsplat.images import atomic_output
-from clsplat.layers import HALF_MAX, Encoding, Header, deep_spec
+from clsplat.layers import DEEP, HALF_MAX, Encoding, Header, deep_spec
 from clsplat.needs import frame_pixels
-from clsplat.picture_config import DeepConfig
+from clsplat.picture_config import DEEP_STRIP_FLOATS, DeepConfig
 from clsplat.rendering import Renderer
 from clsplat.stages.deep import DEEP_FLOATS
 
 Float32 = NDArray[np.float32]
 
-CHANNELS = ("R", "G", "B", "A", "Z", "ZBack")
 _OUTLIERS = 0.01
 """Share of the Gaussians in view that is nearer than the first bound, and that is further than the last."""
-_STRIP_FLOATS = 1 << 26
-"""Of a strip's slices: 256 MiB."""
 
 
 def bin_bounds(gaussians: Gaussians, camera: Camera, config: DeepConfig) -> Float32:
@@ -54,6 +52,7 @@ def bin_bounds(gaussians: Gaussians, camera: Camera, config: DeepConfig) -> Floa
 
 def depths_in_view(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
     """Depths of the means that are in front of the camera and, if it has an image plane, in its frame."""
+    camera = camera.from_origin(gaussians.origin)
     p = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
     if camera.projection not in ("perspective", "orthographic"):
         distances: NDArray[np.float64] = np.linalg.norm(p, axis=1)
@@ -80,6 +79,13 @@ def flattened(slices: Float32) -> Float32:
     return flat.astype(np.float32)
 
 
+def deep_rows(device: Device, camera: Camera, bins: int) -> int:
+    """Rows of the strips that a deep picture of so many slices is rendered in, whole tiles of them."""
+    floats = DEEP_FLOATS * bins
+    pixels = min(DEEP_STRIP_FLOATS // floats, frame_pixels(device, planes=4 * floats))
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with what fills the first and last tile
+
+
 def write_deep(
     path: Path,
     renderer: Renderer,
@@ -103,14 +109,12 @@ def write_deep(
     bounds = bin_bounds(gaussians, camera, config)
     kinds = [oiio.TypeDesc("half" if encoding.depth == "half" else "float")] * 4 + [oiio.TypeDesc("float")] * 2
     spec = deep_spec(camera.width, camera.height, header)
-    spec.nchannels = len(CHANNELS)
-    spec.channelnames = CHANNELS
+    spec.nchannels = len(DEEP)
+    spec.channelnames = DEEP
     spec.channelformats = tuple(kinds)
     spec.alpha_channel, spec.z_channel = 3, 4
     spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
-    floats = DEEP_FLOATS * (len(bounds) + 1)
-    pixels = min(_STRIP_FLOATS // floats, frame_pixels(renderer.device, planes=4 * floats))
-    rows = max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with what fills the first and last tile
+    rows = deep_rows(renderer.device, camera, len(bounds) + 1)
     with atomic_output(path, [spec], "exr") as output:
         row = spec.y
         for strip in strips(camera, rows):
@@ -132,12 +136,12 @@ def _deep_rows(slices: Float32, kinds: list[Any], *, half: bool) -> Iterator[tup
         rows = slices[:, top : top + step].reshape(bins, -1, DEEP_FLOATS).transpose(1, 0, 2)
         there = rows[:, :, 3] > 0
         data = oiio.DeepData()
-        data.init(len(rows), len(CHANNELS), kinds, list(CHANNELS))
+        data.init(len(rows), len(DEEP), kinds, list(DEEP))
         _each(data.set_samples, range(len(rows)), there.sum(axis=1).tolist())
         pixels = np.nonzero(there)[0].tolist()
         samples = (np.cumsum(there, axis=1) - 1)[there].tolist()
         values = rows[there]
-        for channel in range(len(CHANNELS)):
+        for channel in range(len(DEEP)):
             _each(data.set_deep_value, pixels, repeat(channel), samples, values[:, channel].tolist())
         yield data, len(rows) // width
 

@@ -14,13 +14,28 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import clsplat
 from clsplat.config import RasterizerConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.render_job import Record, is_complete, record_of, remove_temporaries, stamp, write_frame
+from clsplat.render_job import (
+    HOST_BYTES,
+    Record,
+    Result,
+    encoded,
+    frame_bytes,
+    is_complete,
+    record_of,
+    remove_temporaries,
+    stamp,
+    video_frame,
+    write_frame,
+)
 from clsplat.shading import RenderOptions, Shader, Task, open_shader
+
+if TYPE_CHECKING:
+    from clsplat.video import VideoWriter
 
 THREADS = 2
 """Of a local worker: one frame is encoded while the next is rendered."""
@@ -79,17 +94,20 @@ class _Held:
 _HELD = _Held()
 
 
-def render_frame(task: Task, scene: Scene) -> Record | Failure:
-    """What a worker does: the frame's file, unless a worker that was lost since has finished it."""
+def render_frame(task: Task, scene: Scene) -> Result | Failure:
+    """What a worker does: the frame's file, unless a worker that was lost since has finished it; of a video the frame,
+    which goes to who encodes it."""
     try:
         if scene.version != clsplat.__version__:
             raise InputError(f"a worker has clsplat {clsplat.__version__}, expected {scene.version}")
         with _HELD.room:
             with _HELD.turn:
-                if stamp(task.path) != task.before and is_complete(task, scene.options):
-                    return record_of(task)
+                if not task.is_video and stamp(task.path) != task.before and is_complete(task, scene.options):
+                    return record_of(task, scene.options), None
                 shaded = _HELD.shader_for(scene)(task)
-            return write_frame(task, shaded, scene.options)
+            if task.is_video:
+                return video_frame(task, shaded, scene.options)
+            return write_frame(task, shaded, scene.options), None
     except (ClsplatError, OSError, MemoryError) as error:
         message = " ".join(str(error).split()) or type(error).__name__
         return Failure(message, isinstance(error, InputError))
@@ -102,8 +120,10 @@ def render_on_farm(
     *,
     scheduler: str | None = None,
     workers: int | None = None,
+    video: VideoWriter | None = None,
 ) -> None:
     """Render the frames on the cluster of the scheduler at that address, or on a new one of `workers` processes here.
+    Those of a video are encoded here.
 
     on_done: as for `render_job.run_tasks`. The frames of a worker that is lost are rendered again by others. Raises
     InputError where there is no such cluster, and ClsplatError for a frame that cannot be rendered, or that has cost
@@ -116,14 +136,16 @@ def render_on_farm(
     placed = [replace(task, path=task.path.absolute(), before=stamp(task.path)) for task in tasks]
     names = {task.number: str(task.path) for task in tasks}
     with _client(scheduler, workers) as client:
-        for record in _results(client, placed, scene):
+        results = _results(client, placed, scene, video)
+        for record in encoded(placed, results, video):
             on_done(replace(record, path=names[record.frame]))
     # Whoever was killed while it wrote has left a file, and nobody writes any more.
     remove_temporaries(tasks)
 
 
-def _results(client: Any, tasks: Sequence[Task], scene: Scene) -> Iterator[Record]:
-    """Records as the frames are done; a window of tasks is with the scheduler, and not a million of them."""
+def _results(client: Any, tasks: Sequence[Task], scene: Scene, video: VideoWriter | None = None) -> Iterator[Result]:
+    """What `render_frame` gives as the frames are done; a window of tasks is with the scheduler, and not a million. Of
+    a video the window begins with the frame that is to be encoded next, as those that come early wait here."""
     from distributed import CancelledError, KilledWorker, as_completed
 
     job, left = uuid.uuid4().hex[:12], iter(tasks)
@@ -135,9 +157,13 @@ def _results(client: Any, tasks: Sequence[Task], scene: Scene) -> Iterator[Recor
         ]
 
     threads = sum(client.nthreads().values())
+    window = max(64, 4 * threads)
+    if video is not None:
+        window = max(threads + 1, min(window, HOST_BYTES // frame_bytes(tasks[0], scene.options)))
     with client.as_current():
-        pending = as_completed(submit(max(64, 4 * threads)))
-    for future in pending:
+        pending = as_completed(submit(window))
+    sent = window
+    for done, future in enumerate(pending, 1):
         try:
             result = future.result()
         except KilledWorker:
@@ -146,12 +172,14 @@ def _results(client: Any, tasks: Sequence[Task], scene: Scene) -> Iterator[Recor
                 "see why"
             ) from None
         except (CancelledError, OSError):
-            raise ClsplatError("the scheduler was lost; go on with --skip-existing") from None
+            advice = "go on with --skip-existing" if video is None else "begin again"
+            raise ClsplatError(f"the scheduler was lost; {advice}") from None
         if isinstance(result, Failure):
             raise (InputError if result.wrong_input else ClsplatError)(result.message)
         yield result
-        for another in submit(1):
+        for another in submit((done if video is None else video.frames) + window - sent):
             pending.add(another)
+            sent += 1
 
 
 def dask_setup(_: Any) -> None:

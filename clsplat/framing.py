@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from clsplat.camera import FRAME_CLAMP, Camera, Window
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
-from clsplat.gaussians import Gaussians
 from clsplat.layers import LAYERS
 from clsplat.picture_config import Filter, FramingConfig, parse_overscan, parse_region
-from clsplat.rendering import Renderer
+
+if TYPE_CHECKING:
+    from clsplat.gaussians import Gaussians
+    from clsplat.rendering import Renderer
 
 Float32 = NDArray[np.float32]
 Layers = dict[str, NDArray[Any]]
@@ -79,30 +81,37 @@ def drawn_by(
     after: Camera | None = None,
 ) -> Draw:
     """A Draw by the kernels; after: the camera of a whole frame that motion goes to. Motion is turned over: in files v
-    is up, and docs/channels.md has y down."""
+    is up, and docs/channels.md has y down. Layers need not be contiguous: what puts them in order is left to who
+    encodes them, which may be another thread."""
 
     def draw(camera: Camera, names: Collection[str]) -> Layers:
         camera, rows, columns = on_tiles(camera)
         if set(names) <= set(COLOUR):
-            picture = renderer.render(gaussians, camera, background)
+            picture = renderer.render(gaussians, camera, background, contiguous=False)
             layers: Layers = {"rgb": picture.image, "alpha": picture.alpha}
         else:
-            wanted = [_FEATURES[name] for name in names if name in _FEATURES]
+            wanted = renderer_channels(names)
             picture, found = renderer.render_channels(
                 gaussians,
                 camera,
                 wanted,
                 after=after and reframed(after, camera),
                 background=background,
+                contiguous=False,
             )
             layers = {"rgb": picture.image, "alpha": picture.alpha, "depth": found.depth, "median": found.median}
             layers |= {"first": found.first, "count": found.count, "id": found.index}
             layers |= {name: found.fields[_FEATURES[name]] for name in names if name in _FEATURES}
             if "motion" in layers:
                 layers["motion"] = layers["motion"] * np.array([1, -1], np.float32)
-        return {name: np.ascontiguousarray(layers[name][rows, columns]) for name in LAYERS if name in names}
+        return {name: layers[name][rows, columns] for name in LAYERS if name in names}
 
     return draw
+
+
+def renderer_channels(names: Collection[str]) -> tuple[str, ...]:
+    """What `Renderer.render_channels` calls those of the layers that it makes only when asked."""
+    return tuple(own for name, own in _FEATURES.items() if name in names)
 
 
 def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
@@ -132,13 +141,26 @@ def _margin(config: FramingConfig) -> int:
     return int(np.ceil(_RADII[config.filter] - 0.5))
 
 
+def finer(camera: Camera, config: FramingConfig) -> Camera:
+    """What is drawn for a picture that is supersampled: larger, with what its filter looks at around it.
+
+    Raises InputError for a panorama, which has nothing around it, where the filter looks beyond a pixel."""
+    margin, samples = _margin(config), config.supersample
+    if margin == 0:
+        return camera.resized(camera.width * samples, camera.height * samples)
+    if camera.projection == "equirectangular":
+        raise InputError(f"--filter {config.filter}: needs pixels beyond a panorama's edges, expected box")
+    padded = crop(camera, -margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
+    return padded.resized(padded.width * samples, padded.height * samples)
+
+
 def supersampled(draw: Draw, config: FramingConfig) -> Draw:
     """rgb and alpha from a frame `supersample` times larger, filtered; other layers as without.
 
     `draw` has to give rgb in linear light: what falls on a pixel adds up in that alone. The sums are in the same order
     wherever the picture is in its frame.
     """
-    samples, margin = config.supersample, _margin(config)
+    samples = config.supersample
     if samples == 1:
         return draw
     taps = filter_taps(config)
@@ -158,11 +180,7 @@ def supersampled(draw: Draw, config: FramingConfig) -> Draw:
         rest = [name for name in names if name not in COLOUR]
         layers = draw(camera, rest) if rest else {}
         if light:
-            if margin and camera.projection == "equirectangular":
-                raise InputError(f"--filter {config.filter}: needs pixels beyond a panorama's edges, expected box")
-            padded = crop(camera, -margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
-            larger = (padded if margin else camera).resized(padded.width * samples, padded.height * samples)
-            for name, plane in draw(larger, light).items():
+            for name, plane in draw(finer(camera, config), light).items():
                 layers[name] = shrunk(shrunk(plane, 0, camera.height), 1, camera.width)
         return {name: layers[name] for name in LAYERS if name in names}
 

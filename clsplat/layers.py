@@ -55,6 +55,9 @@ HALF_MAX = np.float32(65504)
 _LARGEST_FLOAT_INDEX = 2**24
 
 EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
+VIDEO = ".mp4"
+DEEP = ("R", "G", "B", "A", "Z", "ZBack")
+"""Channels of a deep picture."""
 
 
 @dataclass(frozen=True)
@@ -88,18 +91,19 @@ def parse_channels(text: str) -> tuple[str, ...]:
     return tuple(name for name in LAYERS if name in asked)
 
 
-def check_format(path: str, channels: Iterable[str]) -> None:
-    """Raise InputError where a file of that name cannot hold the channels."""
-    extension = Path(path).suffix.lower()
-    if extension not in EXTENSIONS:
-        raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(EXTENSIONS)}")
+def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
+    """Raise InputError where a file of that name cannot hold the channels. video: it may be one, too."""
+    extension, known = Path(path).suffix.lower(), (*EXTENSIONS, VIDEO) if video else EXTENSIONS
+    if extension not in known:
+        raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(known)}")
     if extension == ".exr":
         return
-    holds = ("rgb",) if extension in (".jpg", ".jpeg") else ("rgb", "alpha")
+    holds = ("rgb",) if extension in (".jpg", ".jpeg", VIDEO) else ("rgb", "alpha")
     over = [name for name in channels if name not in holds]
     if over or "rgb" not in channels:
         lacking = f"cannot hold {', '.join(over)}" if over else "needs rgb"
-        raise InputError(f"{path}: a {extension[1:].upper()} {lacking}; write .exr, or other --channels")
+        article = "an" if extension == VIDEO else "a"
+        raise InputError(f"{path}: {article} {extension[1:].upper()} {lacking}; write .exr, or other --channels")
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
@@ -163,9 +167,14 @@ def is_whole(
     channels: Iterable[str],
     encoding: Encoding,
     attributes: Mapping[str, str | int | float] | None = None,
+    *,
+    deep: bool = False,
 ) -> bool:
     """Whether a file is there that holds these channels, as `write_layers` would have them, in a picture of that size,
-    with no other values of these attributes, and that decodes to its last row. A file that was cut short does not."""
+    with no other values of these attributes, and that decodes to its last row. A file that was cut short does not.
+
+    deep: whether it is to be a deep picture, whose channels are DEEP.
+    """
     channels = [name for name in LAYERS if name in set(channels)]
     exr = path.suffix.lower() == ".exr"
     groups = _parts(channels) if exr and encoding.parts == "several" else [tuple(channels)]
@@ -184,13 +193,17 @@ def is_whole(
             if not source.seek_subimage(part, 0):
                 return False
             spec = source.spec()
-            names = tuple(channel for name in group for channel in LAYERS[name].names)
-            if (spec.width, spec.height, tuple(spec.channelnames)) != (width, height, names):
+            names = DEEP if deep else tuple(channel for name in group for channel in LAYERS[name].names)
+            if (spec.width, spec.height, tuple(spec.channelnames)) != (width, height, names) or spec.deep != deep:
                 return False
             if any(spec.getattribute(key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False
             bottom = spec.y + spec.height
-            row = source.read_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels, oiio.FLOAT)
+            row = (
+                source.read_native_deep_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels)
+                if deep
+                else source.read_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels, oiio.FLOAT)
+            )
             if row is None or source.geterror():
                 return False
         return not source.seek_subimage(len(groups), 0)

@@ -12,6 +12,10 @@ from clsplat.errors import InputError
 
 Filter = Literal["box", "blackman-harris"]
 
+STRIP_PIXELS = 1 << 24
+"""Pixels that are on the host at once, before filtering: about a gigabyte with every layer."""
+DEEP_STRIP_FLOATS = 1 << 26
+"""Of the slices of a deep picture's strip: 256 MiB."""
 _MOST_SUPERSAMPLES = 64
 _MOST_SAMPLES = 4096
 _MOST_BINS = 256

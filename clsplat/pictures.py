@@ -10,16 +10,19 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from clsplat.big_frames import strip_rows, write_in_strips
+from clsplat.big_frames import in_strips, strip_rows, write_in_strips
 from clsplat.camera import Camera
 from clsplat.colour import SRGB, Colours
 from clsplat.framing import Draw, Layers, drawn_by, framed, supersampled
-from clsplat.gaussians import Gaussians
 from clsplat.layers import Encoding, Header, write_layers
 from clsplat.picture_config import PictureConfig
-from clsplat.rendering import Renderer
 from clsplat.sampling import sample_cameras, sampled
+
+if TYPE_CHECKING:
+    from clsplat.gaussians import Gaussians
+    from clsplat.rendering import Renderer
 
 
 class Pictures:
@@ -45,12 +48,21 @@ class Pictures:
         """The picture's camera, of the middle of the shutter: for its size, its window and the file's header."""
         return framed(sample_cameras(at, replace(self.config.sampling, samples=1))[0], self.config.framing)
 
+    def rows(self, camera: Camera, names: Collection[str]) -> int:
+        """Rows of the strips that the camera's picture is rendered in, its height where that is none."""
+        return strip_rows(self._renderer.device, camera, names, self.config.framing)
+
     def drawn(self, at: Callable[[float], Camera], after: Camera | None = None) -> Draw:
         """What draws a frame's layers, of a camera that says size and window (`camera`, or a strip of it).
 
         at: the camera of the whole frame, in its final size, at a time in frames from the frame: 0 if nothing moves;
         after: that of the next frame, for motion.
         """
+        draw, space = self._in_light(at, after)
+        return converted(draw, self.colours, space, self.colours.output)
+
+    def _in_light(self, at: Callable[[float], Camera], after: Camera | None) -> tuple[Draw, str]:
+        """`drawn` without the last conversion, and the space that its colours are in."""
         config, colours = self.config, self.colours
         draw = drawn_by(self._renderer, self._gaussians, self._background, after)
         space = colours.model
@@ -59,7 +71,17 @@ class Pictures:
             draw = supersampled(draw, config.framing)
         if config.sampling.on:
             draw = sampled(draw, *sample_cameras(at, config.sampling))
-        return converted(draw, colours, space, colours.output)
+        return draw, space
+
+    def unfinished(
+        self, at: Callable[[float], Camera], names: Collection[str], after: Camera | None = None
+    ) -> tuple[Layers, Callable[[Layers], Layers]]:
+        """The picture's layers before the conversion on the way out, and that conversion, which needs no device."""
+        camera = self.camera(at)
+        draw, space = self._in_light(at, after)
+        colours, rows = self.colours, self.rows(camera, names)
+        made = (in_strips(draw, rows) if rows < camera.height else draw)(camera, names)
+        return made, lambda layers: in_space(layers, colours, space, colours.output)
 
     def layers(self, at: Callable[[float], Camera], names: Collection[str], after: Camera | None = None) -> Layers:
         """The picture's layers, all at once; its window is `camera(at).window`."""
@@ -78,8 +100,7 @@ class Pictures:
         camera, header = self.camera(at), header or Header()
         if path.suffix.lower() == ".exr":
             header = replace(header, window=camera.window)
-        rows = strip_rows(self._renderer.device, camera, names, self.config.framing)
-        draw = self.drawn(at, after)
+        rows, draw = self.rows(camera, names), self.drawn(at, after)
         if rows < camera.height:
             write_in_strips(path, draw, camera, names, rows, encoding, header)
         else:
@@ -91,10 +112,11 @@ def converted(draw: Draw, colours: Colours, source: str, target: str) -> Draw:
     if source == target:
         return draw
 
-    def in_target(camera: Camera, names: Collection[str]) -> Layers:
-        layers = draw(camera, names)
-        if "rgb" in layers:
-            layers["rgb"] = colours.convert(layers["rgb"], layers.get("alpha"), source, target)
-        return layers
+    return lambda camera, names: in_space(draw(camera, names), colours, source, target)
 
-    return in_target
+
+def in_space(layers: Layers, colours: Colours, source: str, target: str) -> Layers:
+    """The same layers, rgb in another colour space, as `converted`."""
+    if source == target or "rgb" not in layers:
+        return layers
+    return {**layers, "rgb": colours.convert(layers["rgb"], layers.get("alpha"), source, target)}

@@ -409,7 +409,7 @@ class Renderer:
     def render_deep(self, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
         """(bins, H, W, 6): the view in slices by depth, the next of which begins at each of the bounds (bins - 1,):
         red, green, blue, associated with alpha; alpha; least and largest depth. All 0 where there is nothing."""
-        bins = len(bounds) + 1
+        bins, camera = len(bounds) + 1, camera.from_origin(gaussians.origin)
         on_device = self._hold(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
         frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
         found = self._rasterizer.deep(frame, upload(self.device, np.append(bounds, np.inf).astype(np.float32)))

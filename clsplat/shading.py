@@ -3,34 +3,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
-from clsplat.layers import Encoding, Header, camera_matrices
+from clsplat.errors import InputError
+from clsplat.framing import Layers, framed
+from clsplat.layers import VIDEO, Encoding, Header, camera_matrices
+from clsplat.picture_config import DeepConfig, PictureConfig
+from clsplat.sampling import shutter_middle
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
+    from clsplat.shutter import Stretch
 
-Layers = dict[str, NDArray[Any]]
-_FIELDS = {"normals": "normal", "position": "position", "motion": "motion"}
-"""What the renderer calls the channels that it makes only when asked."""
-_PLANES = {"depth": "depth", "median": "median", "first": "first", "count": "count", "id": "index"}
-"""And those that it always makes beside colour."""
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A frame to be rendered. number, name: as `paths.Frame`; camera: in the size of the picture; after: the camera
-    that motion goes to, of the same size, where motion is asked for; path: of the file; before: see `render_job.stamp`.
+    """A frame to be rendered. number, name: as `paths.Frame`; camera: of the whole frame, in its final size; after: the
+    camera that motion goes to, of the same size, where motion is asked for; stretch: where the camera is while the
+    shutter is open, None where it stands still; path: of the file; before: see `render_job.stamp`.
     """
 
     number: int
@@ -38,73 +37,119 @@ class Task:
     camera: Camera
     path: Path
     after: Camera | None = None
+    stretch: Stretch | None = None
     before: tuple[int, ...] | None = None
+
+    def at(self, time: float) -> Camera:
+        """The camera of the whole frame at a time in frames from the frame."""
+        return self.camera if time == 0 or self.stretch is None else self.stretch.at(time)
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the file holds other frames too."""
+        return self.path.suffix.lower() == VIDEO
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What every frame of a job has in common. channels: of `layers.LAYERS`; attributes: of the file's header."""
+    """What every frame of a job has in common. channels: of `layers.LAYERS`; attributes: of the file's header;
+    pictures: what is made of a frame; recorded: the model's colour space; deep: slices of a deep picture, or None."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     encoding: Encoding = field(default_factory=Encoding)
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    pictures: PictureConfig = field(default_factory=PictureConfig)
+    recorded: str = "sRGB"
+    deep: DeepConfig | None = None
+
+
+def as_it_is(layers: Layers) -> Layers:
+    """The same layers."""
+    return layers
 
 
 @dataclass(frozen=True)
 class Shaded:
-    """A frame before it is encoded. seconds: that it took; kernel_ms, transfer_ms: the device's, None if not asked
-    for."""
+    """A frame before it is encoded. layers: None for one that was written strip by strip; seconds: that it took;
+    kernel_ms, transfer_ms: the device's, None if not asked for; finish: what is left to do to the layers, for who
+    encodes them, in another thread."""
 
-    layers: Layers
+    layers: Layers | None
     seconds: float
     kernel_ms: float | None = None
     transfer_ms: float | None = None
+    finish: Callable[[Layers], Layers] = as_it_is
 
 
 Shader = Callable[[Task], Shaded]
 
 
-def renderer_channels(channels: tuple[str, ...]) -> tuple[str, ...]:
-    """What `Renderer.render_channels` calls those of them that it makes only when asked."""
-    return tuple(own for name, own in _FIELDS.items() if name in channels)
+def picture_camera(task: Task, options: RenderOptions) -> Camera:
+    """The camera of the picture that is written: its size, its window, the middle of the shutter.
 
-
-def beside_colour(channels: tuple[str, ...]) -> bool:
-    """Whether any of them takes more than `Renderer.render`."""
-    return not set(channels) <= {"rgb", "alpha"}
-
-
-def shade(renderer: Any, gaussians: Gaussians, task: Task, options: RenderOptions) -> Layers:
-    """The layers of a frame by name, (H, W) or (H, W, channels), as `layers.write_layers` takes them.
-
-    renderer: a `Renderer`. They need not be contiguous: what puts them in order is left to who encodes them, which is
-    another thread. Motion is turned over here: docs/channels.md has y down, and in files v is up.
+    Raises InputError for a region that is not in the frame.
     """
-    camera, wanted = task.camera, options.channels
-    if not beside_colour(wanted):
-        result = renderer.render(gaussians, camera, options.background, contiguous=False)
-        made: Layers = {"rgb": result.image, "alpha": result.alpha}
-    else:
-        result, found = renderer.render_channels(
-            gaussians,
-            camera,
-            renderer_channels(wanted),
-            after=task.after,
-            background=options.background,
-            contiguous=False,
-        )
-        made = {"rgb": result.image, "alpha": result.alpha}
-        made.update({name: getattr(found, own) for name, own in _PLANES.items()})
-        made.update({name: found.fields[own] for name, own in _FIELDS.items() if name in wanted})
-        if "motion" in wanted:
-            made["motion"] = made["motion"] * np.array([1, -1], np.float32)
-    return {name: made[name] for name in wanted}
+    middle = task.at(shutter_middle(options.pictures.sampling))
+    return framed(middle, options.pictures.framing)
+
+
+def camera_after(task: Task, options: RenderOptions) -> Camera | None:
+    """The camera of the whole frame that motion goes to: a frame later than the middle of the shutter."""
+    middle = shutter_middle(options.pictures.sampling)
+    return task.after if middle == 0 or task.after is None else task.at(middle + 1)
 
 
 def header(task: Task, options: RenderOptions) -> Header:
-    """Frame, model and version; the matrices of a camera that has them."""
-    return Header({**options.attributes, "clsplat:frame": task.number}, camera_matrices(task.camera))
+    """Frame, model, version and colour space; the matrices of a camera that has them; in EXR the window."""
+    camera = picture_camera(task, options)
+    window = camera.window if task.path.suffix.lower() == ".exr" else None
+    return Header({**options.attributes, "clsplat:frame": task.number}, camera_matrices(camera), window)
+
+
+class FrameShader:
+    """Renders frames of one model on one device. A frame that is too large to be held is written as well."""
+
+    def __init__(self, renderer: Any, gaussians: Gaussians, options: RenderOptions) -> None:
+        """renderer: a `Renderer`. Raises InputError for settings and colour spaces that make no sense."""
+        from clsplat.pictures import Pictures
+
+        self.options = options
+        self._renderer, self._gaussians = renderer, gaussians
+        self._pictures = Pictures(
+            renderer, gaussians, options.pictures, background=options.background, recorded=options.recorded
+        )
+
+    def check(self, tasks: Sequence[Task]) -> None:
+        """Raise InputError for a frame that the file's kind cannot hold as it has to be rendered here."""
+        for task in tasks:
+            if self.options.encoding.parts == "several" and self._in_strips(task):
+                camera = picture_camera(task, self.options)
+                raise InputError(
+                    f"--parts several: a picture of {camera.width}x{camera.height} is written in strips here, "
+                    "expected one part"
+                )
+
+    def __call__(self, task: Task) -> Shaded:
+        """The frame. Raises ClsplatError where it cannot be rendered, or, if it is written here, not be written."""
+        start, options, pictures = time.monotonic(), self.options, self._pictures
+        if options.deep is None and not self._in_strips(task):
+            layers, finish = pictures.unfinished(task.at, options.channels, camera_after(task, options))
+            return Shaded(layers, time.monotonic() - start, finish=finish)
+        encoding, head = options.encoding, header(task, options)
+        if options.deep is None:
+            after = camera_after(task, options)
+            pictures.write(task.path, task.at, options.channels, encoding, head, after)
+        else:
+            from clsplat.deep import write_deep
+
+            model, camera = (self._renderer, self._gaussians), picture_camera(task, options)
+            write_deep(task.path, *model, camera, options.deep, encoding, head, pictures.colours)
+        return Shaded(None, time.monotonic() - start)
+
+    def _in_strips(self, task: Task) -> bool:
+        camera = picture_camera(task, self.options)
+        return not task.is_video and self._pictures.rows(camera, self.options.channels) < camera.height
 
 
 def open_shader(
@@ -115,33 +160,34 @@ def open_shader(
     device: str | None = None,
     memory_limit: int | None = None,
     profile: bool = False,
-) -> Shader:
+) -> FrameShader | _Recorded:
     """A function that renders frames of the model on the device that `device` names. Raises DeviceError.
 
     profile: note what the device is busy with.
     """
-    import time
-
     from clsplat.device.context import open_device
     from clsplat.rendering import Renderer
     from clsplat.trust import require
 
     opened: Any = _profiled(device, memory_limit) if profile else open_device(device, memory_limit)
     require(opened, forward=True)
-    renderer = Renderer(opened, config=rasterizer)
+    shader = FrameShader(Renderer(opened, config=rasterizer), gaussians, options)
+    return _Recorded(shader, opened) if profile else shader
 
-    def shader(task: Task) -> Shaded:
-        start = time.monotonic()
-        if not profile:
-            return Shaded(shade(renderer, gaussians, task, options), time.monotonic() - start)
-        with opened.recorder.recording(opened, wait=False) as stages:
-            layers = shade(renderer, gaussians, task, options)
-            seconds = time.monotonic() - start
+
+class _Recorded:
+    """A shader whose device notes what it is busy with."""
+
+    def __init__(self, shader: FrameShader, opened: Any) -> None:
+        self._shader, self._device = shader, opened
+        self.check = shader.check
+
+    def __call__(self, task: Task) -> Shaded:
+        with self._device.recorder.recording(self._device, wait=False) as stages:
+            shaded = self._shader(task)
         times = [(name, taken) for record in stages.values() for name, taken in record.kernels.items()]
         kernels = sum(taken for name, taken in times if name not in TRANSFERS)
-        return Shaded(layers, seconds, kernels, sum(taken for _, taken in times) - kernels)
-
-    return shader
+        return replace(shaded, kernel_ms=kernels, transfer_ms=sum(taken for _, taken in times) - kernels)
 
 
 def _profiled(device: str | None, memory_limit: int | None) -> Any:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import TEMPORARY_SUFFIX
+from clsplat.layers import VIDEO
 from clsplat.picture_config import VideoConfig
 
-EXTENSION = ".mp4"
 _LUMA = (0.2126, 0.7152, 0.0722)
 _BLUE, _RED = np.float32(2 * (1 - 0.0722)), np.float32(2 * (1 - 0.2126))
 """What B - Y and R - Y reach, from end to end."""
@@ -36,8 +36,8 @@ def video_missing() -> str:
 
 def check_video(path: Path) -> None:
     """Raise InputError where this installation cannot write a video there."""
-    if path.suffix.lower() != EXTENSION:
-        raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected {EXTENSION}")
+    if path.suffix.lower() != VIDEO:
+        raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected {VIDEO}")
     if reason := video_missing():
         raise InputError(f"{path}: {reason}")
     if not path.parent.is_dir():
@@ -56,6 +56,17 @@ def yuv420(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
     chroma = 0.25 * (left + chroma[:, :, 1::2]) + 0.5 * chroma[:, :, 0::2]
     flat = np.concatenate([(16 + 219 * luma).ravel(), (128 + 224 * chroma).ravel()])
     return np.asarray(np.rint(flat).reshape(-1, luma.shape[1]), np.uint8)
+
+
+def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """`yuv420` of (H, W, 3), floats as they are to be displayed, clipped to [0, 1], NaN as 0, or uint8.
+
+    Raises ValueError for another shape."""
+    pixels = np.asarray(image)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
+        raise ValueError(f"frame {pixels.shape}: expected (H, W, 3)")
+    values = pixels / np.float32(255) if pixels.dtype == np.uint8 else np.clip(np.nan_to_num(pixels), 0, 1)
+    return yuv420(values.astype(np.float32, copy=False))
 
 
 class VideoWriter:
@@ -82,18 +93,18 @@ class VideoWriter:
         return self
 
     def add(self, image: NDArray[Any]) -> None:
-        """Append a frame: (H, W, 3), floats as they are to be displayed, clipped to [0, 1], or uint8; all of one size.
+        """Append a frame, as `frame_planes` takes it; all of one size.
 
         Raises ClsplatError if writing fails, ValueError for a frame of another size.
         """
-        pixels = np.asarray(image)
-        if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
-            raise ValueError(f"frame {pixels.shape}: expected (H, W, 3)")
-        if self.frames and pixels.shape[:2] != self._size:
-            raise ValueError(f"frame {pixels.shape[:2]}: expected {self._size}, the size of the first")
-        self._size = pixels.shape[:2]
-        values = pixels / np.float32(255) if pixels.dtype == np.uint8 else np.clip(np.nan_to_num(pixels), 0, 1)
-        planes = yuv420(values.astype(np.float32, copy=False))
+        self.add_planes(frame_planes(image))
+
+    def add_planes(self, planes: NDArray[np.uint8]) -> None:
+        """As `add`, of what `frame_planes` gives."""
+        size = planes.shape[0] * 2 // 3, planes.shape[1]
+        if self.frames and size != self._size:
+            raise ValueError(f"frame {size}: expected {self._size}, the size of the first")
+        self._size = size
         self._taken(lambda: self._encode(planes))
         self.frames += 1
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from models import random_gaussians
 
-from clsplat import colmap, layers, verb_render  # noqa: F401  # imported before fakes take their modules' places
+from clsplat import colmap, layers, pictures, trust, verb_render  # noqa: F401  # imported before fakes take their modules' places
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig, TrainConfig
 from clsplat.errors import DeviceError, InputError
@@ -38,6 +38,8 @@ class FakeView:
 class FakeDevice:
     name: str = "processor"
     driver: str = "OpenCL 3.0 driver 1.0"
+    budget: int = 1 << 30
+    max_allocation: int = 1 << 28
 
 
 @dataclass
@@ -98,6 +100,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         def __init__(self, device: object, config: object = None) -> None:
             assert isinstance(device, FakeDevice)
             assert config == RasterizerConfig()
+            self.device = device
 
         def render(
             self, gaussians: Gaussians, camera: Camera, background: tuple[float, ...] = (0, 0, 0), **_: Any

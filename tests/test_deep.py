@@ -181,7 +181,7 @@ def test_halves_and_a_window(tmp_path: Path) -> None:
 def test_strips_make_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, *_ = made(tmp_path)
     whole = path.read_bytes()
-    monkeypatch.setattr("clsplat.deep._STRIP_FLOATS", 71 * 6 * 6 * 16)
+    monkeypatch.setattr("clsplat.deep.DEEP_STRIP_FLOATS", 71 * 6 * 6 * 16)
     made(tmp_path)
     assert path.read_bytes() == whole
 

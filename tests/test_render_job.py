@@ -8,6 +8,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,12 @@ from scenes import tilted_camera
 from clsplat import render_job
 from clsplat.camera import Camera
 from clsplat.errors import ClsplatError, InputError
+from clsplat.framing import Layers
 from clsplat.layers import LAYERS, Encoding
 from clsplat.paths.shot import Frame, Shot, numbered
-from clsplat.render_job import Record, camera_after, is_complete, make_tasks, run_tasks, write_frame
-from clsplat.shading import Layers, RenderOptions, Shaded, Task, shade
+from clsplat.render_job import Record, is_complete, make_tasks, run_tasks, write_frame
+from clsplat.shading import FrameShader, RenderOptions, Shaded, Task
+from clsplat.shutter import camera_after
 
 EVERYTHING = tuple(LAYERS)
 OPTIONS = RenderOptions(("rgb", "alpha", "depth"), attributes={"clsplat:model": "abc", "Software": "clsplat"})
@@ -101,6 +104,7 @@ class FakeRenderer:
 
     def __init__(self) -> None:
         self.asked: list[Any] = []
+        self.device = SimpleNamespace(budget=1 << 30, max_allocation=1 << 30)
 
     def render(self, _: object, camera: Camera, background: object, **how: Any) -> Any:
         self.asked.append((background, how))
@@ -119,10 +123,16 @@ class FakeRenderer:
         return self.render(gaussians, camera, None), found
 
 
+def shade(renderer: Any, task: Task, options: RenderOptions) -> Layers:
+    made = FrameShader(renderer, None, options)(task).layers  # type: ignore[arg-type]
+    assert made is not None
+    return made
+
+
 def test_shade_takes_each_channel_from_its_place(tmp_path: Path) -> None:
     renderer: Any = FakeRenderer()
     (task,) = tasks_in(tmp_path, 1, EVERYTHING)
-    made = shade(renderer, None, task, RenderOptions(EVERYTHING))  # type: ignore[arg-type]
+    made = shade(renderer, task, RenderOptions(EVERYTHING))
     assert tuple(made) == EVERYTHING
     ones = {"rgb": 0.25, "alpha": 0.5, "depth": 0, "median": 1, "first": 2, "count": 3, "id": 4}
     for name, value in {**ones, "normals": 7, "position": 8}.items():
@@ -130,12 +140,13 @@ def test_shade_takes_each_channel_from_its_place(tmp_path: Path) -> None:
     assert (made["motion"] == [2, -3]).all()  # y is down in docs/channels.md, v is up in a file
     wanted, how = renderer.asked[0]
     assert set(wanted) == {"normal", "position", "motion"}
-    assert how["after"] is task.after
+    assert task.after is not None
+    assert (how["after"].width, how["after"].translation is task.after.translation) == (task.after.width, True)
     renderer.asked.clear()
-    plain = shade(renderer, None, task, RenderOptions(("alpha",), (1, 0, 0)))  # type: ignore[arg-type]
+    plain = shade(renderer, task, RenderOptions(("alpha",), (1, 0, 0)))
     assert list(plain) == ["alpha"]
     assert [background for background, _ in renderer.asked] == [(1, 0, 0)]
-    shade(renderer, None, task, RenderOptions(("first",)))  # type: ignore[arg-type]
+    shade(renderer, task, RenderOptions(("first",)))
     assert renderer.asked[1][0] == ()
 
 

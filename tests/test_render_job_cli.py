@@ -23,8 +23,8 @@ from clsplat.config import RasterizerConfig
 from clsplat.device.context import list_devices
 from clsplat.gaussians import Gaussians
 from clsplat.paths import choose_shot
-from clsplat.render_job import camera_after
 from clsplat.rendering import Renderer
+from clsplat.shutter import camera_after
 
 COUNT = 6
 ALL = "rgb,alpha,depth,normals,position,motion,median,first,count,id"

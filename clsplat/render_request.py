@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a call of `clsplat render` asks for. What is wrong with it is found here, before a frame is rendered."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import clsplat
+from clsplat import render_job
+from clsplat.camera import Camera
+from clsplat.cli import Render
+from clsplat.colour import Colours, recorded_space
+from clsplat.config import RasterizerConfig
+from clsplat.errors import InputError
+from clsplat.files import digest
+from clsplat.framing import finer
+from clsplat.gaussians import Gaussians
+from clsplat.layers import VIDEO, Encoding, check_format, parse_channels
+from clsplat.memory import parse_bytes
+from clsplat.paths import choose_shot
+from clsplat.picture_config import ColourConfig, DeepConfig, PictureConfig, VideoConfig
+from clsplat.runs import model_file
+from clsplat.shading import RenderOptions, Task, picture_camera
+
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a call means. devices: selectors, None for the usual one; spaces: the model's colour space and that of the
+    pictures."""
+
+    verb: Render
+    options: RenderOptions
+    rasterizer: RasterizerConfig
+    model: Path
+    gaussians: Gaussians
+    tasks: list[Task]
+    devices: tuple[str | None, ...]
+    memory_limit: int | None
+    spaces: tuple[str, str]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the model file."""
+        return str(self.options.attributes["clsplat:model"])
+
+    @property
+    def is_video(self) -> bool:
+        """Whether all frames go into one file."""
+        return self.tasks[0].is_video
+
+    @property
+    def on_farm(self) -> bool:
+        """Whether others render."""
+        return self.verb.workers is not None or self.verb.scheduler is not None
+
+
+def read_job(verb: Render) -> Job:
+    """All that can be checked without rendering. Raises InputError and DeviceError; writes nothing."""
+    options = _options(verb)
+    verb.rasterizer.check()
+    limit = parse_bytes(verb.max_device_mem)
+    resize = resizer(verb.width, verb.height, verb.scale)
+    devices = _devices(verb)
+    whole = choose_shot(
+        verb.cameras,
+        path=verb.path,
+        count=verb.count,
+        size=(verb.width, verb.height),
+        usd_camera=verb.usd_camera,
+    )
+    chosen = whole if verb.frames is None else whole.only(verb.frames)
+    sampling = options.pictures.sampling
+    tasks = render_job.make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
+    _check_pictures(tasks, options)
+    render_job.check_folders(tasks)
+    for warning in chosen.warnings:
+        warn(warning)
+    rasterizer = verb.rasterizer
+    if rasterizer.sh_angle:
+        warn(f"--rasterizer.sh-angle {rasterizer.sh_angle:g} is not used: a frame would depend on those before it")
+        rasterizer = replace(rasterizer, sh_angle=0.0)
+    model = model_file(verb.model)
+    gaussians = Gaussians.load(model)
+    recorded = recorded_space(model)
+    colours = Colours(options.pictures.colour, recorded)
+    attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
+    attributes["clsplat:colorspace"] = colours.output
+    options = replace(options, attributes=attributes, recorded=recorded)
+    return Job(verb, options, rasterizer, model, gaussians, tasks, devices, limit, (colours.model, colours.output))
+
+
+def _options(verb: Render) -> RenderOptions:
+    pictures = PictureConfig(_for_workers(verb.colour), verb.framing, verb.sampling)
+    pictures.check()
+    video = Path(verb.output).suffix.lower() == VIDEO
+    channels = parse_channels(f"{verb.channels},alpha" if verb.alpha or verb.deep else verb.channels)
+    check_format(verb.output, channels, video=True)
+    if not 1 <= verb.quality <= 100:
+        raise InputError(f"--quality {verb.quality}: expected 1 to 100")
+    if "alpha" in channels and verb.background is not None:
+        flag = "--deep" if verb.deep else "--alpha" if verb.alpha else "--channels alpha"
+        raise InputError(f"{flag} and --background exclude each other: with alpha there is no background")
+    verb.slices.check()
+    verb.video.check()
+    if verb.deep:
+        pictures.check_deep()
+        _check_deep(verb, channels)
+    elif verb.slices != DeepConfig():
+        raise InputError("--deep.bins, --deep.near and --deep.far are of deep EXR, expected --deep with them")
+    if video:
+        _check_video(verb)
+    elif verb.video != VideoConfig():
+        raise InputError(f"-o {verb.output}: --video flags are of videos, expected the name of an {VIDEO} file")
+    encoding = Encoding(verb.exr, verb.parts, verb.compression, verb.bits, verb.quality)
+    colour = parse_colour(verb.background or "black")
+    return RenderOptions(channels, colour, encoding, pictures=pictures, deep=verb.slices if verb.deep else None)
+
+
+def _for_workers(colour: ColourConfig) -> ColourConfig:
+    """The configuration that is meant here, for processes with other surroundings too."""
+    source = colour.ocio_config or os.environ.get("OCIO", "")
+    if source and "://" not in source:
+        source = str(Path(source).absolute())
+    return replace(colour, ocio_config=source)
+
+
+def _check_deep(verb: Render, channels: tuple[str, ...]) -> None:
+    if Path(verb.output).suffix.lower() != ".exr":
+        raise InputError(f"--deep: {verb.output} cannot hold deep samples, expected an .exr file")
+    if over := [name for name in channels if name not in ("rgb", "alpha")]:
+        raise InputError(f"--deep: has no {', '.join(over)} beside colour, alpha and depths, expected --channels rgb")
+    if verb.parts != "one":
+        raise InputError("--deep and --parts several exclude each other: a deep file has one part")
+
+
+def _check_video(verb: Render) -> None:
+    from clsplat.video import video_missing
+
+    if reason := video_missing():
+        raise InputError(f"{verb.output}: {reason}")
+    if verb.skip_existing:
+        raise InputError("--skip-existing: a video is written as a whole, expected a call without, or a file a frame")
+
+
+def _check_pictures(tasks: list[Task], options: RenderOptions) -> None:
+    """Raise InputError for a frame that the framing does not suit, and for a video of several sizes."""
+    sizes = set()
+    for task in tasks:
+        camera = picture_camera(task, options)
+        if options.pictures.framing.supersample > 1:
+            finer(camera, options.pictures.framing)
+        sizes.add(f"{camera.width}x{camera.height}")
+    if tasks[0].is_video and len(sizes) > 1:
+        raise InputError(
+            f"{tasks[0].path}: frames are of the sizes {', '.join(sorted(sizes))}, expected one; give --width and "
+            "--height"
+        )
+
+
+def _devices(verb: Render) -> tuple[str | None, ...]:
+    """The selectors in --device."""
+    if verb.workers is not None and verb.workers < 1:
+        raise InputError(f"--workers {verb.workers}: expected at least 1")
+    if verb.workers is not None and verb.scheduler is not None:
+        raise InputError("--workers and --scheduler exclude each other: a new cluster here, or one that is there")
+    words = [word.strip() for word in verb.device.split(",")] if verb.device else []
+    if not words:
+        return (None,)
+    farm = "--workers" if verb.workers is not None else "--scheduler" if verb.scheduler is not None else None
+    if farm and (len(words) > 1 or words == ["all"]):
+        raise InputError(f"--device {verb.device} and {farm} exclude each other: a worker has one device")
+    if farm:
+        return (words[0],)
+    if words == ["all"]:
+        from clsplat.device.context import list_devices
+
+        words = [str(info.index) for info in list_devices()]
+    elif len(words) > 1:
+        from clsplat.device.context import find_device
+
+        found = [find_device(word).index for word in words]
+        if len(set(found)) < len(found):
+            raise InputError(f"--device {verb.device}: names a device twice, expected each once")
+    return tuple(words)
+
+
+def parse_colour(text: str) -> Colour:
+    """black, white or three numbers from 0 to 1. Raises InputError."""
+    named: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    if text in named:
+        return named[text]
+    try:
+        red, green, blue = (float(word) for word in text.split(","))
+    except ValueError:
+        red = green = blue = -1.0
+    if not (0 <= red <= 1 and 0 <= green <= 1 and 0 <= blue <= 1):
+        raise InputError(f"--background {text}: expected black, white or three numbers from 0 to 1 such as 0.2,0.2,0.3")
+    return red, green, blue
+
+
+def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Camera], Camera]:
+    """A camera's size after --width, --height and --scale. Raises InputError for sizes that make no sense."""
+    for flag, value in (("--width", width), ("--height", height), ("--scale", scale)):
+        if value is not None and not 0 < value < float("inf"):
+            raise InputError(f"{flag} {value}: expected a number above 0")
+    if scale != 1 and (width or height):
+        raise InputError("--scale and --width or --height exclude each other")
+
+    def resize(camera: Camera) -> Camera:
+        across, down = width, height
+        if across is None:
+            across = round(camera.width * (down / camera.height if down else scale))
+        if down is None:
+            down = round(camera.height * (across / camera.width if width else scale))
+        if (across, down) == (camera.width, camera.height):
+            return camera
+        return camera.resized(max(1, across), max(1, down))
+
+    return resize
+
+
+def warn(text: str) -> None:
+    """A line for the user, on standard error."""
+    print(f"clsplat: warning: {text}", file=sys.stderr)
