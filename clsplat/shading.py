@@ -124,14 +124,19 @@ def open_shader(
     import time
 
     from clsplat.device.context import open_device
-    from clsplat.rendering import Renderer
+    from clsplat.rendering import PROJECTION_DEFINES, Renderer
+    from clsplat.selftest_result import CHANNELS, FORWARD, RAYS
     from clsplat.trust import require
 
     opened: Any = _profiled(device, memory_limit) if profile else open_device(device, memory_limit)
-    require(opened, forward=True)
+    require(opened, (*FORWARD, *(CHANNELS if beside_colour(options.channels) else ())))
     renderer = Renderer(opened, config=rasterizer)
+    tested: list[tuple[str, ...]] = []
 
     def shader(task: Task) -> Shaded:
+        if task.camera.projection in PROJECTION_DEFINES and RAYS not in tested:
+            require(opened, RAYS)
+            tested.append(RAYS)
         start = time.monotonic()
         if not profile:
             return Shaded(shade(renderer, gaussians, task, options), time.monotonic() - start)
