@@ -198,8 +198,8 @@ def sorts(device: Device) -> None:
 
 
 def limits(device: Device) -> None:
-    """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the probes of the tests
-    and of the self-test."""
+    """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the probes of the
+    tests and of the self-test."""
     items, lanes = tile_items(device), device.shape.lanes
     splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
     kernels = device.kernels("limit", ITEMS=items)
