@@ -23,6 +23,8 @@ _FIELDS = {"normals": "normal", "position": "position", "motion": "motion"}
 """What the renderer calls the channels that it makes only when asked."""
 _PLANES = {"depth": "depth", "median": "median", "first": "first", "count": "count", "id": "index"}
 """And those that it always makes beside colour."""
+_FLAT = ("perspective", "orthographic")
+"""Projections with an image plane; others have kernels of their own."""
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
 
@@ -124,7 +126,7 @@ def open_shader(
     import time
 
     from clsplat.device.context import open_device
-    from clsplat.rendering import PROJECTION_DEFINES, Renderer
+    from clsplat.rendering import Renderer
     from clsplat.selftest_result import CHANNELS, FORWARD, RAYS
     from clsplat.trust import require
 
@@ -134,7 +136,7 @@ def open_shader(
     tested: list[tuple[str, ...]] = []
 
     def shader(task: Task) -> Shaded:
-        if task.camera.projection in PROJECTION_DEFINES and RAYS not in tested:
+        if task.camera.projection not in _FLAT and RAYS not in tested:
             require(opened, RAYS)
             tested.append(RAYS)
         start = time.monotonic()

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from spoilers import MOST_BYTES, SPOILERS, spoil_place
 
-from clsplat import colmap, ply, runs, sfm, sfm_photos, transforms
+from clsplat import colmap, ply, replay, runs, sfm, sfm_photos, transforms
 from clsplat.config import TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.images import image_size, read_image, write_image
 from clsplat.paths.read import choose_shot
 from clsplat.scene import load_scene
+from clsplat.stages.project import group_shapes
 
 
 @dataclass(frozen=True)
@@ -227,6 +228,31 @@ def make_run(folder: Path) -> None:
     (folder / "run" / "model.ply").write_bytes(b"ply\n")
 
 
+def make_bundle(folder: Path) -> None:
+    """What a training leaves that gives up, of five Gaussians."""
+    shapes = group_shapes(5, 4)
+    arrays = {
+        f"{kind}/{g}": np.ones(shapes[g], np.float32) for kind in ("parameters", "first", "second") for g in shapes
+    }
+    record = {
+        "step": 7,
+        "stage": "adam",
+        "rates": dict.fromkeys(shapes, 0.001),
+        "camera": {"width": 12, "height": 9, "fx": 11.5, "fy": 11.0, "cx": 6.0, "cy": 4.5, "near": 0.01},
+        "settings": runs.config_text(TrainConfig(), None),
+    }
+    np.savez(
+        folder / "trouble-step-0000007.npz",
+        allow_pickle=False,
+        **{replay.RECORD: np.frombuffer(json.dumps(record).encode(), np.uint8)},
+        photograph=np.zeros((9, 12, 3), np.uint8),
+        background=np.zeros(3, np.float32),
+        rotation=np.eye(3),
+        translation=np.zeros(3),
+        **arrays,
+    )
+
+
 def make_photos(folder: Path) -> None:
     """Photos for structure from motion."""
     for name in ("a.png", "b.png"):
@@ -397,6 +423,14 @@ _ALL = (
         ("run/checkpoints/step-0000002.npz", "run/checkpoints/step-0000001.npz"),
         (*BYTES, "archive", *PLACES),
         3,
+    ),
+    Reader(
+        "bundle",
+        make_bundle,
+        lambda f: replay.read_bundle(f / "trouble-step-0000007.npz"),
+        ("trouble-step-0000007.npz",),
+        (*BYTES, "archive", *PLACES),
+        2,
     ),
     Reader("photos", make_photos, read_photos, ("photos/a.png", "photos/picture.jpg"), (*BYTES, *PLACES), 1),
     Reader("record", make_record, read_record, ("sfm.json",), (*BYTES, *LINES, "json", *PLACES), 1),
