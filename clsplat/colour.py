@@ -154,7 +154,7 @@ class Colours:
             linear = all(self._config.isColorSpaceLinear(name) for name in names)
             self._matrices[names] = self._matrix(*names) if linear else None
         if (matrix := self._matrices[names]) is None:
-            return self._converted(rgb, *names)
+            return self._converted(rgb, names[0], names[1])
         red, green, blue = (rgb[:, :, index, None] for index in range(3))  # no sum of a library's, whose order varies
         return np.asarray(red * matrix[0] + green * matrix[1] + blue * matrix[2], np.float32)
 
@@ -166,9 +166,9 @@ class Colours:
         exact = np.allclose(light[0, 3:] @ found[0, :3], found[0, 3:], rtol=1e-5, atol=1e-5)  # of float32 sums up to 4
         return found[0, :3] if exact else None
 
-    def _converted(self, rgb: Float32, *names: str) -> Float32:
+    def _converted(self, rgb: Float32, source: str, target: str) -> Float32:
         pixels = oiio.ImageBuf(np.ascontiguousarray(rgb, np.float32))
-        result = oiio.ImageBufAlgo.colorconvert(pixels, *names, unpremult=False, colorconfig=self._source)
+        result = oiio.ImageBufAlgo.colorconvert(pixels, source, target, unpremult=False, colorconfig=self._source)
         if reason := result.geterror():
-            raise InputError(f"{self._source}: {names[0]} to {names[1]}: {' '.join(reason.split())}")
+            raise InputError(f"{self._source}: {source} to {target}: {' '.join(reason.split())}")
         return np.asarray(result.get_pixels(oiio.FLOAT), np.float32)

@@ -32,10 +32,10 @@ from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
 from clsplat.device.layout import SPLAT, SlotFields
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import atomic_writer
+from clsplat.files import atomic_writer, parse_json
 from clsplat.quarantine import Incident, finite_or_zero
 from clsplat.rendering import Rasterizer
-from clsplat.runs import config_text, read_config
+from clsplat.runs import config_text, read_arrays, read_config
 from clsplat.stages.adam import REFUSED, adam
 from clsplat.stages.loss import loss
 from clsplat.stages.project import GROUPS, DeviceGaussians, allocate_gaussians, group_shapes
@@ -118,23 +118,51 @@ def _forget_marks(models: dict[str, dict[str, NDArray[np.float32]]]) -> None:
 def read_bundle(path: Path) -> Bundle:
     """Raises InputError for what is no bundle."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        record = json.loads(arrays[RECORD].tobytes())
-        pose = (arrays["rotation"], arrays["translation"])
-        size = record["camera"]
-        lens = (size["width"], size["height"], size["fx"], size["fy"], size["cx"], size["cy"])
-        models = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS}
-        with tempfile.TemporaryDirectory() as folder:
-            settings = Path(folder) / "config.toml"
-            settings.write_text(record["settings"], "utf-8")
-            config, _ = read_config(settings)
-        camera = Camera(*lens, *pose, near=size["near"])
-        return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
-        raise InputError(f"{path}: not a bundle of a training that gave up ({error})") from None
+        return _checked(_bundle_of(read_arrays(path, "a bundle")))
+    except Exception as error:  # as of a checkpoint: zipfile raises nearly anything for a flipped bit
+        if isinstance(error, InputError) and str(path) in str(error):
+            raise
+        why = f"{type(error).__name__}: {error}"[:300]
+        raise InputError(f"{path}: not a bundle of a training that gave up ({why})") from None
+
+
+def _bundle_of(arrays: dict[str, NDArray[Any]]) -> Bundle:
+    record = parse_json(arrays[RECORD].tobytes())
+    size = record["camera"]
+    lens = (size["width"], size["height"], size["fx"], size["fy"], size["cx"], size["cy"])
+    with tempfile.TemporaryDirectory() as folder:
+        settings = Path(folder) / "config.toml"
+        settings.write_text(record["settings"], "utf-8")
+        config, _ = read_config(settings)
+    config.check()
+    camera = Camera(*lens, arrays["rotation"], arrays["translation"], near=size["near"])
+    models = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS}
+    return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
+
+
+def _checked(bundle: Bundle) -> Bundle:
+    """The bundle. Raises ValueError where its arrays do not belong together, or it lacks what a step needs."""
+    camera, record = bundle.camera, bundle.record
+    sides = camera.height, camera.width
+    if not all(type(side) is int for side in sides):
+        raise ValueError(f"a camera of {sides} pixels")
+    if bundle.photograph.shape not in ((*sides, 3), (*sides, 4)) or bundle.photograph.dtype not in (
+        np.uint8,
+        np.float32,
+    ):
+        raise ValueError(f"a photograph {bundle.photograph.shape} of {bundle.photograph.dtype} for a camera of {sides}")
+    numbers = (camera.rotation, camera.translation, [camera.fx, camera.fy, camera.cx, camera.cy, camera.near])
+    if not all(np.isfinite(values).all() for values in numbers) or bundle.background.shape != (3,):
+        raise ValueError("a camera that is none")
+    rates = record["rates"]
+    if type(record["step"]) is not int or not np.isfinite([float(rates[group]) for group in GROUPS]).all():
+        raise ValueError("no step and no learning rates")
+    for arrays in bundle.models.values():
+        count, coefficients = len(arrays["means"]), arrays["sh_rest"].shape[1] + 1
+        for group, shape in group_shapes(count, coefficients).items():
+            if arrays[group].shape != shape or arrays[group].dtype != np.float32:
+                raise ValueError(f"{group} are {arrays[group].shape} of {arrays[group].dtype}, expected {shape}")
+    return bundle
 
 
 def replay(bundle: Bundle, device: Device) -> dict[str, int]:
@@ -175,8 +203,6 @@ def first_trouble(counts: dict[str, int]) -> str | None:
 
 def _upload(device: Device, arrays: dict[str, NDArray[np.float32]]) -> DeviceGaussians:
     count, coefficients = len(arrays["means"]), arrays["sh_rest"].shape[1] + 1
-    if any(arrays[group].shape != shape for group, shape in group_shapes(count, coefficients).items()):
-        raise InputError("the bundle's Gaussians have arrays that do not belong together")
     return DeviceGaussians(count, coefficients, {group: upload(device, arrays[group]) for group in GROUPS})
 
 

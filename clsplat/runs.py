@@ -226,20 +226,27 @@ def _digest(array: NDArray[Any]) -> str:
     return digest.hexdigest()
 
 
-def _read_checkpoint(path: Path) -> Checkpoint:
-    """Raises ValueError, InputError or what zipfile does where it is not as `save_checkpoint` makes it.
+def read_arrays(path: Path, expected: str) -> Arrays:
+    """The arrays of numbers of a file that np.savez has made, by name. `expected` as of `open_input`.
 
-    Not by np.load, which takes an array's size from its header, and unpacks what was packed.
+    Raises ValueError, InputError or what zipfile does where it is no such file. Not by np.load, which takes an array's
+    size from its header, and unpacks what was packed.
     """
     arrays: Arrays = {}
-    with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
+    with open_input(path, expected) as file, ZipFile(_Bounded(file)) as archive:
         left = os.fstat(file.fileno()).st_size
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
             left -= member.file_size
             if member.compress_type != ZIP_STORED or name == member.filename or name in arrays or left < 0:
-                raise ValueError(f"its member {member.filename[:80]!r} is none of a checkpoint's")
+                raise ValueError(f"its member {member.filename[:80]!r} is none of {expected}'s")
             arrays[name] = _array(archive.read(member), name)
+    return arrays
+
+
+def _read_checkpoint(path: Path) -> Checkpoint:
+    """Raises ValueError, InputError or what zipfile does where it is not as `save_checkpoint` makes it."""
+    arrays = read_arrays(path, "a checkpoint")
     record = parse_json(arrays.pop(STATE_KEY).tobytes())
     if not isinstance(record, dict) or type(step := record.get("step")) is not int or step < 0:
         raise ValueError("its state names no step")
@@ -247,10 +254,9 @@ def _read_checkpoint(path: Path) -> Checkpoint:
         raise ValueError("its state is none")
     digests = record.get("sha256")  # runs of earlier versions have none
     if digests is not None:
-        if not isinstance(digests, dict):
-            raise ValueError("its state has no digests")
-        if odd := arrays.keys() ^ digests.keys():
-            raise ValueError(f"{min(odd)[:80]!r} is not among the arrays it was written with, or is missing")
+        if not isinstance(digests, dict) or arrays.keys() != digests.keys():
+            other = ", ".join(sorted(arrays.keys() ^ set(digests)))[:200] if isinstance(digests, dict) else "no list"
+            raise ValueError(f"it has not the arrays it was written with ({other})")
         for name, array in arrays.items():
             if _digest(array) != digests[name]:
                 raise ValueError(f"{name} is not what was written: its sha256 differs")

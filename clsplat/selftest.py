@@ -19,7 +19,7 @@ from typing import Any
 from clsplat.device.context import Device, all_devices
 from clsplat.device.source import kernel_root
 from clsplat.selftest_bench import Bench, Outcome, digest_of
-from clsplat.selftest_result import BOUNDS, FORWARD, INDICES, MARK, STAGES, Result
+from clsplat.selftest_result import BOUNDS, INDICES, MARK, STAGES, Result
 from clsplat.selftest_scenes import scenes
 from clsplat.selftest_stages import RUN
 from clsplat.stages.blend import tile_items
@@ -32,7 +32,7 @@ BUILT_WITH: dict[str, dict[str, object]] = {
     "features": {**_FEATURES, "LANES": 1},
     "channels": _FEATURES,
     "deep": {"DEEP_SIZE": DEEP_FLOATS},
-    "project_rays": {"LANES": 1},
+    "project_rays": {"LANES": 1, "RAYS": 1},
 }
 """Of the kernels that are not built without."""
 
@@ -103,7 +103,7 @@ def _result(name: str, benches: list[Bench], outcomes: list[Outcome]) -> Result:
     )
 
 
-def _child(index: int, shape: tuple[int, int], *, quick: bool, forward: bool) -> None:
+def _child(index: int, shape: tuple[int, int], stages: Sequence[str], *, quick: bool) -> None:
     """Build and run on the `index`-th device; a line of JSON for what begins, another for what came of it."""
 
     def tell(**values: object) -> None:
@@ -111,7 +111,6 @@ def _child(index: int, shape: tuple[int, int], *, quick: bool, forward: bool) ->
 
     tell(begins="opening the device")
     device = Device(all_devices()[index]).with_shape(lanes=shape[0], items=shape[1])
-    stages = FORWARD if forward else STAGES
     if not quick:
         start = time.perf_counter()
         for path in sorted(kernel_root().glob("*.cl")):
@@ -124,5 +123,5 @@ def _child(index: int, shape: tuple[int, int], *, quick: bool, forward: bool) ->
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    _child(int(given[0]), (int(given[1]), int(given[2])), quick="quick" in given, forward="forward" in given)
+    which, lanes, items, names, *flags = sys.argv[1:]
+    _child(int(which), (int(lanes), int(items)), names.split(","), quick="quick" in flags)

@@ -12,10 +12,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
+from clsplat.reference import blend as reference_blend
 from clsplat.reference import project as reference_project
+from clsplat.reference.sort import depth_order
 from clsplat.selftest_scenes import Frozen
 from clsplat.stages.blend import Blended
 from clsplat.stages.duplicate import Band, Counted, Pairs
@@ -32,6 +34,9 @@ Array = NDArray[Any]
 Float64 = NDArray[np.float64]
 
 WHITEN = np.sqrt(0.5 * np.log2(np.e))
+MARGIN = 1e-4
+"""Pixels where alpha, or what is left of the light, is relatively nearer than this to a threshold are not compared:
+there a rounding decides. It is a hundred times what rounding moves them by."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,16 @@ def error_of(got: Array, wanted: Array) -> tuple[float, float]:
     return float(error.max()), float(ulp.max())
 
 
+def worst(parts: dict[str, tuple[Array, Array]]) -> dict[str, tuple[float, float]]:
+    """`error_of` what was got and what is wanted, by name."""
+    return {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
+
+
+def wrong_counts(**counts: int) -> str:
+    """In words, what is wrong; nothing where every count is 0."""
+    return ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in counts.items() if count)
+
+
 def digest_of(arrays: Sequence[Array]) -> str:
     """CRC-32 of the bytes one after the other."""
     total = 0
@@ -85,6 +100,7 @@ class Bench:
         self.pairs: Pairs
         self.lists: TileLists
         self.blended: Blended
+        self.features: DeviceArray
 
     def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, list[Array], float, str]:
         """The stage's value, its arrays on the host and ms, of a second run; trouble where that differs from the first,
@@ -126,3 +142,10 @@ class Bench:
             colors=np.stack([field["RED"], field["GREEN"], field["BLUE"]], axis=1),
             visible=visible,
         )
+
+    def blend_reference(self) -> reference_blend.Blended:
+        """The frame of the splats that the device made."""
+        splats = self.splats()
+        order = depth_order(splats.depths, splats.visible)
+        camera, background = self.camera, self.frozen.background.astype(np.float64)
+        return reference_blend.blend(splats, order, camera.width, camera.height, background, margins=True)

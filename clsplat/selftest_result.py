@@ -7,7 +7,16 @@ from dataclasses import dataclass
 
 FORWARD = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend")
 """What a frame needs."""
-STAGES = (*FORWARD, "loss", "blend_grad", "project_grad", "adam", "statistics")
+CHANNELS = ("features", "channels")
+"""What a frame with more than colour and alpha needs beside that."""
+DEEP = ("deep",)
+"""A frame in slices by depth."""
+RAYS = ("rays",)
+"""A frame of an equirectangular or a fisheye camera."""
+BACKWARD = ("loss", "blend_grad", "project_grad", "adam", "statistics")
+"""What training needs beside a frame."""
+TRAINING = (*FORWARD, *BACKWARD)
+STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *BACKWARD)
 INDICES = ("project", "duplicate", "sort", "ranges")
 """Those by whose counts and lists the next ones find their way."""
 
@@ -18,6 +27,10 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "sort": (0, "whole numbers"),
     "ranges": (0, "whole numbers"),
     "blend": (256, "11 found; 256 are 1.5e-5 of a colour of 0.5, under the 2e-5 that a frame may be off"),
+    "features": (64, "6 found; two divisions and a root one after the other"),
+    "channels": (256, "13 found, of normals that cancel; else as blend"),
+    "deep": (256, "27 found; as blend"),
+    "rays": (512, "47 found; directions and rays have several quotients and roots of 3 ulp, not 0.5"),
     "loss": (128, "9 found; the SSIM's quotients may have six times that"),
     "blend_grad": (1024, "32 found; up to 64 divisions one after the other recover the transmittance"),
     "project_grad": (512, "39 found, at opacities near 1; six times that for sloppy divisions"),

@@ -21,7 +21,8 @@ from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
 from clsplat.reference.tiles import touched_tiles
-from clsplat.selftest_bench import WHITEN, Array, Bench, Float64, Outcome, error_of
+from clsplat.selftest_bench import MARGIN, WHITEN, Array, Bench, Float64, Outcome, worst, wrong_counts
+from clsplat.selftest_pictures import PICTURES
 from clsplat.selftest_scenes import evenly, keys
 from clsplat.stages.adam import adam
 from clsplat.stages.blend import blend, blend_grad
@@ -41,15 +42,6 @@ from clsplat.stages.project import (
 )
 from clsplat.stages.ranges import tile_lists
 from clsplat.stages.sort import bitonic_sort, radix_sort
-
-
-def _worst(parts: dict[str, tuple[Array, Array]]) -> dict[str, tuple[float, float]]:
-    return {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
-
-
-def _wrong(**counts: int) -> str:
-    """In words, what is wrong; nothing where every count is 0."""
-    return ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in counts.items() if count)
 
 
 def _arithmetic(bench: Bench) -> Outcome:
@@ -95,7 +87,7 @@ def _project(bench: Bench) -> Outcome:
     wanted = reference_project.project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
     got, shown = bench.splats(), bench.visible & wanted.visible
     log2o = bench.projected.splats.get()[shown, SPLAT.index("LOG2O")]
-    errors = _worst(
+    errors = worst(
         {
             "mean": (got.means2d[shown], wanted.means2d[shown]),
             "whitening": (got.whitening[shown], wanted.whitening[shown]),
@@ -111,7 +103,7 @@ def _project(bench: Bench) -> Outcome:
         arrays,
         errors,
         ms,
-        trouble or _wrong(tile_counts=too_few + int((arrays[1] > _box_tiles(wanted, bench.tiles)).sum())),
+        trouble or wrong_counts(tile_counts=too_few + int((arrays[1] > _box_tiles(wanted, bench.tiles)).sum())),
     )
 
 
@@ -152,7 +144,7 @@ def _duplicate(bench: Bench) -> Outcome:
     touched = touched_tiles(got, bench.camera.width, bench.camera.height, TILE, threshold)
     listed = set(zip(owners.tolist(), tile_keys.tolist(), strict=True))
     missing = sum((gaussian, tile) not in listed for gaussian, tiles in enumerate(touched) for tile in tiles.tolist())
-    return Outcome(arrays, {}, ms, trouble or _wrong(pairs=wrong + missing))
+    return Outcome(arrays, {}, ms, trouble or wrong_counts(pairs=wrong + missing))
 
 
 def _sort(bench: Bench) -> Outcome:
@@ -175,7 +167,7 @@ def _sort(bench: Bench) -> Outcome:
     for values, got, positions in zip(given, arrays[::2], arrays[1::2], strict=True):
         order = np.argsort(values, kind="stable")
         wrong += int((got != values[order]).sum()) + int((positions != order).sum())
-    return Outcome(arrays, {}, ms, trouble or _wrong(sorted_keys=wrong))
+    return Outcome(arrays, {}, ms, trouble or wrong_counts(sorted_keys=wrong))
 
 
 def _ranges(bench: Bench) -> Outcome:
@@ -190,12 +182,7 @@ def _ranges(bench: Bench) -> Outcome:
     wanted = np.where((ends > begins)[:, None], np.stack([begins, ends], axis=1), 0)
     wrong = int((arrays[0] != wanted).sum())
     wrong += int((arrays[1] != ids[order, 1]).sum()) + int((arrays[2] != ids[order, 0]).sum())
-    return Outcome(arrays, {}, ms, trouble or _wrong(list_entries=wrong))
-
-
-MARGIN = 1e-4
-"""Pixels where alpha, or what is left of the light, is relatively nearer than this to a threshold are not compared:
-there a rounding decides. It is a hundred times what rounding moves them by."""
+    return Outcome(arrays, {}, ms, trouble or wrong_counts(list_entries=wrong))
 
 
 def _blend(bench: Bench) -> Outcome:
@@ -212,25 +199,18 @@ def _blend(bench: Bench) -> Outcome:
         ),
         lambda blended: [blended.image.get(), blended.transmittance.get(), blended.stops.get()],
     )
-    wanted = _blend_reference(bench)
+    wanted = bench.blend_reference()
     assert wanted.margin is not None
     clear = wanted.margin > MARGIN
     image = arrays[0][:, : camera.height, : camera.width].transpose(1, 2, 0)
     left = arrays[1][: camera.height, : camera.width]
-    errors = _worst(
+    errors = worst(
         {
             "image": (image[clear], wanted.image[clear]),
             "transmittance": (left[clear], wanted.transmittance[clear]),
         }
     )
     return Outcome(arrays, errors, ms, trouble)
-
-
-def _blend_reference(bench: Bench) -> reference_blend.Blended:
-    splats = bench.splats()
-    order = depth_order(splats.depths, splats.visible)
-    camera, background = bench.camera, bench.frozen.background.astype(np.float64)
-    return reference_blend.blend(splats, order, camera.width, camera.height, background, margins=True)
 
 
 def _loss(bench: Bench) -> Outcome:
@@ -244,7 +224,7 @@ def _loss(bench: Bench) -> Outcome:
     x, y = (_pixels(bench, planes) for planes in (image.get(), bench.frozen.photograph))
     value, gradient = reference_loss.l1_dssim(x, y)
     mean_square = np.square(x - y).mean()
-    errors = _worst(
+    errors = worst(
         {
             "gradient": (_pixels(bench, arrays[0]), gradient),
             "loss and error": (np.array(found.read()), np.array([value, mean_square])),
@@ -261,7 +241,7 @@ def _pixels(bench: Bench, planes: Array) -> Float64:
 
 def _blend_grad(bench: Bench) -> Outcome:
     device, camera, splats = bench.device, bench.camera, bench.splats()
-    margin = _blend_reference(bench).margin
+    margin = bench.blend_reference().margin
     assert margin is not None
     planes = bench.frozen.image_gradient()
     exact = planes.copy()
@@ -279,7 +259,7 @@ def _blend_grad(bench: Bench) -> Outcome:
     wanted = reference_blend.blend_grad(splats, order, camera.width, camera.height, background, _pixels(bench, exact))
     shown = splats.visible
     moments = _moments(splats, wanted)
-    errors = _worst(
+    errors = worst(
         {
             "sum of g": (got[shown, :1], moments[shown, :1]),
             "first moments": (got[shown, 1:3], moments[shown, 1:3]),
@@ -361,7 +341,7 @@ def _project_grad(bench: Bench) -> Outcome:
     parts = {name: (got[visible], wanted[name][visible]) for name, got in zip(names, arrays[:4], strict=True)}
     parts["SH"] = (np.concatenate([arrays[4][:, None], arrays[5]], axis=1)[visible], wanted["sh"][visible])
     parts["means on the image"] = (arrays[6], d_means[visible])
-    return Outcome(arrays, _worst(parts), ms, trouble)
+    return Outcome(arrays, worst(parts), ms, trouble)
 
 
 _RATES = {name: 2.0**-power for power, name in enumerate(GROUPS, 3)}
@@ -412,7 +392,7 @@ def _adam(bench: Bench) -> Outcome:
             ):
                 parts[f"{name} of {group}"] = (a[rows], b[rows])
                 kept += int((a[~rows] != before[~rows]).sum())
-        outcomes.append(Outcome(arrays, _worst(parts), ms, trouble or _wrong(hidden_rows=kept)))
+        outcomes.append(Outcome(arrays, worst(parts), ms, trouble or wrong_counts(hidden_rows=kept)))
     first, second = outcomes
     errors = {name: max(first.errors[name], second.errors[name]) for name in first.errors}
     return Outcome([*first.arrays, *second.arrays], errors, first.ms, first.trouble or second.trouble)
@@ -438,7 +418,7 @@ def _statistics(bench: Bench) -> Outcome:
     wrong = int((got["seen"] != 2 * visible).sum()) + int((got["agreeing"] != 2 * (norms >= 1.0))[~near].sum())
     wrong += int((np.abs(got["radii"] - radii) > 1).sum()) + int((got["radii"] != radii).sum() > 1 + n // 100)
     return Outcome(
-        arrays, _worst({"gradient sums": (got["gradient_sums"], 2 * norms)}), ms, trouble or _wrong(counts=wrong)
+        arrays, worst({"gradient sums": (got["gradient_sums"], 2 * norms)}), ms, trouble or wrong_counts(counts=wrong)
     )
 
 
@@ -449,6 +429,7 @@ RUN: dict[str, Callable[[Bench], Outcome]] = {
     "sort": _sort,
     "ranges": _ranges,
     "blend": _blend,
+    **PICTURES,
     "loss": _loss,
     "blend_grad": _blend_grad,
     "project_grad": _project_grad,

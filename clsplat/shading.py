@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.errors import InputError
-from clsplat.framing import Layers, framed
+from clsplat.framing import COLOUR, Layers, framed
 from clsplat.layers import VIDEO, Encoding, Header, camera_matrices
 from clsplat.picture_config import DeepConfig, PictureConfig
 from clsplat.sampling import shutter_middle
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.shutter import Stretch
 
+_FLAT = ("perspective", "orthographic")
+"""Projections with an image plane; others have kernels of their own."""
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
 
@@ -116,6 +118,7 @@ class FrameShader:
 
         self.options = options
         self._renderer, self._gaussians = renderer, gaussians
+        self._rays_tested = False
         self._pictures = Pictures(
             renderer, gaussians, options.pictures, background=options.background, recorded=options.recorded
         )
@@ -132,6 +135,7 @@ class FrameShader:
 
     def __call__(self, task: Task) -> Shaded:
         """The frame. Raises ClsplatError where it cannot be rendered, or, if it is written here, not be written."""
+        self._trust(task.camera)
         start, options, pictures = time.monotonic(), self.options, self._pictures
         if options.deep is None and not self._in_strips(task):
             layers, finish = pictures.unfinished(task.at, options.channels, camera_after(task, options))
@@ -146,6 +150,16 @@ class FrameShader:
             model, camera = (self._renderer, self._gaussians), picture_camera(task, options)
             write_deep(task.path, *model, camera, options.deep, encoding, head, pictures.colours)
         return Shaded(None, time.monotonic() - start)
+
+    def _trust(self, camera: Camera) -> None:
+        """Self-test what panoramas and fisheyes need before the first of them."""
+        if camera.projection in _FLAT or self._rays_tested:
+            return
+        from clsplat.selftest_result import RAYS
+        from clsplat.trust import require
+
+        require(self._renderer.device, RAYS)
+        self._rays_tested = True
 
     def _in_strips(self, task: Task) -> bool:
         camera = picture_camera(task, self.options)
@@ -167,10 +181,12 @@ def open_shader(
     """
     from clsplat.device.context import open_device
     from clsplat.rendering import Renderer
+    from clsplat.selftest_result import CHANNELS, DEEP, FORWARD
     from clsplat.trust import require
 
     opened: Any = _profiled(device, memory_limit) if profile else open_device(device, memory_limit)
-    require(opened, forward=True)
+    beside = DEEP if options.deep is not None else CHANNELS if set(options.channels) - set(COLOUR) else ()
+    require(opened, (*FORWARD, *beside))
     shader = FrameShader(Renderer(opened, config=rasterizer), gaussians, options)
     return _Recorded(shader, opened) if profile else shader
 

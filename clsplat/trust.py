@@ -16,6 +16,7 @@ import sys
 import threading
 import warnings
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -26,7 +27,7 @@ from clsplat.device.shapes import Shape, saved_path, shape_of
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import DeviceError
 from clsplat.files import atomic_write
-from clsplat.selftest_result import FORWARD, MARK, STAGES, Result
+from clsplat.selftest_result import FORWARD, MARK, STAGES, TRAINING, Result
 
 PATIENCE = 300.0
 """Seconds without a word after which a driver counts as hung: the slowest that works builds a kernel in 60."""
@@ -75,20 +76,20 @@ class Report:
         )
 
 
-def command(index: int, shape: Shape, *, quick: bool, forward: bool) -> list[str]:
+def command(index: int, shape: Shape, stages: Sequence[str], *, quick: bool) -> list[str]:
     """The child."""
-    flags = [name for name, on in (("quick", quick), ("forward", forward)) if on]
-    return [sys.executable, "-m", "clsplat.selftest", str(index), str(shape.lanes), str(shape.items), *flags]
+    words = [str(index), str(shape.lanes), str(shape.items), ",".join(stages), *(["quick"] if quick else [])]
+    return [sys.executable, "-m", "clsplat.selftest", *words]
 
 
 def examine(
-    index: int, shape: Shape, *, quick: bool = False, forward: bool = False, patience: float = PATIENCE
+    index: int, shape: Shape, stages: Sequence[str] = STAGES, *, quick: bool = False, patience: float = PATIENCE
 ) -> Report:
-    """Test the `index`-th device in a process of its own."""
-    report = Report(wanted=FORWARD if forward else STAGES)
+    """Test the `index`-th device in a process of its own; stages: in the order of STAGES, FORWARD among them."""
+    report = Report(wanted=tuple(stages))
     environment = {**os.environ, "PYTHONPATH": _with_this_package()}
     with subprocess.Popen(
-        command(index, shape, quick=quick, forward=forward),
+        command(index, shape, stages, quick=quick),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -177,21 +178,23 @@ def _key(device: Any, shape: Shape) -> str:
     return f"{device.name.strip()} | {driver} | {shape.lanes}x{shape.items} | clsplat {__version__} {kernels:08x}"
 
 
-def require(device: Device, *, forward: bool = False) -> None:
+def require(device: Device, stages: Sequence[str] = TRAINING) -> None:
     """Test a device that is met for the first time, in about a second beside the building of its kernels, and remember
     that it passed; nothing if it is remembered, or if CLSPLAT_TRUST_DRIVER=1.
 
-    forward: what a frame needs is enough. Raises DeviceError where the driver cannot be trusted.
+    stages: what will be used, of STAGES; what a frame needs is tested with it. Raises DeviceError where the driver
+    cannot be trusted.
     """
     if os.environ.get(REGARDLESS, "") not in ("", "0"):
         return
-    key, wanted = _key(device.cl_device, device.shape), FORWARD if forward else STAGES
-    remembered = _remembered()
-    if set(wanted) <= set(remembered.get(key, ())):
+    key, remembered = _key(device.cl_device, device.shape), _remembered()
+    known = set(remembered.get(key, ()))
+    if set(stages) <= known:
         return
+    wanted = [name for name in STAGES if name in FORWARD or name in stages]
     name = f"{device.name}, {device.driver.split('  ')[0].strip()}"
     print(f"{name}: used for the first time, a short test of its driver", file=sys.stderr)
-    report = examine(all_devices().index(device.cl_device), device.shape, quick=True, forward=forward)
+    report = examine(all_devices().index(device.cl_device), device.shape, wanted, quick=True)
     if report.failure:
         raise DeviceError(
             f"{name}: the driver {report.verdict}; clsplat selftest tells more, --device takes another device, "
@@ -199,7 +202,7 @@ def require(device: Device, *, forward: bool = False) -> None:
         )
     if report.other_bits:
         warnings.warn(f"{name}: {report.verdict}", stacklevel=2)
-    remembered[key] = list(wanted)
+    remembered[key] = [name for name in STAGES if name in known or name in wanted]
     try:
         memory_path().parent.mkdir(parents=True, exist_ok=True)
         atomic_write(memory_path(), (json.dumps(remembered, indent=2, sort_keys=True) + "\n").encode())

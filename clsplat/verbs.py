@@ -192,6 +192,7 @@ def evaluate(verb: Eval) -> int:
     from clsplat.metrics import lpips_missing
     from clsplat.rendering import Renderer
     from clsplat.runs import Run, is_run, model_file
+    from clsplat.selftest_result import FORWARD
     from clsplat.trust import require
 
     limit = parse_bytes(verb.max_device_mem)
@@ -209,7 +210,7 @@ def evaluate(verb: Eval) -> int:
     views = [view for view in scene.views if view.split == "test"]
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {test_every}")
-    require(device, forward=True)
+    require(device, FORWARD)
     renderer = Renderer(device, config=config.rasterizer)
 
     background = background_colour(verb.background or config.background)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames and gradients of a few tiny scenes, and a trained model: checksums for `golden/frames.json`, and all of it for
-`tools/digests.py`."""
+"""Frames and gradients of a few tiny scenes, pictures with every channel, and a trained model: checksums for
+`golden/frames.json`, and all of it for `tools/digests.py`."""
 
 from __future__ import annotations
 
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.rendering import Renderer
 from clsplat.scene import load_scene
+from clsplat.shading import RenderOptions, Task, shade
 from clsplat.training import train
 
 Array = NDArray[np.float32]
@@ -54,6 +56,27 @@ def _of(run: Pipeline) -> dict[str, list[Array]]:
         "gradients": [getattr(gradients, name) for name in names],
         "screen": [screen[run.visible]],
     }
+
+
+CHANNELS = ("rgb", "alpha", "depth", "median", "first", "normals", "position", "motion", "count", "id", "deep")
+"""All that a picture can be written with (`clsplat.layers`), and its slices by depth."""
+BOUNDS = np.array([2.0, 3.5, 6.0], np.float32)
+
+
+def pictures_of(device: Device) -> dict[str, dict[str, str]]:
+    """Checksums by kind of camera and channel, in the device's own shape; motion is defined for a pinhole alone."""
+    gaussians, camera = SCENES["cloud"]()
+    found = {}
+    for kind in ("perspective", "equirectangular", "fisheye"):
+        focal = {"equirectangular": camera.width / (2 * np.pi), "fisheye": 0.3 * camera.width}.get(kind)
+        view = camera if focal is None else replace(camera, fx=focal, fy=focal, projection=kind)  # type: ignore[arg-type]
+        after = replace(view, translation=view.translation + np.array([-0.0625, 0.03125, 0.125]))
+        wanted = [name for name in CHANNELS[:-1] if kind == "perspective" or name != "motion"]
+        renderer = Renderer(device)
+        layers = shade(renderer, gaussians, Task(1, "1", view, Path(), after), RenderOptions(channels=tuple(wanted)))
+        layers["deep"] = renderer.render_deep(gaussians, view, BOUNDS)
+        found[kind] = {name: checksum([np.ascontiguousarray(values)]) for name, values in layers.items()}
+    return found
 
 
 def checksum(parts: list[Array]) -> str:

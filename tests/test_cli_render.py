@@ -129,7 +129,7 @@ def test_cameras_that_cannot_be_rendered(model: str, pipeline: Pipeline, tmp_pat
         ({}, [*out, "--frames", "20-30"], "--frames 20-30: holds none of the frames to render"),
         ({}, [*out, "--frames", "9-3"], "--frames 9-3: the range '9-3' is empty"),
         ({}, [*out, "--count", "3"], "--count 3: expected --path with it"),
-        ({}, [*out, "--path", "turntable", "--count", "0"], "--count 0: expected 1 to 1,000,000 frames"),
+        ({}, [*out, "--path", "turntable", "--count", "0"], "--count 0: expected 1 to 100,000 frames"),
         ({}, [*out, "--usd-camera", "c"], "is no USD stage"),
         ({}, ["-o", str(tmp_path / "shot" / "a.exr")], "or a frame number such as ####"),
         ({}, ["-o", str(tmp_path / "shot" / "{nam}.exr")], "{nam} is not known, expected {name}, {frame}, #### or"),

@@ -15,14 +15,16 @@ from golden_frames import SCENES, arrays_of
 from pipeline import shaped
 
 from clsplat.device.context import Device
+from clsplat.layers import LAYERS
 
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))
 import digests  # noqa: E402
 from digests import EXPECTED, Row, problems  # noqa: E402
 
-GOOD = Row("A", "8x1", "f", "g8", "m8", True, 20.0, 100)
-ROWS = [GOOD, replace(GOOD, driver="B"), Row("A", "1x64", "f", "g1", "m1", True, 20.1, 101, 5e-7)]
+PICTURES = {"perspective": {"rgb": "c", "motion": "v"}, "fisheye": {"rgb": "d"}}
+GOOD = Row("A", "8x1", "f", "g8", "m8", True, 20.0, 100, pictures=PICTURES)
+ROWS = [GOOD, replace(GOOD, driver="B"), Row("A", "1x64", "f", "g1", "m1", True, 20.1, 101, 5e-7, pictures=PICTURES)]
 
 
 def test_no_problem() -> None:
@@ -34,6 +36,12 @@ def test_no_problem() -> None:
     [
         (1, {"frame": "x"}, "B, 8x1: the frame is x, on A, 8x1 it is f"),
         (2, {"frame": "x"}, "A, 1x64: the frame is x"),
+        (
+            2,
+            {"pictures": {"perspective": PICTURES["perspective"], "fisheye": {"rgb": "x"}}},
+            "A, 1x64: rgb of the fisheye camera is x, on A, 8x1 it is d",
+        ),
+        (1, {"pictures": {}}, "B, 8x1: rgb of the perspective camera is missing"),
         (1, {"gradient": "x"}, "B, 8x1: the gradient is x, on A in that shape it is g8"),
         (2, {"difference": 2e-6}, "A, 1x64: the gradient is 2.0e-06 from that of 8x1"),
         (2, {"difference": float("nan")}, "A, 1x64: the gradient is nan"),
@@ -63,14 +71,23 @@ def test_nothing_run() -> None:
 def test_tables_have_every_driver() -> None:
     rows = [*ROWS, Row(*next(iter(EXPECTED)), trouble="known")]
     assert len(digests.table(rows).splitlines()) == 2 + len(rows)
-    assert "| 8x1 | A; B | `f` | `g8` | `m8`, 20.000 dB |" in digests.summary(rows).splitlines()
+    lines = digests.summary(rows).splitlines()
+    assert f"| 8x1 | A; B | `f` | `{GOOD.channels}` | `g8` | `m8`, 20.000 dB |" in lines
+    assert lines[-2:] == ["| perspective | `c` | `v` |", "| fisheye | `d` | not defined |"]
 
 
 def test_a_child(tmp_path: Path) -> None:
     command = [sys.executable, str(TOOLS / "digests.py"), "child", "0", "8x1", str(tmp_path / "arrays.npz")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     told = json.loads(done.stdout.splitlines()[-1])
-    assert set(told) == {"frame", "gradient"}
+    assert set(told) == {"frame", "gradient", "pictures"}
+    motion = {"motion"}
+    channels = {"deep", *LAYERS}
+    assert {kind: set(each) for kind, each in told["pictures"].items()} == {
+        "perspective": channels,
+        "equirectangular": channels - motion,
+        "fisheye": channels - motion,
+    }
     assert (tmp_path / "arrays.npz").exists()
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from clsplat.device.shapes import shape_of
 from clsplat.errors import DeviceError, InputError
 from clsplat.selftest import run
 from clsplat.selftest_bench import error_of
-from clsplat.selftest_result import BOUNDS, STAGES, Result
+from clsplat.selftest_result import BOUNDS, CHANNELS, FORWARD, STAGES, TRAINING, Result
 from clsplat.selftest_scenes import keys, scenes
 from clsplat.trust import Report, examine
 
@@ -40,6 +41,18 @@ BROKEN = {
     "loss: 2.0f * (mu1 * mu2) + C1": ("2.0f * (mu1 * mu2) - C1", "loss"),
     "blend_grad: fmaL(weight, shade, behind[k])": ("fmaL(weight, shade, -behind[k])", "blend_grad"),
     "project_grad: sums[field] += slot[field]": ("sums[field] -= slot[field]", "project_grad"),
+    "features: 2.0f * fma1(v[axis], v[next], w * v[last])": ("2.0f * fma1(v[axis], v[next], -w * v[last])", "features"),
+    "features: (rest - splat[SPLAT_SUB_X])": ("(rest + splat[SPLAT_SUB_X])", "features"),
+    "channels: sums[field][k] / by": ("sums[field][k] * by", "channels"),
+    "channels: weight > largest[k]": ("weight < largest[k]", "channels"),
+    "channels: MASKL(t[k] <= 0.5f)": ("MASKL(t[k] <= 0.25f)", "channels"),
+    "channels: MASKL(count[k] == 0)": ("MASKL(count[k] == 1)", "channels"),
+    "deep: depth >= bounds[bin]": ("depth < bounds[bin]", "deep"),
+    "deep: before * alpha": ("before + alpha", "deep"),
+    "deep: 1.0f - value": ("value", "deep"),
+    "project_rays: l22 * t.e2[0]": ("l11 * t.e2[0]", "rays"),
+    "project_rays: latitude - cap": ("latitude + cap", "rays"),
+    "project_rays: -(s * around) / fx": ("(s * around) / fx", "rays"),
     "adam: (1.0f - beta2) * (g * g)": ("(1.0f - beta2) * g", "adam"),
     "density: fma1(gx, gx, gy * gy)": ("fma1(gx, gx, gx * gy)", "statistics"),
 }
@@ -93,6 +106,9 @@ SLOPPY = {
     "arithmetic: sqrt(y)": "(sqrt(y) * 1.00000012f)",
     "project: sqrt(p.syy / p.det)": "(sqrt(p.syy / p.det) * 1.0000003f)",
     "project: dx / length": "dx / length * 0.9999998f",
+    "features: q[0] / length": "q[0] / length * 1.0000002f",
+    "channels: sums[field][k] / by": "sums[field][k] / by * 0.9999998f",
+    "project_rays: sqrt(syy / det)": "(sqrt(syy / det) * 1.0000003f)",
     "blend_grad: 1.0f / (1.0f - alpha)": "1.0f / (1.0f - alpha) * 1.00000024f",
     "loss: 1.0f / (c * d)": "1.0f / (c * d) * 0.9999998f",
     "adam: sqrt(*v)": "sqrt(*v) * 1.0000003f",
@@ -230,14 +246,14 @@ def untrusting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return trust.memory_path()
 
 
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """Whether a frame was enough, of each test that is made."""
-    made: list[bool] = []
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
+    """The stages of each test that is made."""
+    made: list[tuple[str, ...]] = []
     real = trust.examine
 
-    def counting(index: int, shape: Any, *, quick: bool, forward: bool) -> Report:
-        made.append(forward)
-        return real(index, shape, quick=quick, forward=forward)
+    def counting(index: int, shape: Any, stages: Sequence[str], *, quick: bool) -> Report:
+        made.append(tuple(stages))
+        return real(index, shape, stages, quick=quick)
 
     monkeypatch.setattr(trust, "examine", counting)
     return made
@@ -245,15 +261,19 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
 
 def test_it_is_tested_once(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     made = counted(monkeypatch)
-    for forward in (True, True, False, False, True):
-        trust.require(default_device, forward=forward)
-    assert made == [True, False], "first a frame, later training, nothing again"
-    assert list(json.loads(untrusting.read_text()).values()) == [list(STAGES)]
+    for stages in (FORWARD, FORWARD, TRAINING, TRAINING, FORWARD):
+        trust.require(default_device, stages)
+    assert made == [FORWARD, TRAINING], "first a frame, later training, nothing again"
+    for stages in (CHANNELS, TRAINING, (*FORWARD, *CHANNELS)):
+        trust.require(default_device, stages)
+    assert made[2:] == [(*FORWARD, *CHANNELS)], "what is not remembered yet, and what it stands on"
+    remembered = [name for name in STAGES if name in (*TRAINING, *CHANNELS)]
+    assert list(json.loads(untrusting.read_text()).values()) == [remembered]
     trust.require(shaped(default_device, 4, 1))
-    assert made == [True, False, False], "another shape has other kernels"
+    assert made[3:] == [TRAINING], "another shape has other kernels"
     monkeypatch.setattr("clsplat.__version__", "0.0.0")
-    trust.require(default_device, forward=True)
-    assert made[3:] == [True], "so has another version"
+    trust.require(default_device, FORWARD)
+    assert made[4:] == [FORWARD], "so has another version"
 
 
 def test_a_failure_is_an_error_and_not_remembered(
@@ -261,13 +281,13 @@ def test_a_failure_is_an_error_and_not_remembered(
 ) -> None:
     monkeypatch.setenv(BREAK, "blend: before * alpha => before + alpha")
     with pytest.raises(DeviceError, match=r"cannot be trusted: blend: image is off by .* clsplat selftest tells more"):
-        trust.require(default_device, forward=True)
+        trust.require(default_device, FORWARD)
     assert not untrusting.exists()
     monkeypatch.setenv(trust.REGARDLESS, "1")
-    trust.require(default_device, forward=True)
+    trust.require(default_device, FORWARD)
     monkeypatch.delenv(BREAK)
     monkeypatch.setenv(trust.REGARDLESS, "0")
-    trust.require(default_device, forward=True)
+    trust.require(default_device, FORWARD)
     assert untrusting.exists()
 
 
@@ -277,18 +297,18 @@ def test_a_memory_that_is_broken_or_read_only(
     made = counted(monkeypatch)
     untrusting.parent.mkdir(parents=True)
     untrusting.write_text("[]")
-    trust.require(default_device, forward=True)
+    trust.require(default_device, FORWARD)
     assert len(made) == 1
     assert len(json.loads(untrusting.read_text())) == 1
     monkeypatch.setenv("XDG_CACHE_HOME", str(untrusting))  # a file, where a folder would have to be
     with pytest.warns(UserWarning, match="cannot be written"):
-        trust.require(default_device, forward=True)
+        trust.require(default_device, FORWARD)
 
 
 def test_other_bits_are_a_warning(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BREAK, "arithmetic: x / y => (x / y) * 1.00000012f")
     with pytest.warns(UserWarning, match=r"its bits are not those of other devices in arithmetic: .* division"):
-        trust.require(default_device, forward=True)
+        trust.require(default_device, FORWARD)
     assert untrusting.exists()
 
 
@@ -315,7 +335,7 @@ def test_training_and_rendering_ask_for_it(
 
 
 def test_asking_again_takes_no_time(untrusting: Path, default_device: Device) -> None:
-    trust.require(default_device, forward=True)
+    trust.require(default_device, FORWARD)
     start = time.perf_counter()
-    trust.require(default_device, forward=True)
+    trust.require(default_device, FORWARD)
     assert time.perf_counter() - start < 0.1, "a file of a few lines is read, and the kernels' texts are hashed"

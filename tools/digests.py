@@ -1,15 +1,16 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Table of drivers and kernel shapes: digests of frames, gradients and a trained model, or how far they differ.
+"""Table of drivers and kernel shapes: digests of frames, of pictures with every channel by every kind of camera, of
+gradients and of a trained model, or how far they differ.
 
     .venv/bin/python tools/digests.py [--markdown]
 
---markdown prints what README.md has: drivers with the same digests in one row.
+--markdown prints what README.md has: drivers with the same digests in one row, and each channel's own digest.
 
 Every driver that is found is run in every shape, each in a process of its own, PoCL also with its other ways to make
 work-groups, and Rusticl where CLSPLAT_RUSTICL names its libRusticlOpenCL.so. Exit status 1 where
 
-- a frame has other bits anywhere,
+- a frame or a channel of a picture has other bits anywhere,
 - gradients differ within a shape, or between shapes by more than GRADIENT_BOUND,
 - two trainings on one driver differ in a bit, or those of two drivers in one shape,
 - trainings in two shapes differ by more than PSNR_BOUND,
@@ -24,8 +25,9 @@ import subprocess
 import sys
 import tempfile
 import time
+import zlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +61,9 @@ PSNR_BOUND = 0.2
 
 @dataclass
 class Row:
-    """One driver in one shape: digests of frame, gradient and model (None: not trained); whether a second training gave
-    the same bytes; PSNR on the held-out views; how far the gradient is from the first row's, relative in norm; trouble
-    in words."""
+    """One driver in one shape: digests of frame, gradient and model (None: not trained); of pictures by kind of camera
+    and channel; whether a second training gave the same bytes; PSNR on the held-out views; how far the gradient is from
+    the first row's, relative in norm; trouble in words."""
 
     driver: str
     shape: str
@@ -74,6 +76,12 @@ class Row:
     difference: float = 0.0
     trouble: str = ""
     seconds: float = 0.0
+    pictures: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    @property
+    def channels(self) -> str:
+        """Of all pictures' digests."""
+        return f"{zlib.crc32(json.dumps(self.pictures, sort_keys=True).encode()):08x}"
 
 
 @dataclass(frozen=True)
@@ -200,7 +208,7 @@ def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
 
     scene: to train on, if any; "open" for a device that is only to be opened, which builds a kernel.
     """
-    from golden_frames import arrays_of, checksum, trained
+    from golden_frames import arrays_of, checksum, pictures_of, trained
 
     from clsplat.device.context import Device, all_devices
 
@@ -217,6 +225,7 @@ def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
     np.savez(arrays, **gradient)  # type: ignore[arg-type]
     unsigned = [part + np.float32(0) for part in gradient.values()]  # a sum that is zero may be so with either sign
     told: dict[str, Any] = {"frame": checksum(frame), "gradient": checksum(unsigned)}
+    told["pictures"] = pictures_of(device)
     if scene is not None:
         models = [trained(device, scene) for _ in range(2)]
         names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
@@ -251,6 +260,7 @@ def problems(rows: list[Row]) -> list[str]:
         at = f"{row.driver}, {row.shape}"
         if row.frame != first.frame:
             found.append(f"{at}: the frame is {row.frame}, on {first.driver}, {first.shape} it is {first.frame}")
+        found += other_channels(row, first)
         other = by_shape.setdefault(row.shape, row)
         if row.gradient != other.gradient:
             found.append(
@@ -273,17 +283,30 @@ def problems(rows: list[Row]) -> list[str]:
     return found
 
 
+def other_channels(row: Row, first: Row) -> list[str]:
+    """Channels of which a row has other bits than the first row."""
+    found = []
+    for kind, wanted in first.pictures.items():
+        for name, digest in wanted.items():
+            got = row.pictures.get(kind, {}).get(name, "missing")
+            if got != digest:
+                where = f"{row.driver}, {row.shape}: {name} of the {kind} camera"
+                found.append(f"{where} is {got}, on {first.driver}, {first.shape} it is {digest}")
+    return found
+
+
 def table(rows: list[Row]) -> str:
     """In Markdown, which a terminal can show as well."""
-    lines = ["| driver | shape | frame | gradient | trained model |", "|---|---|---|---|---|"]
+    lines = ["| driver | shape | frame | all channels | gradient | trained model |", "|---|---|---|---|---|---|"]
     first = next((row for row in rows if not row.trouble), None)
     for row in rows:
         if row.trouble:
             reason = EXPECTED.get((row.driver, row.shape), row.trouble)
-            lines.append(f"| {row.driver} | {row.shape} | not run: {reason} | | |")
+            lines.append(f"| {row.driver} | {row.shape} | not run: {reason} | | | |")
             continue
         assert first is not None
         frame = row.frame if row is first else _same(row.frame, first.frame)
+        channels = row.channels if row is first else _same(row.channels, first.channels)
         gradient = f"{row.gradient}" + (
             "" if row is first else f", {_apart(row.gradient, first.gradient, row.difference)}"
         )
@@ -292,7 +315,7 @@ def table(rows: list[Row]) -> str:
             apart = "identical" if row.model == first.model else f"{row.psnr - first.psnr:+.3f} dB"
             base = f"{row.psnr:.2f} dB, {row.gaussians} Gaussians"
             model = f"{row.model}, {base if row is first else apart}"
-        lines.append(f"| {row.driver} | {row.shape} | {frame} | {gradient} | {model} |")
+        lines.append(f"| {row.driver} | {row.shape} | {frame} | {channels} | {gradient} | {model} |")
     return "\n".join(lines)
 
 
@@ -303,18 +326,29 @@ def summary(rows: list[Row]) -> str:
     for row in rows:
         if row.trouble:
             reason = EXPECTED.get((row.driver, row.shape), row.trouble)
-            cells: tuple[str, ...] = (row.shape, f"not run: {reason}", "", "")
+            cells: tuple[str, ...] = (row.shape, f"not run: {reason}", "", "", "")
         else:
             apart = "" if row.gradient == first.gradient else f", {row.difference:.0e} off"
             model = "not trained"
             if row.model is not None:
                 model = f"`{row.model}`, {row.psnr:.3f} dB"
-            cells = (row.shape, f"`{row.frame}`", f"`{row.gradient}`{apart}", model)
+            cells = (row.shape, f"`{row.frame}`", f"`{row.channels}`", f"`{row.gradient}`{apart}", model)
         drivers.setdefault(cells, []).append(row.driver)
-    lines = ["| shape | drivers | frame | gradient | trained model |", "|---|---|---|---|---|"]
+    header = ("shape", "drivers", "frame", "all channels", "gradient", "trained model")
+    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
     for (shape, *cells_of), names in sorted(drivers.items(), key=lambda pair: SHAPES.index(pair[0][0])):
         lines.append(f"| {shape} | {'; '.join(names)} | {' | '.join(cells_of)} |")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", *channel_table(first)])
+
+
+def channel_table(row: Row) -> list[str]:
+    """Every channel's digest by kind of camera."""
+    names = list(next(iter(row.pictures.values()), {}))
+    lines = [f"| camera | {' | '.join(names)} |", "|---" * (1 + len(names)) + "|"]
+    for kind, digests in row.pictures.items():
+        cells = (f"`{digests[name]}`" if name in digests else "not defined" for name in names)
+        lines.append(f"| {kind} | {' | '.join(cells)} |")
+    return lines
 
 
 def _same(digest: str, wanted: str) -> str:

@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 from spoilers import MOST_BYTES, SPOILERS, spoil_place
 
-from clsplat import colmap, ply, runs, sfm, sfm_photos, transforms
+from clsplat import colmap, ply, replay, runs, sfm, sfm_photos, transforms
 from clsplat.config import TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.images import image_size, read_image, write_image
+from clsplat.paths.read import choose_shot
 from clsplat.scene import load_scene
+from clsplat.stages.project import group_shapes
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,47 @@ def make_blender(folder: Path) -> None:
         (folder / f"transforms_{split}.json").write_text(json.dumps(listed))
 
 
+def make_camera_keys(folder: Path) -> None:
+    """A clsplat camera file of three keys, with all that a key can have."""
+    turn = [0.70710678, -0.70710678, 0, 0]
+    document = {
+        "clsplat_cameras": 1,
+        "width": 32,
+        "height": 18,
+        "fps": 24,
+        "first_frame": 1001,
+        "near": 0.01,
+        "far": 100,
+        "keys": [
+            {"frame": 1001, "position": [0, -4, 1], "world_from_cam": turn, "fov_x": 40},
+            {"frame": 1009, "position": [2, -4, 1], "world_from_cam": turn, "fov_x": 55, "roll": 5},
+            {
+                "seconds": 0.5,
+                "position": [3, -3, 1],
+                "world_from_cam": [0.65, -0.65, 0.27, -0.27],
+                "fx": 30,
+                "shift": [0.05, 0],
+            },
+        ],
+    }
+    (folder / "cameras.json").write_text(json.dumps(document, indent=1))
+
+
+def make_camera_path(folder: Path) -> None:
+    """nerfstudio's camera_path.json, four frames."""
+    poses = [[1, 0, 0, 0.1 * i, 0, 1, 0, 0.2, 0, 0, 1, 2.0 + i, 0, 0, 0, 1] for i in range(4)]
+    document = {
+        "camera_type": "perspective",
+        "render_width": 32,
+        "render_height": 18,
+        "fps": 24,
+        "seconds": 4,
+        "keyframes": [],
+        "camera_path": [{"camera_to_world": pose, "fov": 50, "aspect": 1.7} for pose in poses],
+    }
+    (folder / "camera_path.json").write_text(json.dumps(document, indent=1))
+
+
 FORMATS = ("png", "jpg", "exr", "tif", "bmp", "hdr", "tga", "ppm", "webp")
 
 
@@ -183,6 +226,31 @@ def make_run(folder: Path) -> None:
         run.save_checkpoint(step, arrays, state)
     run.write_eval({"step": 2, "psnr": 20.0})
     (folder / "run" / "model.ply").write_bytes(b"ply\n")
+
+
+def make_bundle(folder: Path) -> None:
+    """What a training leaves that gives up, of five Gaussians."""
+    shapes = group_shapes(5, 4)
+    arrays = {
+        f"{kind}/{g}": np.ones(shapes[g], np.float32) for kind in ("parameters", "first", "second") for g in shapes
+    }
+    record = {
+        "step": 7,
+        "stage": "adam",
+        "rates": dict.fromkeys(shapes, 0.001),
+        "camera": {"width": 12, "height": 9, "fx": 11.5, "fy": 11.0, "cx": 6.0, "cy": 4.5, "near": 0.01},
+        "settings": runs.config_text(TrainConfig(), None),
+    }
+    np.savez(
+        folder / "trouble-step-0000007.npz",
+        allow_pickle=False,
+        **{replay.RECORD: np.frombuffer(json.dumps(record).encode(), np.uint8)},
+        photograph=np.zeros((9, 12, 3), np.uint8),
+        background=np.zeros(3, np.float32),
+        rotation=np.eye(3),
+        translation=np.zeros(3),
+        **arrays,
+    )
 
 
 def make_photos(folder: Path) -> None:
@@ -212,6 +280,20 @@ def read_scene(folder: Path) -> None:
         view.load()
         inside(folder, view.path)
     _ = scene.extent
+
+
+def read_cameras(folder: Path, name: str) -> None:
+    """The frames that `clsplat render --cameras` would make of a file, and a path around them."""
+    path = folder / name
+    shot = choose_shot(path, size=(32, 18))
+    if all(camera.projection == "perspective" for camera in shot.cameras):
+        choose_shot(path, path="turntable", count=5, size=(32, 18))
+    if bad := [warning for warning in shot.warnings if not warning.isprintable()]:
+        raise AssertionError(f"a warning that is not a plain line: {bad[0][:300]!r}")
+    for camera in shot.cameras:
+        numbers = (camera.rotation, camera.translation, [camera.fx, camera.fy, camera.cx, camera.cy, camera.near])
+        if not all(np.isfinite(values).all() for values in numbers) or min(camera.fx, camera.fy) <= 0:
+            raise AssertionError(f"a camera {camera}")
 
 
 def inside(folder: Path, path: Path) -> None:
@@ -315,6 +397,14 @@ _ALL = (
         2,
     ),
     *(
+        Reader(f"cameras-{kind}", make, partial(read_cameras, name=name), (name,), (*BYTES, *LINES, "json", *PLACES), 3)
+        for kind, make, name in (
+            ("keys", make_camera_keys, "cameras.json"),
+            ("path", make_camera_path, "camera_path.json"),
+            ("poses", make_transforms, "transforms.json"),
+        )
+    ),
+    *(
         Reader(
             f"image-{extension}",
             partial(make_image, extension=extension),
@@ -333,6 +423,14 @@ _ALL = (
         ("run/checkpoints/step-0000002.npz", "run/checkpoints/step-0000001.npz"),
         (*BYTES, "archive", *PLACES),
         3,
+    ),
+    Reader(
+        "bundle",
+        make_bundle,
+        lambda f: replay.read_bundle(f / "trouble-step-0000007.npz"),
+        ("trouble-step-0000007.npz",),
+        (*BYTES, "archive", *PLACES),
+        2,
     ),
     Reader("photos", make_photos, read_photos, ("photos/a.png", "photos/picture.jpg"), (*BYTES, *PLACES), 1),
     Reader("record", make_record, read_record, ("sfm.json",), (*BYTES, *LINES, "json", *PLACES), 1),

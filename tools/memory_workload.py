@@ -118,6 +118,23 @@ def rendering(device: Device) -> None:
             renderer.render(gaussians, moved)
 
 
+def pictures(device: Device) -> None:
+    """What only pictures have: channels beside colour, slices by depth; cameras without an image plane."""
+    flat = camera(33, 17)
+    around = replace(flat, fx=33 / (2 * np.pi), fy=33 / (2 * np.pi), projection="equirectangular")
+    gaussians = cloud(30, flat, 6)
+    for view in (flat, around, replace(around, fx=9.0, fy=9.0, projection="fisheye")):
+        renderer = Renderer(device)
+        motion = ("motion",) if view is flat else ()
+        after = replace(view, translation=np.array([0.1, 0.0, 0.1]))
+        _, found = renderer.render_channels(gaussians, view, ("normal", "position", *motion), after=after)
+        slices = renderer.render_deep(gaussians, view, np.array([2.0, 3.0], np.float32))
+        if not all(np.isfinite(values).all() for values in (found.depth, *found.fields.values(), slices)):
+            raise SystemExit(f"a channel of the {view.projection} camera is not finite")
+        if not found.count.any():
+            raise SystemExit(f"nothing is in the picture of the {view.projection} camera")
+
+
 def training(device: Device) -> None:
     """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset."""
     view = camera(20, 17)
@@ -181,7 +198,8 @@ def sorts(device: Device) -> None:
 
 
 def limits(device: Device) -> None:
-    """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the tests' probes."""
+    """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the probes of the
+    tests and of the self-test."""
     items, lanes = tile_items(device), device.shape.lanes
     splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
     kernels = device.kernels("limit", ITEMS=items)
@@ -200,6 +218,10 @@ def limits(device: Device) -> None:
         launch.launch_grid(device, getattr(probe, name), (len(values),), upload(device, values), out, *extra)
         out.get()
     copy.get()
+    numbers = [upload(device, np.full(lanes, value, np.float32)) for value in (1.5, 2.5, -0.5)]
+    results = allocate(device, (4, lanes), np.float32)
+    launch.launch_items(device, device.kernels("arithmetic").arithmetic, 1, lanes, *numbers, results)
+    results.get()
 
 
 def planted(device: Device) -> None:
@@ -288,7 +310,7 @@ def main(arguments: list[str]) -> int:
     print("probe_fma", flush=True)  # which opening a device runs
     if items == 1:
         opened.kind = "cpu"  # the launches too are then those of a CPU
-    for part in (sorts, limits, frames, rendering, training):
+    for part in (sorts, limits, frames, rendering, pictures, training):
         part(opened)
     return 0
 

@@ -123,15 +123,18 @@ def _work(tasks: Connection, names: list[str], seed: int, memory: int, most_seco
         name, first, stop = task
         for case in range(first, stop):
             tasks.send(("case", case))
-            with spoilt(readers[name], valid[name], root / "case", seed, case):
-                Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-                before, start = _status("VmRSS"), time.perf_counter()
-                refused, trouble = verdict(readers[name], root / "case")
-                seconds, peak = time.perf_counter() - start, _status("VmHWM") - before
-                if peak > memory and not trouble:
-                    trouble = f"{peak:.0f} MiB of memory"
-                if seconds > most_seconds and not trouble:
-                    trouble = f"{seconds:.0f} s"
+            try:
+                with spoilt(readers[name], valid[name], root / "case", seed, case):
+                    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+                    before, start = _status("VmRSS"), time.perf_counter()
+                    refused, trouble = verdict(readers[name], root / "case")
+                    seconds, peak = time.perf_counter() - start, _status("VmHWM") - before
+            except Exception as error:  # noqa: BLE001  # a defect of these tools, to be told as any other
+                seconds, peak, refused, trouble = 0.0, 0.0, False, f"no case: {type(error).__name__}: {error}"
+            if peak > memory and not trouble:
+                trouble = f"{peak:.0f} MiB of memory"
+            if seconds > most_seconds and not trouble:
+                trouble = f"{seconds:.0f} s"
             tasks.send(("done", seconds, peak, refused, trouble))
         tasks.send(("end",))
 

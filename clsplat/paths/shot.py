@@ -12,8 +12,9 @@ from clsplat.errors import InputError
 from clsplat.frames import parse_frames, ranges
 from clsplat.paths.keys import Key, interpolate
 
-MOST_FRAMES = 1_000_000
-"""More are a slip of the keyboard."""
+MOST_FRAMES = 100_000
+"""Over an hour at 24 a second. More are a slip of the keyboard, and would be gigabytes of cameras from a file of few
+lines."""
 
 
 @dataclass(frozen=True, eq=False)
