@@ -9,9 +9,6 @@
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 
-// Of a channel. The squares that SSIM multiplies stay finite below it, and no picture has a colour over it.
-#define COLOUR_LIMIT 1e9f
-
 // Whether a Gaussian goes on that reaches no tile (RasterizerConfig.frustum_cull, opacity_cull).
 #if defined(NO_FRUSTUM_CULL)
 #define KEEP_CULLED 1

@@ -133,7 +133,7 @@ static inline void store_box(const Tangent *t, int width, int height, int tiles_
   splat[RAY_ROWS] = as_float((uint)y0 | (uint)y1 << 16);
 }
 
-// As `project` in project.cl, but for what it can leave out of a model that is held.
+// As `project` in project.cl, but for what it can leave out of a model that is held; such a colour is not drawn either.
 __kernel void project_rays(const uint n, const int coefficients, const int width, const int height,
                            __constant float *camera, __global const float *means, __global const float *quaternions,
                            __global const float *log_scales, __global const float *opacity_logits,
@@ -226,6 +226,10 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
   __global const shT *band = sh_rest + (size_t)3 * (coefficients - 1) * i;
   for (int k = 1; k < used; ++k, band += 3)
     colour = sh_fma(basis[k], sh_channels(band, k + 1 == coefficients), colour);
+  if (!(colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT)) {
+    tile_counts[i] = 0;
+    return;
+  }
   splat[RAY_RED] = colour.x > 0.0f ? colour.x : 0.0f;
   splat[RAY_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
   splat[RAY_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;

@@ -7,7 +7,7 @@ checksums of frames and gradients; and clsplat/selftest.json, the digests that `
 
 Run it, and commit what it writes, only where a change is meant to change training, or the bits of a frame or of a
 gradient; say why in the commit. Without a name it writes all three files. The default device has to be one that can
-have 16 lanes, which PoCL 3.0 cannot.
+have 16 lanes.
 """
 
 from __future__ import annotations

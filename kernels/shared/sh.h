@@ -1,6 +1,8 @@
 // Real spherical harmonics to degree 3, signs and order of Kerbl et al. 2023; basis[k] at the unit direction (x, y, z).
 
 #define SH_CONSTANT 0.28209479177387814f
+// Of a channel. The squares that SSIM multiplies stay finite below it, and no picture has a colour over it.
+#define COLOUR_LIMIT 1e9f
 
 // Of the coefficients that there are, how many are looked at (RasterizerConfig.sh_degree_limit).
 #ifdef SH_LIMIT

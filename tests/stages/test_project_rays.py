@@ -215,3 +215,21 @@ def test_what_is_too_near_or_transparent_is_left_out(device: Device) -> None:
     camera = replace(panorama(32, 16), rotation=np.eye(3), translation=np.zeros(3))
     result = Renderer(device).render(gaussians, camera)
     assert not result.alpha.any()
+
+
+@pytest.mark.parametrize("group", ["means", "quaternions", "log_scales", "opacity_logits", "sh"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38, -3e38])
+@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees"])
+def test_what_is_not_finite_is_left_out_alone(default_device: Device, name: str, value: float, group: str) -> None:
+    renderer, camera = Renderer(default_device), CAMERAS[name]
+    clean, broken = all_around(60, 9), all_around(60, 9)
+    clean.opacity_logits[7] = -20.0
+    getattr(broken, group)[7] = value
+    wanted, got = (renderer.render_channels(gaussians, camera, ("normal", "position")) for gaussians in (clean, broken))
+    for planes in (got[0].image, got[0].alpha, got[1].depth, *got[1].fields.values()):
+        assert np.isfinite(planes).all()
+    # Opaque, black and scaled to a point are Gaussians as good as any.
+    drawn = (group, np.sign(value)) in (("opacity_logits", 1.0), ("sh", -1.0), ("log_scales", -1.0))
+    if not drawn:
+        assert_same_bits(got[0].image, wanted[0].image)
+        assert_same_bits(got[1].index, wanted[1].index)
