@@ -35,6 +35,14 @@ _NAMES = {
     LINEAR: ("lin_rec709", "Linear Rec.709 (sRGB)", "lin_srgb", "Utility - Linear - sRGB", "lin_rec709_scene"),
 }
 """What configurations call these two."""
+INTEROP = {
+    SRGB: "srgb_rec709_scene",
+    LINEAR: "lin_rec709_scene",
+    "ACEScg": "lin_ap1_scene",
+    "ACES2065-1": "lin_ap0_scene",
+}
+"""What EXR's attribute colorInteropID calls spaces (Color Interop Forum, "Color Space Encodings for Texture Assets",
+https://github.com/AcademySoftwareFoundation/ColorInterop)."""
 _LINEAR_PHOTOS = (".exr", ".hdr")
 
 
@@ -166,9 +174,9 @@ class Colours:
         exact = np.allclose(light[0, 3:] @ found[0, :3], found[0, 3:], rtol=1e-5, atol=1e-5)  # of float32 sums up to 4
         return found[0, :3] if exact else None
 
-    def _converted(self, rgb: Float32, *names: str) -> Float32:
+    def _converted(self, rgb: Float32, source: str, target: str) -> Float32:
         pixels = oiio.ImageBuf(np.ascontiguousarray(rgb, np.float32))
-        result = oiio.ImageBufAlgo.colorconvert(pixels, *names, unpremult=False, colorconfig=self._source)
+        result = oiio.ImageBufAlgo.colorconvert(pixels, source, target, unpremult=False, colorconfig=self._source)
         if reason := result.geterror():
-            raise InputError(f"{self._source}: {names[0]} to {names[1]}: {' '.join(reason.split())}")
+            raise InputError(f"{self._source}: {source} to {target}: {' '.join(reason.split())}")
         return np.asarray(result.get_pixels(oiio.FLOAT), np.float32)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.camera import Camera
+from clsplat.colour import INTEROP
 from clsplat.config import RasterizerConfig
 from clsplat.errors import InputError
 from clsplat.framing import Layers, framed
@@ -104,8 +105,12 @@ def header(task: Task, options: RenderOptions) -> Header:
     """Frame, model, version and colour space; the matrices of a perspective camera; in EXR the window."""
     camera = picture_camera(task, options)
     matrices = camera_matrices(camera) if camera.projection == "perspective" else {}
-    window = camera.window if task.path.suffix.lower() == ".exr" else None
-    return Header({**options.attributes, "clsplat:frame": task.number}, matrices, window)
+    attributes = {**options.attributes, "clsplat:frame": task.number}
+    if task.path.suffix.lower() != ".exr":
+        return Header(attributes, matrices)
+    if name := INTEROP.get(str(attributes.get("clsplat:colorspace"))):
+        attributes["colorInteropID"] = name
+    return Header(attributes, matrices, camera.window)
 
 
 class FrameShader:
