@@ -35,6 +35,14 @@ _NAMES = {
     LINEAR: ("lin_rec709", "Linear Rec.709 (sRGB)", "lin_srgb", "Utility - Linear - sRGB", "lin_rec709_scene"),
 }
 """What configurations call these two."""
+INTEROP = {
+    SRGB: "srgb_rec709_scene",
+    LINEAR: "lin_rec709_scene",
+    "ACEScg": "lin_ap1_scene",
+    "ACES2065-1": "lin_ap0_scene",
+}
+"""What EXR's attribute colorInteropID calls spaces (Color Interop Forum, "Color Space Encodings for Texture Assets",
+https://github.com/AcademySoftwareFoundation/ColorInterop)."""
 _LINEAR_PHOTOS = (".exr", ".hdr")
 
 

@@ -110,9 +110,11 @@ class Run:
         config, scene = read_config(path / "config.toml")
         return cls(path, config, scene)
 
-    def save_model(self, gaussians: Gaussians) -> None:
-        """Write model.ply."""
-        gaussians.save(self.model_path)
+    def save_model(self, gaussians: Gaussians, space: str = "sRGB") -> None:
+        """Write model.ply; space: the colour space that it was trained in (`colour.photos_space`)."""
+        from clsplat.colour import comment
+
+        gaussians.save(self.model_path, comments=[comment(space)])
 
     def write_eval(self, result: Mapping[str, Any]) -> None:
         """Write eval.json."""

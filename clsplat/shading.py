@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.camera import Camera
+from clsplat.colour import INTEROP
 from clsplat.config import RasterizerConfig
 from clsplat.errors import InputError
 from clsplat.framing import COLOUR, Layers, framed
@@ -105,8 +106,13 @@ def camera_after(task: Task, options: RenderOptions) -> Camera | None:
 def header(task: Task, options: RenderOptions) -> Header:
     """Frame, model, version and colour space; the matrices of a camera that has them; in EXR the window."""
     camera = picture_camera(task, options)
-    window = camera.window if task.path.suffix.lower() == ".exr" else None
-    return Header({**options.attributes, "clsplat:frame": task.number}, camera_matrices(camera), window)
+    matrices = camera_matrices(camera)
+    attributes = {**options.attributes, "clsplat:frame": task.number}
+    if task.path.suffix.lower() != ".exr":
+        return Header(attributes, matrices)
+    if name := INTEROP.get(str(attributes.get("clsplat:colorspace"))):
+        attributes["colorInteropID"] = name
+    return Header(attributes, matrices, camera.window)
 
 
 class FrameShader:

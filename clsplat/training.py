@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.colour import photos_space
 from clsplat.config import TrainConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import ClsplatError
@@ -253,7 +254,7 @@ def train(
             raise KeyboardInterrupt
     model = trainer.gaussians()
     if run is not None:
-        run.save_model(model)
+        run.save_model(model, photos_space(view.path for view in scene.views))
         if scene.test_views:
             run.write_eval(session.evaluate(keep=True))
     return model

@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures' flags of `clsplat render`, each once from end to end on a tiny model: what it does to the file."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from calls import Capture, error_line
+from tiny import HEIGHT, WIDTH, hidden_model
+
+from clsplat.cli import main
+from clsplat.colour import LINEAR, Colours, comment, linear_to_srgb, srgb_to_linear
+from clsplat.picture_config import ColourConfig
+from clsplat.video import video_missing
+
+COUNT = 4
+HALF = 2.0**-11
+"""What rounding to a half loses, relative."""
+FLAGS = [
+    *("--colorspace", "--model-colorspace", "--ocio-config", "--overscan", "--region", "--supersample", "--filter"),
+    *("--samples", "--shutter-angle", "--shutter-open", "--shutter-close", "--f-stop", "--aperture", "--focus"),
+    *("--sensor-width", "--metres", "--deep", "--deep.bins", "--deep.near", "--deep.far"),
+    *("--video.fps", "--video.crf", "--video.preset"),
+]
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """A model and a camera that goes to the right, as arguments of render."""
+    folder = tmp_path_factory.mktemp("shot")
+    hidden_model().save(folder / "model.ply")
+    key = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
+    keys = [{"frame": 1, "position": [-0.5, 0, -4], **key}, {"frame": COUNT, "position": [0.5, 0, -4], **key}]
+    document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
+    (folder / "cameras.json").write_text(json.dumps(document))
+    return [str(folder / "model.ply"), "--cameras", str(folder / "cameras.json")]
+
+
+def render(shot: list[str], folder: Path, flags: str = "", pattern: str = "a.####.exr") -> int:
+    return main(["render", *shot, "-o", str(folder / pattern), "--progress", "none", *flags.split()])
+
+
+def picture(shot: list[str], folder: Path, flags: str = "", frame: int = 2) -> tuple[np.ndarray, Any]:
+    """Pixels and specification of one frame."""
+    assert render(shot, folder, f"--frames {frame} {flags}") == 0
+    image = oiio.ImageBuf(str(folder / f"a.{frame:04d}.exr"))
+    return image.get_pixels(oiio.FLOAT), image.spec()
+
+
+@pytest.fixture(scope="module")
+def bright(shot: list[str], tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """As `shot`, of a model with colours of up to 1.9 and some channels of 0."""
+    model = hidden_model()
+    path = tmp_path_factory.mktemp("bright") / "model.ply"
+    replace(model, sh=3 * model.sh).save(path)
+    return [str(path), *shot[1:]]
+
+
+@pytest.fixture(scope="module")
+def plain(shot: list[str], tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+    """Frame 2 with alpha and depth."""
+    return picture(shot, tmp_path_factory.mktemp("plain"), "--channels rgb,alpha,depth")[0]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_the_help_has_every_flag(capsys: Capture) -> None:
+    assert main(["render", "--help"]) == 0
+    words = capsys.readouterr().out.split()
+    assert [flag for flag in FLAGS if flag not in words] == []
+
+
+def test_overscan_and_region(shot: list[str], plain: np.ndarray, tmp_path: Path) -> None:
+    larger, spec = picture(shot, tmp_path, "--channels rgb,alpha,depth --overscan 5")
+    assert (spec.x, spec.y, spec.width, spec.height) == (-5, -5, WIDTH + 10, HEIGHT + 10)
+    assert (spec.full_x, spec.full_y, spec.full_width, spec.full_height) == (0, 0, WIDTH, HEIGHT)
+    np.testing.assert_array_equal(larger[5:-5, 5:-5], plain)
+    part, spec = picture(shot, tmp_path, "--channels rgb,alpha,depth --region 7,9,20,11")
+    assert (spec.x, spec.y, spec.width, spec.height, spec.full_width) == (7, 9, 20, 11, WIDTH)
+    np.testing.assert_array_equal(part, plain[9:20, 7:27])
+
+
+@pytest.mark.parametrize("kind", ["box", "blackman-harris"])
+def test_supersampling(kind: str, shot: list[str], plain: np.ndarray, tmp_path: Path) -> None:
+    flags = f"--channels rgb,alpha,depth --supersample 3 --filter {kind}"
+    fine, _ = picture(shot, tmp_path, flags)
+    np.testing.assert_array_equal(fine[:, :, 4], plain[:, :, 4])  # of depth there is no mean
+    assert 0.002 < np.abs(fine[:, :, 3] - plain[:, :, 3]).mean() < 0.1
+    if kind == "box":
+        large, _ = picture(shot, tmp_path, f"--channels alpha --width {3 * WIDTH}")
+        mean = large[:, :, 0].reshape(HEIGHT, 3, WIDTH, 3).mean(axis=(1, 3))
+        np.testing.assert_allclose(fine[:, :, 3], mean, atol=1e-6)  # sums of nine floats up to 1
+
+
+def test_colour_through_a_half_file_and_back(bright: list[str], tmp_path: Path) -> None:
+    plain, _ = picture(bright, tmp_path, "--channels rgb,alpha")
+    held, spec = picture(bright, tmp_path, "--channels rgb,alpha --colorspace ACEScg --exr half")
+    assert (spec.getattribute("clsplat:colorspace"), spec.getattribute("colorInteropID")) == ("ACEScg", "lin_ap1_scene")
+    alpha = plain[:, :, 3]
+    straight = plain[:, :, :3] / np.where(alpha > 0, alpha, 1)[:, :, None]
+    truth = srgb_to_linear(straight) * alpha[:, :, None]
+    colours = Colours(ColourConfig(colorspace="ACEScg"))
+    back = colours.convert(held[:, :, :3], None, "ACEScg", LINEAR)
+    # rounding is of ACEScg's channels, and the matrix back has rows of absolute sum up to 2.5
+    size = np.abs(held[:, :, :3]).max(axis=2, keepdims=True)
+    assert (np.abs(back - truth) <= 2.5 * HALF * size + 1e-6).all()
+    assert truth.max() > 1 > truth.min() >= 0  # what is over 1 survives
+
+
+def test_colours_beyond_0_and_1_survive(bright: list[str], tmp_path: Path) -> None:
+    # a colour of Rec.709 that is called one of AP1, which reaches further, is beyond Rec.709 where it is saturated
+    flags = "--channels rgb,alpha --exr half --model-colorspace ACEScg --colorspace"
+    held, _ = picture(bright, tmp_path, f"{flags} lin_rec709")
+    assert held[:, :, :3].min() < -0.1
+    assert held[:, :, :3].max() > 1.2
+    same, _ = picture(bright, tmp_path, f"{flags} ACEScg")
+    colours = Colours(ColourConfig(colorspace="ACEScg"))
+    size = np.abs(held[:, :, :3]).max(axis=2, keepdims=True)
+    back = colours.convert(held[:, :, :3], None, LINEAR, "ACEScg")
+    # rows of the matrix there add up to 1, and the other picture is of halves too
+    assert (np.abs(back - same[:, :, :3]) <= HALF * (size + np.abs(same[:, :, :3])) + 1e-6).all()
+
+
+def test_the_space_is_that_of_the_model_file(shot: list[str], plain: np.ndarray, tmp_path: Path) -> None:
+    hidden_model().save(tmp_path / "linear.ply", comments=[comment(LINEAR)])
+    encoded, spec = picture([str(tmp_path / "linear.ply"), *shot[1:]], tmp_path, "--colorspace sRGB")
+    np.testing.assert_allclose(encoded, linear_to_srgb(plain[:, :, :3]), rtol=1e-6, atol=1e-7)
+    assert spec.getattribute("clsplat:colorspace") == "sRGB"
+    same, spec = picture([str(tmp_path / "linear.ply"), *shot[1:]], tmp_path)
+    np.testing.assert_array_equal(same, plain[:, :, :3])
+    assert spec.getattribute("clsplat:colorspace") == LINEAR
+
+
+def test_a_configuration_of_ones_own(shot: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = tmp_path / "own.ocio"
+    config.write_text(
+        "ocio_profile_version: 1\nroles:\n  default: lin_rec709\ndisplays:\n  sRGB:\n"
+        "    - !<View> {name: view, colorspace: lin_rec709}\nactive_displays: []\nactive_views: []\ncolorspaces:\n"
+        "  - !<ColorSpace>\n    name: lin_rec709\n  - !<ColorSpace>\n    name: twice\n"
+        "    from_reference: !<MatrixTransform> {matrix: [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]}\n"
+    )
+    monkeypatch.chdir(tmp_path)  # a file beside, as workers elsewhere have to find it too
+    once, _ = picture(shot, tmp_path, "--colorspace lin_rec709")
+    twice, _ = picture(shot, tmp_path, "--colorspace twice --ocio-config own.ocio")
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-6)
+
+
+def blur(image: np.ndarray) -> float:
+    """Sum of the differences between neighbours: less where it is blurred."""
+    return float(np.abs(np.diff(image[:, :, 3], axis=1)).sum())
+
+
+def test_shutter(shot: list[str], plain: np.ndarray, tmp_path: Path) -> None:
+    flags = "--channels rgb,alpha,depth --samples 8"
+    turned, _ = picture(shot, tmp_path, f"{flags} --shutter-angle 360")
+    assert blur(turned) < 0.95 * blur(plain)
+    np.testing.assert_array_equal(turned[:, :, 4], plain[:, :, 4])  # the middle of the shutter is the frame
+    timed, _ = picture(shot, tmp_path, f"{flags} --shutter-open -0.5 --shutter-close 0.5")
+    np.testing.assert_array_equal(timed, turned)
+    later, _ = picture(shot, tmp_path, f"{flags} --shutter-open 0 --shutter-close 1")
+    assert np.abs(later[:, :, 4] - plain[:, :, 4]).max() > 0.01
+    # the camera goes on at both ends as it did there, at one speed: each frame is blurred as much
+    ends = [blur(picture(shot, tmp_path, f"{flags} --shutter-angle 360", frame)[0]) for frame in (1, COUNT)]
+    assert max(ends) < 0.95 * blur(plain)
+
+
+def test_motion_of_an_open_shutter(shot: list[str], tmp_path: Path) -> None:
+    flags = "--channels alpha,motion --samples 2"
+    whole, _ = picture(shot, tmp_path, flags, COUNT)
+    late, _ = picture(shot, tmp_path, f"{flags} --shutter-open 0 --shutter-close 0.5", COUNT)
+    seen = (whole[:, :, 0] > 0.5) & (late[:, :, 0] > 0.5)
+    # a frame's way from the middle of the shutter on, at one speed; depths differ by what the camera has moved
+    np.testing.assert_allclose(np.median(late[seen][:, 1]), np.median(whole[seen][:, 1]), rtol=0.02)
+
+
+def test_lens(shot: list[str], plain: np.ndarray, tmp_path: Path) -> None:
+    flags = "--channels rgb,alpha,depth --samples 8"
+    near, _ = picture(shot, tmp_path, f"{flags} --aperture 0.2 --focus 1")
+    assert blur(near) < 0.9 * blur(plain)
+    sharp, _ = picture(shot, tmp_path, f"{flags} --aperture 0.2 --focus 4")
+    assert blur(near) < blur(sharp) < blur(plain)
+    # fx = W / 2 / tan 30 degrees, on a sensor of 36 mm, so 31.18 mm at 1 m a unit: radius 0.2 at this f-number
+    stop = 36 / 2 / np.tan(np.pi / 6) / 1000 / 0.4
+    stopped, _ = picture(shot, tmp_path, f"{flags} --f-stop {stop} --focus 1")
+    np.testing.assert_allclose(stopped[:, :, :4], near[:, :, :4], atol=1e-5)
+    double, _ = picture(shot, tmp_path, f"{flags} --f-stop {stop} --focus 1 --sensor-width 72 --metres 2")
+    np.testing.assert_allclose(double[:, :, :4], near[:, :, :4], atol=1e-5)
+
+
+def test_deep(shot: list[str], plain: np.ndarray, tmp_path: Path, capsys: Capture) -> None:
+    assert render(shot, tmp_path, "--deep --deep.bins 4 --deep.near 3 --deep.far 5 --frames 2") == 0
+    image = oiio.ImageBuf(str(tmp_path / "a.0002.exr"))
+    assert image.spec().deep
+    data = image.deepdata()
+    assert 1 < max(data.samples(pixel) for pixel in range(data.pixels)) <= 4
+    flat = oiio.ImageBufAlgo.flatten(image).get_pixels(oiio.FLOAT)
+    np.testing.assert_allclose(flat[:, :, :4], plain[:, :, :4], atol=2e-6)  # sums in float, as docs/pictures.md says
+    before = (tmp_path / "a.0002.exr").stat().st_mtime_ns
+    whole = (tmp_path / "a.0002.exr").read_bytes()
+    again = "--deep --deep.bins 4 --deep.near 3 --deep.far 5 --frames 2 --skip-existing"
+    assert render(shot, tmp_path, again) == 0
+    assert (tmp_path / "a.0002.exr").stat().st_mtime_ns == before
+    (tmp_path / "a.0002.exr").write_bytes(whole[:-100])
+    assert render(shot, tmp_path, again) == 0
+    assert (tmp_path / "a.0002.exr").read_bytes() == whole
+    assert render(shot, tmp_path, "--alpha --frames 2 --skip-existing") == 0  # a flat one is another
+    assert not oiio.ImageBuf(str(tmp_path / "a.0002.exr")).spec().deep
+
+
+def test_another_colour_space_is_not_what_is_wanted(shot: list[str], tmp_path: Path) -> None:
+    picture(shot, tmp_path)
+    _, spec = picture(shot, tmp_path, "--colorspace ACEScg --skip-existing")
+    assert spec.getattribute("clsplat:colorspace") == "ACEScg"
+
+
+def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    av = pytest.importorskip("av", reason="the extra `video` brings it")
+    small = tmp_path / "small.mp4"
+    flags = "--video.fps 12 --video.crf 10 --video.preset fast --count 9 --path through --json"
+    assert render(shot, tmp_path, flags, "a.mp4") == 0
+    records = json.loads(capsys.readouterr().out)
+    assert [record["frame"] for record in records] == list(range(1, 10))
+    assert {record["path"] for record in records} == {str(tmp_path / "a.mp4")}
+    assert render(shot, tmp_path, flags.replace("crf 10", "crf 45"), small.name) == 0
+    assert small.stat().st_size < (tmp_path / "a.mp4").stat().st_size
+    assert render(shot, tmp_path, f"{flags} --device all", "all.mp4") == 0
+    assert (tmp_path / "all.mp4").read_bytes() == (tmp_path / "a.mp4").read_bytes()
+    assert sorted(contents(tmp_path)) == ["a.mp4", "all.mp4", "small.mp4"]
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        stream = container.streams.video[0]
+        frames = [frame.to_ndarray() for frame in container.decode(stream)]
+    assert (stream.average_rate, len(frames)) == (12, 9)
+    assert render(shot, tmp_path, "--path through --count 9", "####.exr") == 0
+    for index, frame in enumerate(frames, 1):  # in their order: each is nearest to its own
+        means = [oiio.ImageBuf(str(tmp_path / f"{at:04d}.exr")).get_pixels(oiio.FLOAT) for at in (index, 10 - index)]
+        lumas = [16 + 219 * np.clip(image, 0, 1) @ [0.2126, 0.7152, 0.0722] for image in means]
+        errors = [np.abs(frame[:HEIGHT] - luma).mean() for luma in lumas]
+        assert index == 5 or errors[0] < errors[1]
+
+
+def test_strips(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    flags = f"--width {20 * WIDTH} --frames 2 --channels rgb,alpha,depth --max-device-mem"
+    plenty, little = (f"{flags} {size}" for size in ("1GiB", "4MiB"))
+    assert render(shot, tmp_path / "plenty", plenty) == 0
+    assert render(shot, tmp_path, f"{little} --dry-run --json") == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["devices"][0]["strips"] > 1
+    assert plan["devices"][0]["needed"] <= 4 << 20
+    assert render(shot, tmp_path / "little", little) == 0
+    assert contents(tmp_path / "little") == contents(tmp_path / "plenty")
+    assert render(shot, tmp_path / "parts", f"{little} --parts several") == 2
+    assert "--parts several: a picture of 960x800 is written in strips" in error_line(capsys)
+    assert not (tmp_path / "parts").exists()
+
+
+EVERYTHING = "--channels rgb,alpha,depth,motion --overscan 3 --supersample 2 --colorspace ACEScg --shutter-angle 180 "
+EVERYTHING += "--samples 3 --aperture 0.1 --focus 4"
+
+
+def test_the_plan(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    assert render(shot, tmp_path / "new", f"{EVERYTHING} --dry-run") == 0
+    text = capsys.readouterr().out
+    for part in (
+        f"{WIDTH + 6}x{HEIGHT + 6} at -3,-3 of {WIDTH}x{HEIGHT}",
+        "colour    sRGB to ACEScg",
+        "samples   3 frames for one, shutter from -0.25 to 0.25 frames, lens in focus at 4, 2x2 a pixel, box",
+    ):
+        assert part in text
+    assert render(shot, tmp_path / "new", f"{EVERYTHING} --dry-run --json") == 0
+    plan = json.loads(capsys.readouterr().out)
+    wanted = {"model_colorspace": "sRGB", "colorspace": "ACEScg", "samples": 3, "supersample": 2, "deep_bins": 0}
+    assert {name: plan[name] for name in wanted} == wanted
+    assert plan["frames"][0]["window"] == [-3, -3, WIDTH, HEIGHT]
+    assert plan["devices"][0]["strips"] == 1
+    assert render(shot, tmp_path / "new", "--deep --deep.bins 5 --dry-run") == 0
+    assert "channels  rgb, alpha in 5 slices by depth" in capsys.readouterr().out
+    assert not (tmp_path / "new").exists()
+
+
+def test_everything_on_a_farm(shot: list[str], tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra `farm` brings it")
+    cases = [("all", EVERYTHING, "a.####.exr"), ("deep", "--deep --deep.bins 3", "a.####.exr")]
+    cases += [] if video_missing() else [("video", "", "a.mp4")]
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, host="127.0.0.1", protocol="tcp://"
+    ) as cluster:
+        for name, flags, pattern in cases:
+            assert render(shot, tmp_path / name / "here", flags, pattern) == 0
+            address = f"--scheduler {cluster.scheduler_address}"
+            assert render(shot, tmp_path / name / "there", f"{flags} {address}", pattern) == 0
+            assert contents(tmp_path / name / "there") == contents(tmp_path / name / "here") != {}, name
+
+
+def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Capture, monkeypatch: Any) -> None:
+    cases = [
+        ("--colorspace ACEScq", "a.#.exr", "--colorspace ACEScq: not in the configuration"),
+        ("--model-colorspace srbg", "a.#.exr", "--model-colorspace srbg: not in the configuration"),
+        ("--ocio-config none.ocio --colorspace ACEScg", "a.#.exr", "none.ocio: no OpenColorIO configuration"),
+        ("--region 40,0,20,10", "a.#.exr", f"--region 40,0,20,10: ends at 60,10, expected at most the frame's {WIDTH}"),
+        ("--region 0,0,8,8 --overscan 2", "a.#.exr", "--overscan and --region exclude each other"),
+        ("--supersample 0", "a.#.exr", "--supersample 0: expected 1 to 64"),
+        ("--shutter-open 0.1", "a.#.exr", "--shutter-open 0.1 --shutter-close None: expected two times"),
+        ("--aperture 0.1", "a.#.exr", "--focus 0.0: expected the depth that is in focus"),
+        ("--deep --supersample 2", "a.#.exr", "deep EXR: --supersample has no deep samples"),
+        ("--deep --channels rgb,depth", "a.#.exr", "--deep: has no depth beside colour, alpha and depths"),
+        ("--deep --parts several", "a.#.exr", "--deep and --parts several exclude each other"),
+        ("--deep", "a.#.tif", "cannot hold deep samples, expected an .exr file"),
+        ("--deep --background white", "a.#.exr", "--deep and --background exclude each other"),
+        ("--deep.bins 8", "a.#.exr", "expected --deep with them"),
+        ("--video.fps 25", "a.#.exr", "--video flags are of videos, expected the name of an .mp4 file"),
+        ("--channels rgb,depth", "a.mp4", "an MP4 cannot hold depth"),
+        ("--alpha", "a.mp4", "an MP4 cannot hold alpha"),
+        ("--alpha", "a.#.jpg", "a JPG cannot hold alpha"),
+        ("--skip-existing", "a.mp4", "--skip-existing: a video is written as a whole"),
+        ("--video.crf 99", "a.mp4", "--video.crf 99: expected 0 to 51"),
+    ]
+    for flags, pattern, message in cases:
+        assert render(shot, tmp_path / "new", flags, pattern) == 2, flags
+        assert message in error_line(capsys), flags
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert render(shot, tmp_path / "new", "", "a.mp4") == 2
+    assert "a.mp4: video needs PyAV, which is not installed" in error_line(capsys)
+    assert not (tmp_path / "new").exists()
