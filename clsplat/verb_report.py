@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from clsplat.cli import Compare, Report
-from clsplat.errors import InputError
+from clsplat.errors import InputError, plain
 from clsplat.runs import Run
 
 
@@ -24,7 +24,7 @@ def report(verb: Report) -> int:
     if verb.json:
         print(json_text(figures.document()))
     for note in figures.notes:
-        print(f"clsplat: warning: {note}", file=sys.stderr)
+        print(f"clsplat: warning: {plain(note)}", file=sys.stderr)
     print(f"report in {path}", file=sys.stderr)
     return 0
 
@@ -45,7 +45,7 @@ def compare(verb: Compare) -> int:
         print(f"page in {verb.output}", file=sys.stderr)
     print(json_text(found.document()) if verb.json else comparison_table(found))
     for note in found.notes:
-        print(f"clsplat: warning: {note}", file=sys.stderr)
+        print(f"clsplat: warning: {plain(note)}", file=sys.stderr)
     return 0
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -41,3 +42,11 @@ def watched_page(browser: Any, **options: Any) -> tuple[Any, list[str]]:
     page.on("pageerror", lambda error: trouble.append(str(error)))
     page.on("requestfailed", lambda request: trouble.append(f"{request.url[:100]}: {request.failure}"))
     return page, trouble
+
+
+def keep_screenshot(page: Any, name: str, folder: Path) -> Path:
+    """A picture of the whole page, in CLSPLAT_ARTEFACTS if that is set, else in the test's own folder."""
+    kept = Path(os.environ.get("CLSPLAT_ARTEFACTS") or folder)
+    kept.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=kept / f"{name}.png", full_page=True)
+    return kept / f"{name}.png"

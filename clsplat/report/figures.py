@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -25,7 +24,9 @@ CURVES = ("step", "loss", "psnr", "gaussians", "seconds")
 """Of metrics.jsonl, every record has them."""
 MAX_NAME = 200
 """Characters of a name of a view, a stage or a device that are shown."""
-MAX_VIEWS, MAX_STAGES = 10_000, 40
+MAX_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
+"""What is kept of a file that has more, as none of ours does: the last."""
+LARGEST = 1e30
 
 
 @dataclass
@@ -96,6 +97,9 @@ def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = T
             figures.evaluations.append({**_summary(found), "step": int(record["step"])})
         if isinstance(session := record.get("session"), dict):
             figures.sessions.append(_session(session))
+    for listed in (figures.stages, figures.evaluations):
+        del listed[:-MAX_SAMPLES]
+    del figures.sessions[:-MAX_SESSIONS]
     figures.elapsed = _elapsed(records)
     _add_evaluation(figures)
     if describe:
@@ -117,13 +121,10 @@ def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = T
 
 
 def number(value: object) -> float | None:
-    """The value as a finite number, or None."""
+    """The value as a number of a size that can be drawn, or None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    try:
-        return float(value) if math.isfinite(value) else None
-    except OverflowError:  # an integer of a thousand digits
-        return None
+    return float(value) if -LARGEST <= value <= LARGEST else None
 
 
 def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]:

@@ -70,46 +70,52 @@ def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
 
 
 def contributions(trainer: Trainer, seconds: float = SECONDS) -> dict[str, Any] | None:
-    """The largest contribution of each Gaussian to one of the views, in pixels of full size: the sum of its blending
-    weights there, which --density.min-contribution goes by. As a histogram: `none` counts those that none shows,
-    `counts` those between `edges`, powers of ten; the first and last take what is beyond.
+    """A histogram of `largest_contributions`: `none` counts those that none shows, `counts` those between `edges`,
+    powers of ten of pixels; the first and last take what is beyond. None where memory is limited, as that was planned
+    for training alone."""
+    if trainer.device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):
+        return None
+    try:
+        largest, looked = largest_contributions(trainer, seconds)
+    except (CapacityError, cl.MemoryError):
+        return None
+    seen = largest[np.isfinite(largest) & (largest > 0)]
+    powers = np.clip(np.log10(seen.astype(np.float64)), EDGES[0], EDGES[-1])
+    counts, _ = np.histogram(powers, EDGES)
+    return {
+        "views": looked,
+        "of": len(trainer.views),
+        "none": len(largest) - len(seen),
+        "edges": list(EDGES),
+        "counts": counts.tolist(),
+    }
 
-    Of as many training views, spread evenly, as `seconds` allow; None where memory is limited, as it was planned for
-    training alone. Changes nothing that training goes by.
+
+def largest_contributions(trainer: Trainer, seconds: float = SECONDS) -> tuple[NDArray[np.float32], int]:
+    """What each Gaussian (n,) adds at most to one of the views: the sum of its blending weights there, in pixels of
+    the working size, which --density.min-contribution goes by; and of how many views.
+
+    Of as many training views, spread evenly, as `seconds` allow. Changes nothing that training goes by. Raises
+    CapacityError.
     """
     device, rasterizer, views = trainer.device, trainer.rasterizer, trainer.views
-    if device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):
-        return None
     fields, looked = SlotFields(contributions=True), 0
     largest: NDArray[np.float32] = np.zeros(trainer.parameters.count, np.float32)
     start = time.perf_counter()
     for index in _spread(len(views)):
         camera = views[index].camera.from_origin(trainer.origin)
-        try:
-            frame = rasterizer.forward(trainer.parameters, camera, trainer.background)
-            slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=fields)  # of any gradient
-            if slots.first_slots is None:
-                sums = slots.values
-            else:
-                sums = add_slots(device, rasterizer.work, frame.projected.tile_counts, slots, None, fields=fields)
-        except (CapacityError, cl.MemoryError):
-            return None
+        frame = rasterizer.forward(trainer.parameters, camera, trainer.background)
+        slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=fields)  # weights are of any gradient
+        sums = slots.values
+        if slots.first_slots is not None:
+            sums = add_slots(device, rasterizer.work, frame.projected.tile_counts, slots, None, fields=fields)
         np.maximum(largest, sums.get()[:, -1], out=largest)
         looked += 1
         if looked == 1:
             start = time.perf_counter()  # kernels may have been built
         elif time.perf_counter() - start > seconds:
             break
-    seen = largest[np.isfinite(largest) & (largest > 0)]
-    powers = np.clip(np.log10(seen.astype(np.float64)), EDGES[0], np.nextafter(EDGES[-1], 0))
-    counts, _ = np.histogram(powers, EDGES)
-    return {
-        "views": looked,
-        "of": len(views),
-        "none": len(largest) - len(seen),
-        "edges": list(EDGES),
-        "counts": counts.tolist(),
-    }
+    return largest, looked
 
 
 def _spread(count: int) -> list[int]:

@@ -19,6 +19,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.report import NAME, pictures
 from clsplat.report.figures import (
     CURVES,
+    MAX_STAGES,
     SCORES,
     Figures,
     default_settings,
@@ -187,7 +188,7 @@ def stage_rows(figures: Figures) -> list[tuple[str, float, float, float]]:
     if not figures.stages:
         return []
     last = figures.stages[-1]["ms"]
-    names = sorted({name for each in figures.stages for name in each["ms"]} - {"all"})
+    names = sorted({name for each in figures.stages for name in each["ms"]} - {"all"})[:MAX_STAGES]
     rows = []
     for name in names:
         values = sorted(each["ms"].get(name, 0.0) for each in figures.stages)

@@ -84,7 +84,10 @@ def show(
     run: Run, names: Sequence[str], wanted: Sequence[int], scene: Scene | None, background: ArrayLike
 ) -> list[Shown]:
     """The pictures of the views `names[index]`, for each index wanted, whose render is in the run's test/."""
-    paths = picture_names(names)
+    try:
+        paths = picture_names(names)
+    except ValueError:  # a name that no file has, such as ""
+        return []
     views = {view.name: view for view in scene.views} if scene is not None else {}
 
     def one(index: int) -> Shown | None:
