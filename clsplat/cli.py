@@ -96,7 +96,7 @@ class Train:
     """
 
     output: Output
-    """Folder for the run: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/, test/."""
+    """Folder for the run: config.toml, model.ply, metrics.jsonl, eval.json, report.html, checkpoints/, test/."""
     scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None
     """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, or just photos. Not needed with --resume."""
     resume: Flag = False
@@ -290,7 +290,36 @@ class Selftest:
     """Print the result as JSON."""
 
 
-Verb = Devices | Demo | Sfm | Train | Eval | Render | Bench | Tune | Selftest
+@dataclass(frozen=True)
+class Report:
+    """Write a run's report: one HTML file with curves, pictures, figures and settings, that loads nothing else.
+
+    docs/report.md says what is in it. A run that is not finished has a report too.
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A run's folder."""
+    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
+    """The file; report.html in the run's folder if not given."""
+    views: int = 8
+    """Most held-out views with pictures: the worst, the best and some between. All are in the table."""
+    json: Flag = False
+    """Print the figures as JSON."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Print runs side by side: scores, Gaussians, times, and the settings that differ."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN")]
+    """Folders of runs, two or more."""
+    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
+    """Write a page too, with the curves overlaid and time against error: one HTML file that loads nothing else."""
+    json: Flag = False
+    """Print JSON instead of the table."""
+
+
+Verb = Devices | Demo | Sfm | Train | Eval | Render | Report | Compare | Bench | Tune | Selftest
 Commands = (
     Annotated[Devices, subcommand("devices")]
     | Annotated[Demo, subcommand("demo")]
@@ -298,6 +327,8 @@ Commands = (
     | Annotated[Train, subcommand("train")]
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Render, subcommand("render")]
+    | Annotated[Report, subcommand("report")]
+    | Annotated[Compare, subcommand("compare")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Selftest, subcommand("selftest")]

@@ -285,6 +285,11 @@ class TrainConfig:
     """Steps between checkpoints; 0 writes only the last and the one of Ctrl-C."""
     eval_at: tuple[int, ...] = ()
     """Steps at which the held-out views are evaluated, beside the end."""
+    stages_every: int = 100
+    """Steps between those in which the time of each stage is measured, for the report, waiting for the device at every
+    seam; in steps that metrics.jsonl has, the last one too. 0 measures none."""
+    report: bool = True
+    """Write report.html at the end."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -296,7 +301,7 @@ class TrainConfig:
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
             (("iterations", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
             (
-                ("seed", "frequency_steps", "resolution", "test_every", "checkpoint_every"),
+                ("seed", "frequency_steps", "resolution", "test_every", "checkpoint_every", "stages_every"),
                 lambda value: value >= 0,
                 "at least 0",
             ),

@@ -26,6 +26,7 @@ from clsplat.memory import Plan, parse_bytes
 from clsplat.quarantine import RETURNS, WINDOW
 from clsplat.rendering import Renderer
 from clsplat.replay import write_bundle
+from clsplat.report import measure, write_last
 from clsplat.runs import Run
 from clsplat.stages.loss import Loss
 from clsplat.trainer import Trainer
@@ -75,6 +76,8 @@ class _Session:
         self.told: Plan | None = None
         self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
+        self.began = time.perf_counter()
+        self.noted, self.first_step = False, 0
         self.saved = 0
         self.told_stages: set[str] = set()
         self.untold = 0
@@ -182,21 +185,48 @@ class _Session:
             seconds=self.seconds,
         )
 
-    def record(self, report: StepReport, on_step: Callable[[StepReport], None] | None, *, evaluating: bool) -> None:
-        """Hand the report on, and write it down."""
+    def record(
+        self,
+        report: StepReport,
+        on_step: Callable[[StepReport], None] | None,
+        *,
+        evaluating: bool,
+        stages: dict[str, float] | None,
+    ) -> None:
+        """Hand the report on, and write it down with what clsplat.report asks for."""
         if on_step is not None:
             on_step(report)
         record = asdict(report)
         if evaluating:
             record["eval"] = self.evaluate(keep=False)
-        if self.run is not None:
-            self.run.append_metrics(record)
+        if self.run is None:
+            return
+        trainer = self.trainer
+        if stages is not None:
+            record["stages"] = stages
+        if not self.noted:
+            record["session"] = measure.session(trainer.device, self.first_step)
+            self.noted = True
+        last = trainer.step == trainer.config.iterations
+        if last and trainer.config.report and (found := measure.contributions(trainer)) is not None:
+            record["contributions"] = found
+        self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
+
+    def times_stages(self, step: int) -> bool:
+        """Whether it is measured what each stage of the step takes: only where that is written down."""
+        config = self.trainer.config
+        if config.stages_every == 0:
+            return False
+        return step == config.iterations or (step % config.stages_every == 0 and step % REPORT_EVERY == 0)
 
     def step(self, on_step: Callable[[StepReport], None] | None) -> None:
         """One step, and what is due after it."""
         trainer, config = self.trainer, self.trainer.config
-        start = time.perf_counter()
-        result = trainer.train_step()
+        start, stages = time.perf_counter(), None
+        if self.run is not None and self.times_stages(trainer.step + 1):
+            result, stages = measure.timed(trainer.device, trainer.train_step)
+        else:
+            result = trainer.train_step()
         self.seconds += time.perf_counter() - start
         self.tell_plan()
         if trainer.step == config.iterations:
@@ -208,7 +238,7 @@ class _Session:
         if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
             report = self.report(result)
             if report is not None:
-                self.record(report, on_step, evaluating=evaluating)
+                self.record(report, on_step, evaluating=evaluating, stages=stages)
         if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
             self.save()
 
@@ -241,6 +271,7 @@ def train(
     trainer = session.trainer
     if resume:
         session.resume()
+    session.first_step = trainer.step
     session.tell_plan()
     with _interruption() as interrupted:
         while True:
@@ -257,4 +288,6 @@ def train(
         run.save_model(model, photos_space(view.path for view in scene.views))
         if scene.test_views:
             run.write_eval(session.evaluate(keep=True))
+        if config.report:
+            write_last(run, scene, model)
     return model

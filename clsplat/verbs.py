@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb
+from clsplat.cli import Bench, Compare, Demo, Devices, Eval, Render, Report, Selftest, Sfm, Train, Tune, Verb
 from clsplat.errors import DeviceError, InputError
 from clsplat.memory import Plan, parse_bytes
 
@@ -37,6 +37,14 @@ def run(verb: Verb) -> int:
             from clsplat.verb_render import render
 
             return render(verb)
+        case Report():
+            from clsplat.verb_report import report
+
+            return report(verb)
+        case Compare():
+            from clsplat.verb_report import compare
+
+            return compare(verb)
         case Bench():
             return bench(verb)
         case Tune():

@@ -19,7 +19,7 @@ os.environ.setdefault("CLSPLAT_TRUST_DRIVER", "1")  # the test at a driver's fir
 from calls import train
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from pipeline import shaped
-from tiny import CONFIG, write_scene
+from tiny import CONFIG, short, write_scene
 
 from clsplat.device.context import Device, list_devices, open_device
 
@@ -67,4 +67,12 @@ def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of CONFIG by the command line; not to be changed."""
     run = tmp_path_factory.mktemp("trained") / "run"
     assert train(scene, run, CONFIG) == 0
+    return run
+
+
+@pytest.fixture(scope="session")
+def reported(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run with everything that a report shows; not to be changed."""
+    run = tmp_path_factory.mktemp("reported") / "a run"
+    assert train(scene, run, short(stages_every=10, eval_at=(10, 30))) == 0
     return run

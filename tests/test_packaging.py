@@ -11,6 +11,7 @@ import pytest
 from clsplat.device.source import kernel_root
 
 ROOT = Path(__file__).resolve().parents[1]
+TEMPLATES = ("base.html", "compare.html", "page.js", "report.html", "style.css")
 FOUND = "from clsplat.device.source import kernel_root; print(kernel_root())"
 
 
@@ -32,7 +33,9 @@ def test_wheel_has_every_kernel_and_module_and_nothing_else(wheel):
     modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "clsplat").rglob("*.py")}
     assert kernels
     assert {f"clsplat/{name}" for name in kernels} <= names
-    assert names == {f"clsplat/{name}" for name in kernels} | modules | {"clsplat/py.typed", "clsplat/selftest.json"}
+    templates = {f"clsplat/report/templates/{name}" for name in TEMPLATES}
+    files = {"clsplat/py.typed", "clsplat/selftest.json"} | templates
+    assert names == {f"clsplat/{name}" for name in kernels} | modules | files
 
 
 def test_kernels_hold_no_python():

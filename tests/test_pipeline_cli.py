@@ -29,7 +29,7 @@ from clsplat.runs import Run
 
 def test_train_leaves_a_run(trained: Path, scene: Path) -> None:
     names = {str(path.relative_to(trained)) for path in trained.rglob("*") if path.is_file()}
-    expected = {"config.toml", "model.ply", "metrics.jsonl", "eval.json", "test/00.png", "test/08.png"}
+    expected = {"config.toml", "model.ply", "metrics.jsonl", "eval.json", "report.html", "test/00.png", "test/08.png"}
     assert names == {*expected, "checkpoints/step-0000040.npz"}
     run = Run.open(trained)
     assert run.config == CONFIG

@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures of a run, as its files have them: nothing is measured again, and what is missing or damaged is noted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config import TrainConfig
+from clsplat.errors import InputError
+from clsplat.files import digest, parse_json, read_document
+from clsplat.gaussians import Gaussians
+from clsplat.runs import Run
+
+Record = dict[str, Any]
+
+SCORES = ("psnr", "ssim", "lpips")
+CURVES = ("step", "loss", "psnr", "gaussians", "seconds")
+"""Of metrics.jsonl, every record has them."""
+MAX_NAME = 200
+"""Characters of a name of a view, a stage or a device that are shown."""
+MAX_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
+"""What is kept of a file that has more, as none of ours does: the last."""
+LARGEST = 1e30
+
+
+@dataclass
+class Figures:
+    """What a run's files say.
+
+    curves: equally long lists by the names of CURVES; stages: step and milliseconds by stage; evaluations: held-out
+    scores on the way and at the end, by step; evaluation: eval.json; model: of model.ply, without its Gaussians;
+    histograms by name: edges and counts; notes: what is missing, a sentence each.
+    """
+
+    run: Run
+    name: str
+    curves: dict[str, list[float]]
+    stages: list[Record] = field(default_factory=list)
+    evaluations: list[Record] = field(default_factory=list)
+    evaluation: Record | None = None
+    sessions: list[Record] = field(default_factory=list)
+    elapsed: float | None = None
+    model: Record | None = None
+    histograms: dict[str, Record] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def step(self) -> int:
+        """The last that is known of."""
+        steps = [self.curves["step"][-1]] if self.curves["step"] else []
+        return int(max([*steps, *(each["step"] for each in self.evaluations)], default=0))
+
+    @property
+    def seconds(self) -> float | None:
+        """Of training, so far."""
+        known = self.evaluation["seconds"] if self.evaluation else None
+        return known if known is not None else next(reversed(self.curves["seconds"]), None)
+
+    @property
+    def gaussians(self) -> int | None:
+        """In the model, as it or eval.json says, or at the last step."""
+        if self.model is not None:
+            return int(self.model["gaussians"])
+        if self.evaluation is not None and self.evaluation["gaussians"] is not None:
+            return int(self.evaluation["gaussians"])
+        last = next(reversed(self.curves["gaussians"]), None)
+        return None if last is None else int(last)
+
+    def document(self) -> Record:
+        """Everything for --json."""
+        found = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "run"}
+        found["settings"] = asdict(self.run.config)
+        found["scene"] = self.run.scene.name if self.run.scene is not None else None
+        return found
+
+
+def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = True) -> Figures:
+    """All that the run's folder has. model: what model.ply holds, if that is known; describe: whether the model is
+    read at all.
+
+    Raises InputError for metrics that are no metrics at all; whatever else is missing or damaged is a note.
+    """
+    records = [record for record in run.read_metrics() if _is_complete(record)]
+    curves = {name: [float(record[name]) for record in records] for name in CURVES}
+    figures = Figures(run, run.path.resolve().name, curves)
+    for record in records:
+        stages = record.get("stages")
+        if isinstance(stages, dict) and (times := _numbers(stages, MAX_STAGES)).get("all"):
+            figures.stages.append({"step": int(record["step"]), "ms": times})
+        if (found := _evaluation(record.get("eval"))) is not None:
+            figures.evaluations.append({**_summary(found), "step": int(record["step"])})
+        if isinstance(session := record.get("session"), dict):
+            figures.sessions.append(_session(session))
+    for listed in (figures.stages, figures.evaluations):
+        del listed[:-MAX_SAMPLES]
+    del figures.sessions[:-MAX_SESSIONS]
+    figures.elapsed = _elapsed(records)
+    _add_evaluation(figures)
+    if describe:
+        _add_model(figures, model)
+    _add_contributions(figures, records)
+    iterations = run.config.iterations
+    if figures.step < iterations:
+        figures.notes.insert(0, f"Not finished: at step {figures.step:,} of {iterations:,}.")
+    if not records:
+        figures.notes.append("metrics.jsonl has no records: there are no curves.")
+    elif not figures.sessions:
+        figures.notes.append("A run of an earlier version: device, times of stages and contributions are not known.")
+    else:
+        if not figures.stages:
+            figures.notes.append("The time of each stage was not measured (--stages-every 0).")
+        if "contribution" not in figures.histograms and figures.step >= iterations:
+            figures.notes.append("Contributions were not measured: --no-report, or the device's memory is limited.")
+    return figures
+
+
+def number(value: object) -> float | None:
+    """The value as a number of a size that can be drawn, or None."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if -LARGEST <= value <= LARGEST else None
+
+
+def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]:
+    """Each setting by the name of its flag."""
+    for each in fields(config):  # type: ignore[arg-type]  # every caller passes a dataclass
+        value, name = getattr(config, each.name), prefix + each.name.replace("_", "-")
+        if is_dataclass(value):
+            yield from settings_of(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def default_settings() -> dict[str, Any]:
+    """What every setting is unless it is asked for."""
+    return dict(settings_of(TrainConfig()))
+
+
+def smooth(values: list[float], count: int) -> list[float]:
+    """The mean of `count` values about each, fewer at the ends."""
+    sums = np.concatenate([[0.0], np.cumsum(np.asarray(values, np.float64))])
+    at = np.arange(len(values))
+    low, high = np.maximum(at - count // 2, 0), np.minimum(at + count // 2 + 1, len(values))
+    means: list[float] = ((sums[high] - sums[low]) / (high - low)).tolist()
+    return means
+
+
+def _is_complete(record: Mapping[str, Any]) -> bool:
+    return all(number(record.get(name)) is not None for name in CURVES)
+
+
+def _text(value: object) -> str | None:
+    return value[:MAX_NAME] if isinstance(value, str) else None
+
+
+def _numbers(values: Mapping[str, Any], limit: int) -> dict[str, float]:
+    found = {name[:MAX_NAME]: number(value) for name, value in list(values.items())[:limit]}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _evaluation(value: object) -> Record | None:
+    """An evaluation as eval.json holds it, if the value is one."""
+    if not isinstance(value, dict) or not isinstance(value.get("views"), list):
+        return None
+    views = []
+    for view in value["views"][:MAX_VIEWS]:
+        if not isinstance(view, dict) or not isinstance(name := view.get("name"), str):
+            return None
+        views.append({"name": name, **_numbers({key: view.get(key) for key in SCORES}, len(SCORES))})
+    mean = value.get("mean")
+    step = number(value.get("step"))
+    gaussians = number(value.get("gaussians"))
+    return {
+        "step": None if step is None else int(step),
+        "gaussians": None if gaussians is None else int(gaussians),
+        "seconds": number(value.get("seconds")),
+        "mean": _numbers({key: mean.get(key) for key in SCORES}, len(SCORES)) if isinstance(mean, dict) else {},
+        "views": views,
+    }
+
+
+def _summary(evaluation: Record) -> Record:
+    return {"seconds": evaluation["seconds"], "gaussians": evaluation["gaussians"], **evaluation["mean"]}
+
+
+def _session(value: Mapping[str, Any]) -> Record:
+    names = ("started", "device", "driver", "kind", "shape", "system")
+    found: Record = {name: text for name in names if (text := _text(value.get(name))) is not None}
+    found["from_step"] = int(number(value.get("from_step")) or 0)
+    found["memory_limit"] = number(value.get("memory_limit"))
+    versions = value.get("versions")
+    if isinstance(versions, dict):
+        pairs = list(versions.items())[:MAX_STAGES]
+        found["versions"] = {name[:MAX_NAME]: text for name, each in pairs if (text := _text(each)) is not None}
+    return found
+
+
+def _elapsed(records: list[Record]) -> float | None:
+    """Seconds of wall time until the last record, of all sessions together."""
+    total, last = 0.0, None
+    for record in records:
+        if "session" in record and last is not None:
+            total += last
+        last = number(record.get("elapsed"))
+        if last is None:
+            return None
+    return None if last is None else total + last
+
+
+def _add_evaluation(figures: Figures) -> None:
+    run = figures.run
+    if not run.eval_path.exists():
+        figures.notes.append("eval.json is not there: no held-out view has been measured at the end.")
+        return
+    try:
+        found = _evaluation(parse_json(read_document(run.eval_path, "the evaluation of a run")))
+    except (InputError, ValueError):
+        found = None
+    if found is None:
+        figures.notes.append("eval.json is damaged, and left out.")
+        return
+    figures.evaluation = found
+    if not found["views"]:
+        figures.notes.append("eval.json has no held-out views.")
+    step = found["step"]
+    last = figures.curves["step"][-1] if figures.curves["step"] else None
+    if step is not None:
+        others = [each for each in figures.evaluations if each["step"] != step]
+        figures.evaluations = sorted([*others, {**_summary(found), "step": step}], key=lambda each: each["step"])
+        if last is not None and step != last:
+            figures.notes.append(f"eval.json is of step {step:,}, metrics.jsonl goes to step {int(last):,}.")
+
+
+def _add_model(figures: Figures, model: Gaussians | None) -> None:
+    path: Path = figures.run.model_path
+    if not path.exists():
+        figures.notes.append("model.ply is not there: there is no model to describe.")
+        return
+    try:
+        model = model or Gaussians.load(path)
+        size, sha256 = path.stat().st_size, digest(path)
+    except (InputError, OSError) as error:
+        figures.notes.append(f"model.ply cannot be read: {str(error).removeprefix(f'{path}: ')}")
+        return
+    figures.model = {"gaussians": len(model), "sh_degree": model.sh_degree, "bytes": size, "sha256": sha256}
+    scales = np.sort(model.log_scales, axis=1) / np.float32(np.log(10))
+    low, high = (np.floor(scales.min() * 5) / 5, np.ceil(scales.max() * 5) / 5) if len(model) else (0.0, 1.0)
+    edges = np.linspace(low, max(high, low + 0.2), 41)
+    for name, axis in (("smallest scale", 0), ("largest scale", 2)):
+        figures.histograms[name] = _histogram(scales[:, axis], edges)
+    opacities = 1 / (1 + np.exp(-np.clip(model.opacity_logits, -80, 80)))
+    figures.histograms["opacity"] = _histogram(opacities, np.linspace(0.0, 1.0, 41))
+
+
+def _histogram(values: NDArray[Any], edges: NDArray[np.float64]) -> Record:
+    counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
+    return {"edges": np.round(edges, 6).tolist(), "counts": counts.tolist()}
+
+
+def _add_contributions(figures: Figures, records: list[Record]) -> None:
+    found = records[-1].get("contributions") if records else None
+    if isinstance(found, dict):
+        edges, counts = found.get("edges"), found.get("counts")
+        if isinstance(edges, list) and isinstance(counts, list) and len(edges) == len(counts) + 1 > 1:
+            values = [[number(each) for each in part] for part in (edges, counts)]
+            rest = [number(found.get(name)) for name in ("views", "of", "none")]
+            if None not in [*values[0], *values[1], *rest] and values[0] == sorted(values[0], key=lambda x: x or 0.0):
+                views, of, none = (int(each or 0) for each in rest)
+                whole = [int(each or 0) for each in values[1]]
+                known = {"edges": values[0], "counts": whole, "views": views, "of": of, "none": none}
+                figures.histograms["contribution"] = known

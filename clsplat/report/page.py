@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: Apache-2.0
+"""report.html: a run on one page that needs nothing else, neither files nor a network."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+import clsplat
+from clsplat.evaluate import background_colour
+from clsplat.files import atomic_write
+from clsplat.gaussians import Gaussians
+from clsplat.report import NAME, pictures
+from clsplat.report.figures import (
+    CURVES,
+    MAX_STAGES,
+    SCORES,
+    Figures,
+    default_settings,
+    read_figures,
+    settings_of,
+    smooth,
+)
+from clsplat.report.svg import Series, chart, short
+from clsplat.runs import Run
+from clsplat.scene import Scene
+
+MAX_VIEWS = 8
+"""Held-out views with pictures, unless asked for others."""
+MAX_RECORDS = 2000
+"""Records of metrics.jsonl whose figures are in the page."""
+MAX_ROWS = 200
+"""Views in the table."""
+NAMED_STAGES = 7
+"""Stages with a colour of their own; the smaller ones are drawn together."""
+TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
+
+
+def write_report(
+    run: Run,
+    path: Path | None = None,
+    *,
+    scene: Scene | str | None = None,
+    model: Gaussians | None = None,
+    views: int = MAX_VIEWS,
+) -> Figures:
+    """Write the page, atomically, to `path` or into the run's folder; what it shows.
+
+    scene: the run's, or why there is none, if that is known; model: what model.ply holds, likewise; views: most
+    held-out views with pictures. Raises InputError for metrics that cannot be read, OSError as writing does.
+    """
+    figures = read_figures(run, model)
+    page = report_page(figures, scene, views)
+    atomic_write(path or run.path / NAME, page.encode("utf-8", "replace"))
+    return figures
+
+
+def report_page(figures: Figures, scene: Scene | str | None = None, views: int = MAX_VIEWS) -> str:
+    """The page's HTML."""
+    evaluation = figures.evaluation
+    listed = evaluation["views"] if evaluation else []
+    shown: list[pictures.Shown] = []
+    notes = list(figures.notes)
+    if listed and views > 0:
+        scene = scene if scene is not None else pictures.scene_of(figures.run)
+        if isinstance(scene, str):
+            notes.append(f"There are renders without photographs: {scene}.")
+        names = [view["name"] for view in listed]
+        wanted = pictures.chosen([view.get("psnr") for view in listed], views)
+        background = background_colour(figures.run.config.background)
+        shown = pictures.show(figures.run, names, wanted, None if isinstance(scene, str) else scene, background)
+        if len(shown) < len(wanted):
+            notes.append(f"{len(wanted) - len(shown)} renders of held-out views are not in test/, or cannot be read.")
+    scores = {view["name"]: view for view in listed}
+    places = {each.name: place for place, each in enumerate(shown, 1)}
+    return render_page(
+        "report.html",
+        figures=figures,
+        notes=notes,
+        summary=summary(figures),
+        charts=[each for each in charts(figures) if each],
+        histograms=[each for each in histograms(figures) if each],
+        stages=stage_rows(figures),
+        shown=[(place, each, scores[each.name]) for place, each in enumerate(shown, 1)],
+        places=places,
+        left_out=len(listed) - len(shown),
+        white_error=pictures.WHITE_ERROR,
+        columns=[(name, TITLES[name]) for name in SCORES if any(name in view for view in listed)],
+        views=listed[:MAX_ROWS],
+        views_left_out=max(len(listed) - MAX_ROWS, 0),
+        settings=setting_rows(figures),
+        machine=machine_rows(figures),
+        data=_data(figures),
+    )
+
+
+def render_page(name: str, **values: Any) -> str:
+    """A template filled in, with everything escaped that is not Markup."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("clsplat.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(short=short, duration=duration, score=score, count=count)
+    folder = Path(__file__).parent / "templates"
+    style, script = ((folder / file).read_text("utf-8") for file in ("style.css", "page.js"))
+    return environment.get_template(name).render(
+        style=Markup(style),  # noqa: S704  # our own files
+        script=Markup(script),  # noqa: S704
+        hashes=[_hash(style), _hash(script)],
+        version=clsplat.__version__,
+        **values,
+    )
+
+
+def summary(figures: Figures) -> list[tuple[str, str, str]]:
+    """What comes first: label, text and figure."""
+    mean = figures.evaluation["mean"] if figures.evaluation else {}
+    rows = [(TITLES[name], score(mean[name], name), repr(mean[name])) for name in SCORES if name in mean]
+    if figures.gaussians is not None:
+        rows.append(("Gaussians", f"{figures.gaussians:,}", str(figures.gaussians)))
+    rows.append(("steps", f"{figures.step:,}", str(figures.step)))
+    if figures.seconds is not None:
+        rows.append(("training", duration(figures.seconds), repr(figures.seconds)))
+    return rows
+
+
+def charts(figures: Figures) -> list[Markup]:
+    """Loss, PSNR, Gaussians, time of stages, time of training, by step."""
+    curves, steps = figures.curves, figures.curves["step"]
+    around = max(len(steps) // 50, 5)
+    note = f"each tenth step, of one view; the line is the mean of {around} records" if len(steps) > 20 else ""
+    made = []
+    for name, label in (("loss", "loss"), ("psnr", "PSNR, dB")):
+        rows = list(zip(steps, curves[name], strict=True))
+        series = [Series("training view", rows, "faint", 0)] if len(steps) > 20 else []
+        means = smooth(curves[name], around) if len(steps) > 20 else curves[name]
+        series.append(
+            Series("training views, mean" if series else "training view", list(zip(steps, means, strict=True)))
+        )
+        if name == "psnr":
+            series.append(Series("held-out views", _held_out(figures, "step"), "dots", 1))
+        title = {"loss": "Loss", "psnr": "PSNR"}[name]
+        made.append(chart(title, series, "step", label, log_y=name == "loss", note=note))
+    grown = Series("Gaussians", list(zip(steps, curves["gaussians"], strict=True)), color=2)
+    made.append(chart("Number of Gaussians", [grown], "step", "Gaussians", from_zero=True))
+    made.append(stage_chart(figures))
+    trained = Series("training", [(0.0, 0.0), *zip(steps, curves["seconds"], strict=True)], color=4)
+    if steps:
+        made.append(chart("Time", [trained], "step", "seconds of training", from_zero=True))
+    made.append(
+        chart("Time against PSNR", [Series("held-out views", _held_out(figures, "seconds"), "dots", 1)],
+              "seconds of training", "PSNR, dB")
+    )  # fmt: skip
+    return made
+
+
+def stage_chart(figures: Figures) -> Markup:
+    """Milliseconds of each stage, stacked, the small ones together; bars where there are too few for a curve."""
+    if len(figures.stages) < 2:
+        return Markup("")
+    names = [name for name, *_ in stage_rows(figures)]
+    named = names if len(names) <= NAMED_STAGES + 1 else names[:NAMED_STAGES]
+    steps = [float(each["step"]) for each in figures.stages]
+    tops, series = [0.0] * len(steps), []
+    groups = [(name, [name]) for name in named]
+    if rest := names[len(named) :]:
+        groups.append((f"{len(rest)} smaller ones", rest))
+    for color, (label, members) in enumerate(groups):
+        added = [sum(each["ms"].get(name, 0.0) for name in members) for each in figures.stages]
+        tops = [top + more for top, more in zip(tops, added, strict=True)]
+        series.append(Series(label, list(zip(steps, tops, strict=True)), "area", color))
+    return chart("Time per stage", series, "step", "ms of a step", note="waiting for the device after each stage")
+
+
+def stage_rows(figures: Figures) -> list[tuple[str, float, float, float]]:
+    """Of each stage its median and last milliseconds, and its share of the last step; the largest first."""
+    if not figures.stages:
+        return []
+    last = figures.stages[-1]["ms"]
+    names = sorted({name for each in figures.stages for name in each["ms"]} - {"all"})[:MAX_STAGES]
+    rows = []
+    for name in names:
+        values = sorted(each["ms"].get(name, 0.0) for each in figures.stages)
+        now = last.get(name, 0.0)
+        rows.append((name, values[len(values) // 2], now, now / last["all"]))
+    return sorted(rows, key=lambda row: -row[2])
+
+
+def histograms(figures: Figures) -> list[Markup]:
+    """Scales, opacities, contributions."""
+    found = figures.histograms
+    scales = [Series(name, _bars(found[name]), "bars", color)
+              for color, name in ((0, "largest scale"), (1, "smallest scale")) if name in found]  # fmt: skip
+    made = [chart("Scales", scales, "world units", "Gaussians", powers=True, note="standard deviations")]
+    if "opacity" in found:
+        made.append(chart("Opacity", [Series("opacity", _bars(found["opacity"]), "bars", 2)], "opacity", "Gaussians"))
+    if "contribution" in found:
+        of = found["contribution"]
+        note = f"largest to one of {of['views']} of {of['of']} training views; {of['none']:,} contribute to none"
+        series = Series("contribution", _bars(of), "bars", 3)
+        made.append(chart("Contribution", [series], "pixels", "Gaussians", powers=True, note=note))
+    return made
+
+
+def setting_rows(figures: Figures) -> list[tuple[str, str, str, bool]]:
+    """Flag, value, default and whether they differ."""
+    defaults = default_settings()
+    return [
+        (name, setting_text(value), setting_text(defaults[name]), value != defaults[name])
+        for name, value in settings_of(figures.run.config)
+    ]
+
+
+def setting_text(value: object) -> str:
+    """For people, lists with spaces, so that they can be wrapped."""
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def machine_rows(figures: Figures) -> list[tuple[str, str]]:
+    """Device, driver, versions, model, seed, time."""
+    run, rows = figures.run, []
+    for index, each in enumerate(figures.sessions):
+        after = f", from step {each['from_step']:,}" if len(figures.sessions) > 1 or each["from_step"] else ""
+        label = "trained" if index == 0 else "then"
+        words = [each.get("started", "").replace("T", " ").replace("+00:00", " UTC") + after]
+        rows.append((label, words[0].strip(", ")))
+        if index == 0 or each.get("device") != figures.sessions[index - 1].get("device"):
+            rows += [("device", f"{each.get('device', 'not known')} ({each.get('kind', '?')})")]
+        rows += [("driver", each.get("driver", "not known").split("  ")[0])]
+        rows += [("kernels' shape", each["shape"])] if "shape" in each else []
+        rows += [("system", each["system"])] if "system" in each else []
+        if each["memory_limit"] is not None:
+            rows.append(("memory limit", f"{each['memory_limit'] / 2**20:,.0f} MiB"))
+        versions = each.get("versions", {})
+        rows.append(("versions", ", ".join(f"{name} {text}" for name, text in versions.items()) or "not known"))
+    rows.append(("seed", str(run.config.seed)))
+    if figures.seconds is not None:
+        rows.append(("time of training", f"{duration(figures.seconds)}, steps alone"))
+    if figures.elapsed is not None:
+        rows.append(("wall time", f"{duration(figures.elapsed)} until the last step, with evaluations and checkpoints"))
+    if run.scene is not None:
+        rows.append(("scene", run.scene.name))
+    if figures.model is not None:
+        model = figures.model
+        size = f"{model['bytes'] / 1e6:,.1f} MB, {model['gaussians']:,} Gaussians, SH degree {model['sh_degree']}"
+        rows += [("model.ply", size), ("its SHA-256", model["sha256"])]
+    return rows
+
+
+def duration(seconds: float | None) -> str:
+    """12.3 s, 4 min 5 s, 2 h 3 min."""
+    if seconds is None:
+        return "not known"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def score(value: float, name: str) -> str:
+    """With the digits that mean something."""
+    return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
+
+
+def count(value: float) -> str:
+    """With thousands."""
+    return f"{value:,.0f}"
+
+
+def _held_out(figures: Figures, x: str) -> list[tuple[float, float]]:
+    found = [(each.get(x), each.get("psnr")) for each in figures.evaluations]
+    return [(float(a), b) for a, b in found if a is not None and b is not None]
+
+
+def _bars(histogram: dict[str, Any]) -> list[tuple[float, float]]:
+    edges, counts = histogram["edges"], histogram["counts"]
+    return list(zip(edges, [*counts, 0], strict=True))
+
+
+def _data(figures: Figures) -> dict[str, Any]:
+    """What the page holds for programs: the figures, unrounded."""
+    length = len(figures.curves["step"])
+    every = -(-length // MAX_RECORDS) or 1
+    kept: Sequence[int] = sorted({*range(0, length, every), *([length - 1] if length else [])})
+    curves = {name: [figures.curves[name][index] for index in kept] for name in CURVES}
+    return {
+        "run": figures.name,
+        "records": length,
+        "curves": curves,
+        "stages": figures.stages,
+        "evaluation": figures.evaluation,
+        "evaluations": figures.evaluations,
+        "model": figures.model,
+        "histograms": figures.histograms,
+        "settings": dict(settings_of(figures.run.config)),
+    }
+
+
+def _hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def json_text(value: object) -> str:
+    """For --json."""
+    return json.dumps(value, indent=2, allow_nan=False)

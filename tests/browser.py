@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A headless Chromium for tests of pages: the system's own, driven by Playwright. Skips with the reason without one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+ARGUMENTS = ("--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Of root in a container, with little shared memory, and without a GPU."""
+
+
+def chromium_path() -> str | None:
+    """The browser: CLSPLAT_CHROMIUM, or what the path has; None where there is none."""
+    named = os.environ.get("CLSPLAT_CHROMIUM")
+    return next((found for name in ([named] if named else NAMES) if (found := shutil.which(name))), None)
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """A Playwright browser. Make a page of it with `browser.new_page()`, and close that."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="the extra `test` brings playwright")
+    path = chromium_path()
+    if path is None:
+        pytest.skip("no Chromium on this system: apt-get install chromium, or set CLSPLAT_CHROMIUM")
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=path, args=list(ARGUMENTS))
+        yield opened
+        opened.close()
+
+
+def watched_page(browser: Any, **options: Any) -> tuple[Any, list[str]]:
+    """A page, and what it said on its console or could not load, of errors alone; options as of `new_page`."""
+    page, trouble = browser.new_page(**options), []
+    page.on("console", lambda message: trouble.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: trouble.append(str(error)))
+    page.on("requestfailed", lambda request: trouble.append(f"{request.url[:100]}: {request.failure}"))
+    return page, trouble
+
+
+def keep_screenshot(page: Any, name: str, folder: Path) -> Path:
+    """A picture of the whole page, in CLSPLAT_ARTEFACTS if that is set, else in the test's own folder."""
+    kept = Path(os.environ.get("CLSPLAT_ARTEFACTS") or folder)
+    kept.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=kept / f"{name}.png", full_page=True)
+    return kept / f"{name}.png"
