@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from models import assert_equal, random_gaussians, real_file
 
-from clsplat import ply
 from clsplat.errors import InputError
+from clsplat.formats import ply
 from clsplat.gaussians import Gaussians
 
 NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3))]

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from spoilers import MOST_BYTES, SPOILERS, spoil_place
 
-from clsplat import colmap, ply, runs, sfm, sfm_photos, transforms
+from clsplat import colmap, runs, sfm, sfm_photos, transforms
 from clsplat.config import TrainConfig
+from clsplat.formats import ply
 from clsplat.gaussians import Gaussians
 from clsplat.images import image_size, read_image, write_image
 from clsplat.scene import load_scene

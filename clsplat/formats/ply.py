@@ -27,6 +27,11 @@ from clsplat.errors import InputError, plain
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
+NAME = "3DGS PLY"
+SUFFIXES = (".ply",)
+FLOAT = True
+LOSES = "nothing"
+
 BLOCK_ROWS = 1 << 15
 MAX_HEADER_LINES = 10_000
 MAX_LINE_BYTES = 1 << 20
@@ -83,6 +88,11 @@ class Header:
         """The packed record of one row of a binary file."""
         order = BYTE_ORDERS[self.format]
         return np.dtype([(name, order + code) for name, code in element.properties])
+
+
+def recognises(head: bytes) -> bool:
+    """A PLY whose vertices have a property of Gaussians that are not packed."""
+    return head.startswith(b"ply") and b"packed_position" not in head.partition(b"end_header")[0]
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
