@@ -3,8 +3,8 @@
 
 A format is a module of this package that has
 
-- `NAME`, what it is called, and `SUFFIXES`, the endings of its files in lower case, such as .compressed.ply, the longest
-  first; one without a dot is a whole name;
+- `NAME`, what it is called, and `SUFFIXES`, the endings of its files in lower case, such as .compressed.ply,
+  the longest first; one without a dot is a whole name;
 - `read(path) -> Gaussians`, which raises InputError, one line with the path, for a file that is not as it should be;
 - `write(path, gaussians)`, atomic, with further settings as keyword arguments; absent where it is only read;
 - `recognises(head) -> bool`, whether these first bytes (`HEAD_BYTES` at most) are of the format; may be absent;
