@@ -91,16 +91,16 @@ class Header:
 
 
 def recognises(head: bytes) -> bool:
-    """A PLY whose vertices have a property of Gaussians that are not packed."""
+    """A PLY that is not the compressed one."""
     return head.startswith(b"ply") and b"packed_position" not in head.partition(b"end_header")[0]
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read a 3DGS PLY: ascii or binary of either byte order, properties in any order, of any numeric type.
 
-    SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45). Other properties are ignored. Bytes after the
-    data give a warning. Raises InputError, one line with the path: not a PLY, truncated, a property missing, values
-    that are not finite, no Gaussians, no such file.
+    SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45); of degree 4 (72) the fourth is left out, with a
+    warning. Other properties are ignored. Bytes after the data give a warning. Raises InputError, one line with the
+    path: not a PLY, truncated, a property missing, values that are not finite, no Gaussians, no such file.
     """
     path = Path(path)
     with open_input(path, "a 3DGS PLY") as file:
@@ -262,19 +262,20 @@ def _vertex_element(header: Header, path: Path) -> tuple[Element, list[Element]]
 def _check_properties(vertex: Element, path: Path) -> int:
     """The number of f_rest properties. Raises InputError where the layout is not a 3DGS model's."""
     names = [name for name, _ in vertex.properties]
-    if "packed_position" in names:
-        raise InputError(f"{path}: a compressed PLY (packed_position), expected the 3DGS layout with x y z f_dc_*")
     missing = [name for name in REQUIRED if name not in names]
     if missing:
         noun = "property" if len(missing) == 1 else "properties"
         raise InputError(f"{path}: PLY lacks the {noun} {' '.join(missing)}, expected a 3DGS model")
     rest = sum(name.startswith("f_rest_") for name in names)
-    counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 1)]
+    counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 2)]
     if rest not in counts:
         raise InputError(f"{path}: PLY has {rest} f_rest properties, expected {', '.join(map(str, counts))}")
     for index in range(rest):
         if f"f_rest_{index}" not in names:
             raise InputError(f"{path}: PLY lacks the property f_rest_{index}, though it has {rest} of f_rest")
+    if rest == counts[-1]:
+        left_out = f"SH of degree {MAX_SH_DEGREE + 1} is left out, {MAX_SH_DEGREE} is the highest that is known"
+        warnings.warn(plain(f"{path}: {left_out}"), stacklevel=3)
     return rest
 
 
@@ -370,16 +371,18 @@ def _ascii_blocks(
 def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gaussians:
     """Gather the columns into arrays and refuse values that are not finite."""
     higher = rest // 3
+    kept = min(higher, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
     # The first block is read before anything is allocated: an ascii file's count is only a claim.
     first_block = next(blocks)
     means, scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     quaternions, opacities = np.empty((count, 4), np.float32), np.empty(count, np.float32)
-    sh = np.empty((count, 1 + higher, 3), np.float32)
+    sh = np.empty((count, 1 + kept, 3), np.float32)
     columns: dict[str, NDArray[np.float32]] = {"opacity": opacities}
     for names, array in ((POSITION, means), (SCALE, scales), (ROTATION, quaternions), (DC, sh[:, 0])):
         columns.update({name: array[:, index] for index, name in enumerate(names)})
     for index in range(rest):
-        columns[f"f_rest_{index}"] = sh[:, 1 + index % higher, index // higher]
+        if index % higher < kept:
+            columns[f"f_rest_{index}"] = sh[:, 1 + index % higher, index // higher]
 
     start, bad_positions, first_bad = 0, 0, -1
     other: tuple[int, str] | None = None
