@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb
+from clsplat.cli_files import Convert, Info
 from clsplat.errors import DeviceError, InputError
 from clsplat.memory import Plan, parse_bytes
 
@@ -37,6 +38,14 @@ def run(verb: Verb) -> int:
             from clsplat.verb_render import render
 
             return render(verb)
+        case Convert():
+            from clsplat.verb_convert import convert
+
+            return convert(verb)
+        case Info():
+            from clsplat.verb_convert import info
+
+            return info(verb)
         case Bench():
             return bench(verb)
         case Tune():

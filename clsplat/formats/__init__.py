@@ -9,6 +9,7 @@ A format is a module of this package that has
 - `write(path, gaussians)`, atomic, with further settings as keyword arguments; absent where it is only read;
 - `recognises(head) -> bool`, whether these first bytes (`HEAD_BYTES` at most) are of the format; may be absent;
 - `describe(path) -> dict`, what `clsplat info` says beside what every model has; may be absent;
+- `order(gaussians) -> (n,)`, which Gaussian each row of a written file is, where that is not their own order;
 - `LOSES`, in a few words what the format does not keep, "nothing" for floats; and `FLOAT`, whether it keeps floats.
 
 Its docstring cites the specification and says what the format has in place of our conventions (docs/conventions.md).

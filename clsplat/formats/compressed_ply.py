@@ -19,6 +19,7 @@ A chunk's Gaussians share its bounds, so that they are sorted to lie near each o
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -79,12 +80,20 @@ def read(path: Path) -> Gaussians:
     return packing.check_finite(found, path)
 
 
-def write(path: Path, gaussians: Gaussians) -> None:
-    """Write it, atomically, the Gaussians in the order of `order`."""
+def describe(path: Path) -> dict[str, Any]:
+    """Of `clsplat info`: comments."""
+    with open_input(path, "a compressed PLY") as file:
+        return {"comments": ply.read_header(file, path).comments}
+
+
+def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> None:
+    """Write it, atomically, the Gaussians in the order of `order`. comments: lines of the header, in ASCII."""
+    ply.check_comments(comments)
     gaussians.check()
     rows, count = order(gaussians), len(gaussians)
     rest = 3 * (gaussians.sh.shape[1] - 1)
     lines = ["ply", "format binary_little_endian 1.0", "comment clsplat"]
+    lines += [f"comment {line}" for line in comments]
     lines += [f"element chunk {-(-count // CHUNK)}", *(f"property float {name}" for name in BOUNDS)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
     lines += [f"element sh {count}", *(f"property uchar f_rest_{index}" for index in range(rest))] if rest else []

@@ -116,6 +116,13 @@ def read(path: Path) -> Gaussians:
     return packing.check_finite(gaussians, path)
 
 
+def describe(path: Path) -> dict[str, Any]:
+    """Of `clsplat info`: version and compression level."""
+    with open_input(path, "a .ksplat file") as file:
+        header = packing.read_rows(file, HEADER, 1, path)[0]
+    return {"version": f"{header['major']}.{header['minor']}", "level": int(header["level"])}
+
+
 def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) -> list[Section]:
     """All of them, checked against the file's size."""
     at = HEADER.itemsize + sections * SECTION.itemsize

@@ -83,6 +83,7 @@ class Header:
     elements: list[Element]
     size: int
     origin: NDArray[np.float64] | None = None
+    comments: list[str] = field(default_factory=list)
 
     def row_type(self, element: Element) -> np.dtype[Any]:
         """The packed record of one row of a binary file."""
@@ -115,6 +116,35 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         return gaussians
 
 
+def read_blocks(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians in the file's order, some rows at a time, in the world; values that are not finite are passed on.
+    Raises InputError as `read`."""
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+        vertex, _ = _vertex_element(header, path)
+        rest = _check_properties(vertex, path)
+        higher, kept = rest // 3, min(rest // 3, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
+        names = [*DC, *(f"f_rest_{c * higher + k}" for k in range(kept) for c in range(3))]
+        for block in read_vertices(file, header, path, "Gaussian") if vertex.count else ():
+
+            def columns(*of: str, block: Block = block) -> NDArray[np.float32]:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    return np.stack([block[name].astype(np.float32) for name in of], axis=1)
+
+            sh = columns(*names).reshape(-1, 1 + kept, 3)
+            yield Gaussians(columns(*POSITION), columns(*ROTATION), columns(*SCALE), columns("opacity")[:, 0], sh)
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Of `clsplat info`: encoding, comments, properties that are ignored."""
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+    vertex, _ = _vertex_element(header, path)
+    known = {*REQUIRED, "nx", "ny", "nz"}
+    ignored = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
+    return {"encoding": header.format, "comments": header.comments, "ignored": ignored}
+
+
 def write(
     path: str | os.PathLike[str],
     gaussians: Gaussians,
@@ -128,9 +158,7 @@ def write(
     the header, such as `colour.comment`. Raises ValueError where the degree is lower than the model's, a comment is no
     line of ASCII, or an array is not as `Gaussians` says.
     """
-    for line in comments:
-        if not (line.isascii() and line.isprintable()):
-            raise ValueError(f"comment {line!r}: expected one line of ASCII")
+    check_comments(comments)
     gaussians.check()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
@@ -163,12 +191,20 @@ def write(
             file.write(np.ascontiguousarray(gaussians.means, "<f4").data)
 
 
+def check_comments(comments: Sequence[str]) -> None:
+    """Raise ValueError for one that is no line of ASCII."""
+    for line in comments:
+        if not (line.isascii() and line.isprintable()):
+            raise ValueError(f"comment {line!r}: expected one line of ASCII")
+
+
 def read_header(file: BinaryIO, path: Path) -> Header:
     """Read the header and leave `file` at the first byte after it. Raises InputError."""
     if file.read(3) != b"ply" or file.readline(16).strip():
         raise InputError(f"{path}: not a PLY file (it does not begin with a line 'ply')")
     form = ""
     elements: list[Element] = []
+    comments: list[str] = []
     origin = None
     for _ in range(MAX_HEADER_LINES):
         line = file.readline(4096)
@@ -177,12 +213,13 @@ def read_header(file: BinaryIO, path: Path) -> Header:
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
             origin = _origin(words) if words[:3] == ORIGIN else origin
+            comments += [" ".join(words[1:])] if words else []
             continue
         if words == ["end_header"]:
             if form not in ("ascii", *BYTE_ORDERS):
                 expected = "ascii, binary_little_endian or binary_big_endian"
                 raise InputError(f"{path}: PLY header has the format {form or 'missing'!r}, expected {expected}")
-            return Header(form, elements, file.tell(), origin)
+            return Header(form, elements, file.tell(), origin, comments)
         try:
             match words:
                 case ["format", name, _]:
