@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The 3DGS model file: a PLY with one vertex a Gaussian, as the paper's authors wrote it and every tool reads it.
 
+https://github.com/graphdeco-inria/gaussian-splatting (scene/gaussian_model.py, save_ply).
 Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. f_rest is channel-major: all higher
 coefficients of red, then of green, then of blue. Files are streamed in blocks of rows, so that reading or writing
 costs the model's own memory and little more.
