@@ -120,10 +120,11 @@ def test_every_degree_of_sh(name: str, degree: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_the_same_model_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
-    for stem in ("a", "b"):
-        formats.save(path_of(WRITTEN[name], tmp_path, stem), edit.take(asymmetric(), np.arange(300)))
-    a, b = (path_of(WRITTEN[name], tmp_path, stem).read_bytes() for stem in ("a", "b"))
-    assert a == b
+    paths = [path_of(WRITTEN[name], tmp_path / folder) for folder in ("a", "b")]  # a name may be in the file
+    for path in paths:
+        path.parent.mkdir()
+        formats.save(path, edit.take(asymmetric(), np.arange(300)))
+    assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
 @pytest.mark.parametrize("name", WRITTEN)
@@ -177,14 +178,15 @@ def test_the_loss_is_small_in_every_attribute(name: str, tmp_path: Path) -> None
     found = fidelity.errors(written, formats.load(path))
     exact = getattr(module, "FLOAT", False)
     # Floats: logs and logits of what is stored, and unit quaternions, are rounded once more. Else: positions to 10
-    # bits, scales and opacities to 7 or 8, rotations to 8, colour to 8, SH to half a step of 5 bits of -4 to 4.
+    # bits, scales and opacities to 7 or 8, rotations to 8, colour to 8. SH of which every one is different are the worst
+    # for a palette: the render has to do, this bound is of four of their standard deviations.
     limits = {
         "position_relative": (1e-6, 2e-3),
         "scale": (2e-6, 0.1),
         "rotation": (1e-3, 2.0),
         "opacity": (1e-6, 0.01),
         "colour": (1e-6, 0.3),
-        "sh": (1e-6, 0.13),
+        "sh": (1e-6, 0.5),
     }
     for attribute, (for_floats, else_) in limits.items():
         assert found[attribute]["largest"] <= (for_floats if exact else else_), attribute
