@@ -26,6 +26,8 @@ SUFFIXES = (".splat",)
 FLOAT = False
 LOSES = "SH beyond degree 0; colour, opacity and rotation to 8 bits, colour beyond 0 to 1"
 MAX_SH_DEGREE = 0
+UNIT_SLACK = 0.1
+"""Bytes make unit quaternions longer by 0.02 at most."""
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quaternions", "u1", 4)])
 
@@ -37,6 +39,8 @@ def read(path: Path) -> Gaussians:
         count, over = divmod(size, ROW.itemsize)
         if over or not count:
             raise InputError(f"{path}: has {size} bytes, expected some Gaussians of {ROW.itemsize} bytes each")
+        _check_first(packing.read_rows(file, ROW, min(BLOCK_ROWS, count), path), path)
+        file.seek(0)
         found = packing.empty(count, 0)
         for start in range(0, count, BLOCK_ROWS):
             block = packing.read_rows(file, ROW, min(BLOCK_ROWS, count - start), path)
@@ -47,6 +51,13 @@ def read(path: Path) -> Gaussians:
             found.opacity_logits[rows] = packing.logits(block["rgba"][:, 3] / 255)
             found.quaternions[rows] = block["quaternions"].astype(np.float32) / 128 - 1
     return packing.check_finite(found, path)
+
+
+def _check_first(block: Any, path: Path) -> None:
+    """Raise InputError where most of these have no rotation: there is no header to tell what else this might be."""
+    lengths = np.linalg.norm(block["quaternions"].astype(np.float32) / 128 - 1, axis=1)
+    if np.median(lengths) > 1 + UNIT_SLACK:
+        raise InputError(f"{path}: not a .splat file (rotations of length {np.median(lengths):.2f}, expected 1)")
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
