@@ -229,7 +229,7 @@ class Bench:
     docs/performance.md says what the figures mean.
     """
 
-    source: Annotated[Positional[Path | None], arg(metavar="SCENE|RUN|MODEL.ply")] = None
+    source: Annotated[Positional[Path | None], arg(metavar="SCENE|RUN|MODEL")] = None
     """A scene as training starts it, a run, or a model file; a made-up scene if not given."""
     gaussians: int = 200_000
     """Gaussians of the made-up scene."""

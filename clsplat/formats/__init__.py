@@ -80,6 +80,11 @@ def format_of(path: Path) -> ModuleType:
     return named or format_of_name(path)
 
 
+def is_model_name(path: Path) -> bool:
+    """Whether the ending is one of a model file."""
+    return _named(path) is not None
+
+
 def _named(path: Path) -> ModuleType | None:
     try:
         return format_of_name(path)
