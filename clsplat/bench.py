@@ -22,6 +22,7 @@ from clsplat.camera import Camera
 from clsplat.config import DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
+from clsplat.formats import is_model_name
 from clsplat.gaussians import Gaussians
 from clsplat.initialise import from_points, random_points
 from clsplat.rendering import Frame, Renderer, held_sh
@@ -89,7 +90,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
             return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
         config = run.config
         scene = load_scene(run.scene, resolution=config.resolution, test_every=config.test_every, progress=progress)
-    elif path.suffix.lower() == ".ply":
+    elif is_model_name(path):
         gaussians = Gaussians.load(path)
         return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
     else:

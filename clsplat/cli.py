@@ -21,6 +21,7 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
+from clsplat.cli_files import Convert, Info
 from clsplat.config import (
     PRESETS,
     Compression,
@@ -127,7 +128,7 @@ class Eval:
     Given a run, eval.json and test/ are written anew.
     """
 
-    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
+    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL")]
     """A run's folder or a model file; for a file in a run's folder that run's settings hold."""
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None
     """Folder with the scene; the one the run was trained on if not given."""
@@ -151,7 +152,7 @@ class Eval:
 class Render:
     """Render a model from the cameras of a file or along a path made from them, an image for each frame."""
 
-    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
+    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL")]
     """A run's folder or a model file."""
     cameras: Annotated[Path, arg(metavar="PATH")]
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
@@ -236,7 +237,7 @@ class Bench:
     docs/performance.md says what the figures mean.
     """
 
-    source: Annotated[Positional[Path | None], arg(metavar="SCENE|RUN|MODEL.ply")] = None
+    source: Annotated[Positional[Path | None], arg(metavar="SCENE|RUN|MODEL")] = None
     """A scene as training starts it, a run, or a model file; a made-up scene if not given."""
     gaussians: int = 200_000
     """Gaussians of the made-up scene."""
@@ -319,7 +320,7 @@ class Compare:
     """Print JSON instead of the table."""
 
 
-Verb = Devices | Demo | Sfm | Train | Eval | Render | Report | Compare | Bench | Tune | Selftest
+Verb = Devices | Demo | Sfm | Train | Eval | Render | Report | Compare | Convert | Info | Bench | Tune | Selftest
 Commands = (
     Annotated[Devices, subcommand("devices")]
     | Annotated[Demo, subcommand("demo")]
@@ -329,6 +330,8 @@ Commands = (
     | Annotated[Render, subcommand("render")]
     | Annotated[Report, subcommand("report")]
     | Annotated[Compare, subcommand("compare")]
+    | Annotated[Convert, subcommand("convert")]
+    | Annotated[Info, subcommand("info")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Selftest, subcommand("selftest")]

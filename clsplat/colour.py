@@ -54,7 +54,7 @@ def comment(space: str) -> str:
 def recorded_space(path: str | os.PathLike[str]) -> str:
     """The space that a model file's header records, sRGB where it records none."""
     with open(path, "rb") as file:
-        for line in file:
+        for line in iter(lambda: file.readline(4097), b""):  # not `in file`: other formats have no lines
             words = line.decode("ascii", "replace").strip()
             if words == "end_header" or len(line) > 4096:
                 break

@@ -63,17 +63,17 @@ class Gaussians:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Gaussians:
-        """Read a 3DGS PLY, see `clsplat.ply.read`. Raises InputError naming the file and the trouble."""
-        from clsplat.ply import read
+        """Read a model file of any format, see `clsplat.formats`. Raises InputError naming the file and the trouble."""
+        from clsplat.formats import load
 
-        return read(path)
+        return load(path)
 
     def save(self, path: str | os.PathLike[str], *, sh_degree: int | None = None, comments: Sequence[str] = ()) -> None:
-        """Write the 3DGS PLY that every tool reads, atomically, see `clsplat.ply.write`.
+        """Write a model file in the format of its ending, atomically, see `clsplat.formats`.
 
-        sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given. comments: lines
-        of its header, such as `colour.comment`.
+        Of formats that have room for it: sh_degree, pad with zero coefficients up to this degree; the model's own where
+        it is not given. comments: lines of the header, such as `colour.comment`.
         """
-        from clsplat.ply import write
+        from clsplat.formats import save
 
-        write(path, self, sh_degree=sh_degree, comments=comments)
+        save(path, self, sh_degree=sh_degree, comments=comments)

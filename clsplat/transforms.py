@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat import ply
 from clsplat.errors import InputError
 from clsplat.files import is_file, open_input, parse_json, read_document
+from clsplat.formats import ply
 from clsplat.images import EXTENSIONS, image_size, require_images
 from clsplat.undistort import Lens, check_lens
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.cli import Bench, Compare, Demo, Devices, Eval, Render, Report, Selftest, Sfm, Train, Tune, Verb
+from clsplat.cli_files import Convert, Info
 from clsplat.errors import DeviceError, InputError
 from clsplat.memory import Plan, parse_bytes
 
@@ -45,6 +46,14 @@ def run(verb: Verb) -> int:
             from clsplat.verb_report import compare
 
             return compare(verb)
+        case Convert():
+            from clsplat.verb_convert import convert
+
+            return convert(verb)
+        case Info():
+            from clsplat.verb_convert import info
+
+            return info(verb)
         case Bench():
             return bench(verb)
         case Tune():

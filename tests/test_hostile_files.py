@@ -35,9 +35,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stress_files import stress, verdict
 
-from clsplat import colmap, images, ply, runs, sfm, transforms
+from clsplat import colmap, images, runs, sfm, transforms
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError, plain
+from clsplat.formats import ply
 from clsplat.images import find_images, image_size, read_image
 from clsplat.scene import load_scene
 

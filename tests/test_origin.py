@@ -14,10 +14,10 @@ from models import assert_equal, random_gaussians
 from scipy.spatial.transform import Rotation
 from tiny import CONFIG, cameras, write_scene
 
-from clsplat import ply
 from clsplat.cli import main
 from clsplat.device.context import Device
 from clsplat.errors import InputError
+from clsplat.formats import ply
 from clsplat.gaussians import Gaussians
 from clsplat.images import read_image
 from clsplat.reference import render as reference

@@ -2,6 +2,7 @@
 """Model files: what we write is what every tool reads, what they write we read, what is broken is named."""
 
 import errno
+import tracemalloc
 import warnings
 from pathlib import Path
 
@@ -9,8 +10,8 @@ import numpy as np
 import pytest
 from models import assert_equal, random_gaussians, real_file
 
-from clsplat import ply
 from clsplat.errors import InputError
+from clsplat.formats import ply
 from clsplat.gaussians import Gaussians
 
 NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3))]
@@ -268,6 +269,16 @@ def test_real_hand_made_model() -> None:
     assert (gaussians.opacity_logits == 100).all()
 
 
-def test_real_compressed_model_is_refused_by_name() -> None:
-    with pytest.raises(InputError, match="compressed PLY"):
-        Gaussians.load(real_file("samples/biker.compressed.ply"))
+def test_reading_makes_no_second_copy_of_the_file(tmp_path: Path) -> None:
+    path, model = tmp_path / "model.ply", random_gaussians(200_000)
+    model.save(path)
+    own = sum(array.nbytes for array in (model.means, model.quaternions, model.log_scales, model.opacity_logits))
+    own += model.sh.nbytes
+    tracemalloc.start()
+    try:
+        Gaussians.load(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # three blocks of rows, of 8 MB each: the last, the next, and what reading it has joined. The file has 50 MB.
+    assert peak < own + 3 * ply.BLOCK_ROWS * 248 + (2 << 20)

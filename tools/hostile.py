@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 from spoilers import MOST_BYTES, SPOILERS, spoil_place
 
-from clsplat import colmap, ply, replay, runs, sfm, sfm_photos, transforms
+from clsplat import colmap, formats, replay, runs, sfm, sfm_photos, transforms
 from clsplat.config import TrainConfig
+from clsplat.formats import ply
 from clsplat.gaussians import Gaussians
 from clsplat.images import image_size, read_image, write_image
+from clsplat.model_info import model_info
 from clsplat.paths.read import choose_shot
 from clsplat.scene import load_scene
 from clsplat.stages.project import group_shapes
@@ -71,6 +73,29 @@ def make_cloud(folder: Path, form: str) -> None:
     else:
         body = b"".join(struct.pack("<3f3B", *row) for row in rows)
     (folder / "cloud.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + body)
+
+
+def make_model(folder: Path, name: str) -> None:
+    """A model file of another format."""
+    formats.save(folder / name, _gaussians())
+
+
+def make_ksplat(folder: Path) -> None:
+    """model.ksplat of level 1: one section, a full bucket of 4 and one of 3, SH of degree 1."""
+    header, section = bytearray(4096), bytearray(1024)
+    struct.pack_into("<BBxx4IH", header, 0, 0, 1, 1, 1, 7, 7, 1)
+    struct.pack_into("<4IfHxxI4xIIH", section, 0, 7, 7, 4, 2, 5.0, 12, 32767, 1, 1, 1)
+    rng = np.random.default_rng(0)
+    rows = b"".join(
+        rng.integers(0, 65536, 3).astype("<u2").tobytes()
+        + rng.random(7).astype("<f2").tobytes()
+        + bytes([10, 20, 30, 200])
+        + rng.random(9).astype("<f2").tobytes()
+        for _ in range(7)
+    )
+    (folder / "model.ksplat").write_bytes(
+        bytes(header) + bytes(section) + struct.pack("<I6f", 3, *range(6)) + rows  # lengths, centres, Gaussians
+    )
 
 
 PICTURES = ("a.png", "b.png", "sub/c.png")
@@ -270,6 +295,12 @@ def make_record(folder: Path) -> None:
 # Readers
 
 
+def read_model(path: Path) -> None:
+    """As `convert` and `info` do."""
+    model_info(path)
+    formats.load(path).check()
+
+
 def read_scene(folder: Path) -> None:
     """Everything of a scene that is looked at before training: cameras, points, every picture."""
     scene = load_scene(folder)
@@ -434,6 +465,16 @@ _ALL = (
     ),
     Reader("photos", make_photos, read_photos, ("photos/a.png", "photos/picture.jpg"), (*BYTES, *PLACES), 1),
     Reader("record", make_record, read_record, ("sfm.json",), (*BYTES, *LINES, "json", *PLACES), 1),
+)
+_ALL += tuple(
+    Reader(f"model-{name}", partial(make_model, name=name), lambda f, n=name: read_model(f / n), (name,), kinds, 2)
+    for name, kinds in (
+        ("model.splat", (*BYTES, *PLACES)),
+        ("model.compressed.ply", (*BYTES, *LINES, *PLACES)),
+    )
+)
+_ALL += (
+    Reader("ksplat", make_ksplat, lambda f: read_model(f / "model.ksplat"), ("model.ksplat",), (*BYTES, *PLACES), 2),
 )
 READERS = {reader.name: reader for reader in _ALL}
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The 3DGS model file: a PLY with one vertex a Gaussian, as the paper's authors wrote it and every tool reads it.
 
+https://github.com/graphdeco-inria/gaussian-splatting (scene/gaussian_model.py, save_ply).
 Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. f_rest is channel-major: all higher
 coefficients of red, then of green, then of blue. Files are streamed in blocks of rows, so that reading or writing
 costs the model's own memory and little more.
@@ -26,6 +27,11 @@ from numpy.typing import NDArray
 from clsplat.errors import InputError, plain
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+
+NAME = "3DGS PLY"
+SUFFIXES = (".ply",)
+FLOAT = True
+LOSES = "nothing"
 
 BLOCK_ROWS = 1 << 15
 MAX_HEADER_LINES = 10_000
@@ -78,6 +84,7 @@ class Header:
     elements: list[Element]
     size: int
     origin: NDArray[np.float64] | None = None
+    comments: list[str] = field(default_factory=list)
 
     def row_type(self, element: Element) -> np.dtype[Any]:
         """The packed record of one row of a binary file."""
@@ -85,12 +92,17 @@ class Header:
         return np.dtype([(name, order + code) for name, code in element.properties])
 
 
+def recognises(head: bytes) -> bool:
+    """A PLY that is not the compressed one."""
+    return head.startswith(b"ply") and b"packed_position" not in head.partition(b"end_header")[0]
+
+
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read a 3DGS PLY: ascii or binary of either byte order, properties in any order, of any numeric type.
 
-    SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45). Other properties are ignored. Bytes after the
-    data give a warning. Raises InputError, one line with the path: not a PLY, truncated, a property missing, values
-    that are not finite, no Gaussians, no such file.
+    SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45); of degree 4 (72) the fourth is left out, with a
+    warning. Other properties are ignored. Bytes after the data give a warning. Raises InputError, one line with the
+    path: not a PLY, truncated, a property missing, values that are not finite, no Gaussians, no such file.
     """
     path = Path(path)
     with open_input(path, "a 3DGS PLY") as file:
@@ -103,6 +115,35 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         if header.origin is not None:
             _count_from(header.origin, gaussians, _local_means(file, header, vertex, skipped, path), path)
         return gaussians
+
+
+def read_blocks(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians in the file's order, some rows at a time, in the world; values that are not finite are passed on.
+    Raises InputError as `read`."""
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+        vertex, _ = _vertex_element(header, path)
+        rest = _check_properties(vertex, path)
+        higher, kept = rest // 3, min(rest // 3, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
+        names = [*DC, *(f"f_rest_{c * higher + k}" for k in range(kept) for c in range(3))]
+        for block in read_vertices(file, header, path, "Gaussian") if vertex.count else ():
+
+            def columns(*of: str, block: Block = block) -> NDArray[np.float32]:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    return np.stack([block[name].astype(np.float32) for name in of], axis=1)
+
+            sh = columns(*names).reshape(-1, 1 + kept, 3)
+            yield Gaussians(columns(*POSITION), columns(*ROTATION), columns(*SCALE), columns("opacity")[:, 0], sh)
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Of `clsplat info`: encoding, comments, properties that are ignored."""
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+    vertex, _ = _vertex_element(header, path)
+    known = {*REQUIRED, "nx", "ny", "nz"}
+    ignored = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
+    return {"encoding": header.format, "comments": header.comments, "ignored": ignored}
 
 
 def write(
@@ -118,9 +159,7 @@ def write(
     the header, such as `colour.comment`. Raises ValueError where the degree is lower than the model's, a comment is no
     line of ASCII, or an array is not as `Gaussians` says.
     """
-    for line in comments:
-        if not (line.isascii() and line.isprintable()):
-            raise ValueError(f"comment {line!r}: expected one line of ASCII")
+    check_comments(comments)
     gaussians.check()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
@@ -153,12 +192,20 @@ def write(
             file.write(np.ascontiguousarray(gaussians.means, "<f4").data)
 
 
+def check_comments(comments: Sequence[str]) -> None:
+    """Raise ValueError for one that is no line of ASCII."""
+    for line in comments:
+        if not (line.isascii() and line.isprintable()):
+            raise ValueError(f"comment {line!r}: expected one line of ASCII")
+
+
 def read_header(file: BinaryIO, path: Path) -> Header:
     """Read the header and leave `file` at the first byte after it. Raises InputError."""
     if file.read(3) != b"ply" or file.readline(16).strip():
         raise InputError(f"{path}: not a PLY file (it does not begin with a line 'ply')")
     form = ""
     elements: list[Element] = []
+    comments: list[str] = []
     origin = None
     for _ in range(MAX_HEADER_LINES):
         line = file.readline(4096)
@@ -167,12 +214,13 @@ def read_header(file: BinaryIO, path: Path) -> Header:
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
             origin = _origin(words) if words[:3] == ORIGIN else origin
+            comments += [" ".join(words[1:])] if words else []
             continue
         if words == ["end_header"]:
             if form not in ("ascii", *BYTE_ORDERS):
                 expected = "ascii, binary_little_endian or binary_big_endian"
                 raise InputError(f"{path}: PLY header has the format {form or 'missing'!r}, expected {expected}")
-            return Header(form, elements, file.tell(), origin)
+            return Header(form, elements, file.tell(), origin, comments)
         try:
             match words:
                 case ["format", name, _]:
@@ -252,19 +300,20 @@ def _vertex_element(header: Header, path: Path) -> tuple[Element, list[Element]]
 def _check_properties(vertex: Element, path: Path) -> int:
     """The number of f_rest properties. Raises InputError where the layout is not a 3DGS model's."""
     names = [name for name, _ in vertex.properties]
-    if "packed_position" in names:
-        raise InputError(f"{path}: a compressed PLY (packed_position), expected the 3DGS layout with x y z f_dc_*")
     missing = [name for name in REQUIRED if name not in names]
     if missing:
         noun = "property" if len(missing) == 1 else "properties"
         raise InputError(f"{path}: PLY lacks the {noun} {' '.join(missing)}, expected a 3DGS model")
     rest = sum(name.startswith("f_rest_") for name in names)
-    counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 1)]
+    counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 2)]
     if rest not in counts:
         raise InputError(f"{path}: PLY has {rest} f_rest properties, expected {', '.join(map(str, counts))}")
     for index in range(rest):
         if f"f_rest_{index}" not in names:
             raise InputError(f"{path}: PLY lacks the property f_rest_{index}, though it has {rest} of f_rest")
+    if rest == counts[-1]:
+        left_out = f"SH of degree {MAX_SH_DEGREE + 1} is left out, {MAX_SH_DEGREE} is the highest that is known"
+        warnings.warn(plain(f"{path}: {left_out}"), stacklevel=3)
     return rest
 
 
@@ -360,16 +409,18 @@ def _ascii_blocks(
 def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gaussians:
     """Gather the columns into arrays and refuse values that are not finite."""
     higher = rest // 3
+    kept = min(higher, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
     # The first block is read before anything is allocated: an ascii file's count is only a claim.
     first_block = next(blocks)
     means, scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     quaternions, opacities = np.empty((count, 4), np.float32), np.empty(count, np.float32)
-    sh = np.empty((count, 1 + higher, 3), np.float32)
+    sh = np.empty((count, 1 + kept, 3), np.float32)
     columns: dict[str, NDArray[np.float32]] = {"opacity": opacities}
     for names, array in ((POSITION, means), (SCALE, scales), (ROTATION, quaternions), (DC, sh[:, 0])):
         columns.update({name: array[:, index] for index, name in enumerate(names)})
     for index in range(rest):
-        columns[f"f_rest_{index}"] = sh[:, 1 + index % higher, index // higher]
+        if index % higher < kept:
+            columns[f"f_rest_{index}"] = sh[:, 1 + index % higher, index // higher]
 
     start, bad_positions, first_bad = 0, 0, -1
     other: tuple[int, str] | None = None

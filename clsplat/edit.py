@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be done to a model without a device: cut, move, thin out, put together. Nothing is changed in place.
+
+A similarity (4, 4) takes the world to a new one: x' = s Q x + t, where Q is a rotation or one with a mirror. A Gaussian
+N(m, R S S R^T) becomes N(s Q m + t, Q R s S s S R^T Q^T), its colour f, a function of the direction of view, becomes
+f(Q^T .). The same frame is seen by a camera that is moved along, `transform_camera`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.gaussians import Float32, Float64, Gaussians
+from clsplat.reference.sh import sh_basis
+
+FAR = 64.0
+"""A model that is moved farther from the origin than so many of its own sizes counts from there (decision 0017)."""
+_SIMILAR = 1e-6
+"""Most that Q^T Q may differ from 1: matrices are typed with six digits, or float32's."""
+
+
+def take(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
+    """Those rows, (n,) booleans or indices."""
+    return Gaussians(
+        gaussians.means[rows],
+        gaussians.quaternions[rows],
+        gaussians.log_scales[rows],
+        gaussians.opacity_logits[rows],
+        gaussians.sh[rows],
+        gaussians.origin,
+    )
+
+
+def in_box(gaussians: Gaussians, low: Sequence[float], high: Sequence[float]) -> NDArray[np.bool_]:
+    """(n,) whose mean is in the box, its faces included; low, high (3,) in the world."""
+    means = gaussians.means + gaussians.origin
+    return np.asarray(((means >= low) & (means <= high)).all(axis=1))
+
+
+def in_sphere(gaussians: Gaussians, centre: Sequence[float], radius: float) -> NDArray[np.bool_]:
+    """(n,) whose mean is at most `radius` from the centre (3,) in the world."""
+    offsets = gaussians.means + (gaussians.origin - np.asarray(centre, np.float64))
+    return np.asarray(np.linalg.norm(offsets, axis=1) <= radius)
+
+
+def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
+    """(n,) whose opacity is at least `least`."""
+    if least >= 1:
+        return np.zeros(len(gaussians), np.bool_)
+    with np.errstate(divide="ignore"):  # at least 0: every one
+        return np.asarray(gaussians.opacity_logits >= np.log(least) - np.log1p(-least))
+
+
+def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
+    """Without SH beyond the degree; the same where there are none."""
+    return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
+
+
+def merge(models: Sequence[Gaussians]) -> Gaussians:
+    """One after the other, SH of lower degree padded with zeros; the means count from the first one's origin."""
+    coefficients, origin = max(model.sh.shape[1] for model in models), models[0].origin
+
+    def means(model: Gaussians) -> Float32:
+        moved = model.origin - origin
+        return (model.means + moved).astype(np.float32) if moved.any() else model.means
+
+    def sh(model: Gaussians) -> Float32:
+        return np.pad(model.sh, ((0, 0), (0, coefficients - model.sh.shape[1]), (0, 0)))
+
+    return Gaussians(
+        np.concatenate([means(model) for model in models]),
+        np.concatenate([model.quaternions for model in models]),
+        np.concatenate([model.log_scales for model in models]),
+        np.concatenate([model.opacity_logits for model in models]),
+        np.concatenate([sh(model) for model in models]),
+        origin,
+    )
+
+
+def decompose(matrix: Float64) -> tuple[float, Float64, Float64]:
+    """s, Q (3, 3), t (3,) of a similarity (4, 4). Raises InputError for a matrix that is none."""
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"a transform of {matrix.shape}, expected 4 x 4 finite numbers")
+    linear = matrix[:3, :3]
+    scale = float(np.abs(np.linalg.det(linear)) ** (1 / 3))
+    if scale == 0 or not np.array_equal(matrix[3], (0, 0, 0, 1)):
+        raise InputError("a transform that cannot be undone, or whose last row is not 0 0 0 1")
+    turn = linear / scale
+    if (off := float(np.abs(turn.T @ turn - np.eye(3)).max())) > _SIMILAR:
+        raise InputError(
+            f"a transform that is no similarity (its axes are {off:.2g} off right angles or equal lengths), expected "
+            "rotation, one scale and translation"
+        )
+    u, _, vt = np.linalg.svd(turn)  # the nearest that is exactly orthogonal
+    return scale, u @ vt, matrix[:3, 3]
+
+
+def transform(gaussians: Gaussians, matrix: Float64) -> Gaussians:
+    """The model moved by a similarity (4, 4) of the world. Raises InputError as `decompose`."""
+    scale, turn, shift = decompose(matrix)
+    linear = scale * turn
+    origin = linear @ gaussians.origin + shift
+    means = gaussians.means.astype(np.float64) @ linear.T
+    if np.linalg.norm(origin) <= FAR * float(means.std(axis=0).max()):
+        means, origin = means + origin, np.zeros(3)
+    return Gaussians(
+        means.astype(np.float32),
+        _turned(gaussians.quaternions, turn),
+        (gaussians.log_scales + np.log(scale)).astype(np.float32),
+        gaussians.opacity_logits,
+        rotate_sh(gaussians.sh, turn),
+        origin,
+    )
+
+
+def scaling(factor: float) -> Float64:
+    """(4, 4) that scales the world about its origin."""
+    return np.diag([factor, factor, factor, 1.0])
+
+
+def transform_camera(camera: Camera, matrix: Float64) -> Camera:
+    """The camera to which a model moved by the similarity looks as it did; with a mirror its axes are mirrored too."""
+    scale, turn, shift = decompose(matrix)
+    rotation = camera.rotation @ turn.T
+    translation = scale * camera.translation - rotation @ shift
+    return replace(camera, rotation=rotation, translation=translation, near=scale * camera.near, far=scale * camera.far)
+
+
+def _turned(quaternions: Float32, turn: Float64) -> Float32:
+    """w x y z of Q R, of the same length; of a mirror -Q, as R S S R^T knows no sign."""
+    proper = turn if np.linalg.det(turn) > 0 else -turn
+    x, y, z, w = Rotation.from_matrix(proper).as_quat()
+    # Hamilton's product of (w, x, y, z) and each quaternion
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    turned: Float32 = (quaternions.astype(np.float64) @ product.T).astype(np.float32)
+    return turned
+
+
+def rotate_sh(sh: Float32, turn: Float64) -> Float32:
+    """(n, K, 3) coefficients of the function turned by Q (3, 3), a rotation or one with a mirror."""
+    degree = round(sh.shape[1] ** 0.5) - 1
+    turned = sh.copy()
+    for band, matrix in enumerate(sh_rotations(turn, degree)[1:], start=1):
+        rows = slice(band**2, (band + 1) ** 2)
+        turned[:, rows] = np.einsum("ij,njc->nic", matrix, sh[:, rows].astype(np.float64))
+    return turned
+
+
+def sh_rotations(turn: Float64, degree: int) -> list[Float64]:
+    """The matrices (2 l + 1, 2 l + 1), l = 0 to degree, that take a band's coefficients of f to those of f(Q^T .).
+
+    A band's functions go into each other under rotations (Wigner 1931), so that the coefficients c' of f(Q^T d) follow
+    from its values at enough directions d: B c' = B_Q c, where the rows of B are the basis at d and of B_Q at Q^T d.
+    With many directions B has a condition number near 1, and c' is exact to float64's rounding.
+    """
+    at = np.arange(64) + 0.5  # Fibonacci's points on the sphere
+    z, angle = 1 - at / 32, np.pi * (1 + 5**0.5) * at
+    radius = np.sqrt(1 - z * z)
+    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    here, there = sh_basis(directions, degree), sh_basis(directions @ turn, degree)
+    bands = (slice(band**2, (band + 1) ** 2) for band in range(degree + 1))
+    return [np.asarray(np.linalg.lstsq(here[:, rows], there[:, rows], rcond=None)[0], np.float64) for rows in bands]

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What several formats share: bytes of colour and opacity, reading rows, an order in space, the check of what was read.
+
+Colours in formats of bytes are 0.5 + C0 times SH coefficient 0, opacities lie in 0 to 1 (Kerbl et al. 2023).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.reference.sh import C0
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+BLOCK_ROWS = 1 << 15
+LEAST_OPACITY = 1e-6
+"""What 0 is read as, and 1 less this what 1 is: their logits have to be finite."""
+LEAST_SCALE = 1e-10
+"""What a scale of 0 is read as, likewise."""
+MORTON_BITS = 21
+_SPREAD = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def empty(count: int, degree: int) -> Gaussians:
+    """Room for so many, to be filled."""
+
+    def room(*shape: int) -> Float32:
+        return np.empty(shape, np.float32)
+
+    return Gaussians(room(count, 3), room(count, 4), room(count, 3), room(count), room(count, (degree + 1) ** 2, 3))
+
+
+def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) -> Float32:
+    """(n, 3) where they are in the world, added in float64 before they are rounded."""
+    means = gaussians.means[rows]
+    return (means + gaussians.origin).astype(np.float32) if gaussians.origin.any() else means
+
+
+def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """0 to 1 as 0 to 255, to the nearest; what lies outside is cut."""
+    found: NDArray[np.uint8] = np.clip(np.rint(values * 255), 0, 255).astype(np.uint8)
+    return found
+
+
+def opacities(logits: Float32) -> Float64:
+    """0 to 1 of logits."""
+    with np.errstate(over="ignore"):
+        found: Float64 = 1 / (1 + np.exp(-logits.astype(np.float64)))
+    return found
+
+
+def logits(found: NDArray[Any]) -> Float64:
+    """Of opacities, kept off 0 and 1 by LEAST_OPACITY."""
+    o: Float64 = np.clip(found, LEAST_OPACITY, 1 - LEAST_OPACITY, dtype=np.float64)
+    return np.asarray(np.log(o) - np.log1p(-o))
+
+
+def log_scales(linear: NDArray[Any], path: Path, first: int) -> Float64:
+    """(n, 3) of standard deviations, those of the Gaussians from `first` on. Raises InputError for negative ones."""
+    with np.errstate(invalid="ignore"):
+        bad = ~(linear >= 0).all(axis=1)
+    if bad.any():
+        at = int(bad.argmax())
+        found = " ".join(f"{value:g}" for value in linear[at])
+        raise InputError(f"{path}: Gaussian {first + at} has the scales {found}, expected numbers of at least 0")
+    return np.asarray(np.log(np.maximum(linear, LEAST_SCALE, dtype=np.float64)))
+
+
+def colours(dc: Float32) -> Float64:
+    """Of SH coefficients 0."""
+    return 0.5 + C0 * dc.astype(np.float64)
+
+
+def coefficients(rgb: NDArray[Any]) -> Float64:
+    """SH coefficients 0 of colours."""
+    return (np.asarray(rgb, np.float64) - 0.5) / C0
+
+
+def unit(quaternions: NDArray[Any]) -> Float64:
+    """(n, 4) of length 1; of length 0 no rotation."""
+    q = quaternions.astype(np.float64)
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    return np.where(length > 0, q / np.where(length > 0, length, 1), (1.0, 0.0, 0.0, 0.0))
+
+
+def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> NDArray[Any]:
+    """The next `count` records of the file, whose size has been checked. Raises InputError where it shrank since."""
+    data = file.read(count * kind.itemsize)
+    if len(data) != count * kind.itemsize:
+        raise InputError(f"{path}: truncated while it was read")
+    return np.frombuffer(data, kind)
+
+
+def check_finite(gaussians: Gaussians, path: Path) -> Gaussians:
+    """The same. Raises InputError for a value that is not finite, naming the first of the attribute."""
+    named = {
+        "a position": gaussians.means,
+        "a rotation": gaussians.quaternions,
+        "a scale": gaussians.log_scales,
+        "an opacity": gaussians.opacity_logits,
+        "a colour": gaussians.sh,
+    }
+    for name, array in named.items():
+        flat = array.reshape(len(array), -1)
+        for start in range(0, len(flat), BLOCK_ROWS):
+            bad = ~np.isfinite(flat[start : start + BLOCK_ROWS]).all(axis=1)
+            if bad.any():
+                raise InputError(f"{path}: Gaussian {start + int(bad.argmax())} has {name} that is not finite")
+    return gaussians
+
+
+def morton_order(means: Float32) -> NDArray[np.int64]:
+    """(n,) rows along a Z-order curve through the box around the means (n, 3) (Morton 1966): near ones near each
+    other, ties by index."""
+    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    cells = (1 << MORTON_BITS) - 1
+    scale = cells / np.where(high > low, high - low, 1)
+    codes = np.zeros(len(means), np.uint64)
+    for axis in range(3):
+        code = ((means[:, axis] - low[axis]) * scale[axis]).astype(np.uint64)
+        for shift, mask in _SPREAD:
+            code = (code | code << np.uint64(shift)) & np.uint64(mask)
+        codes |= code << np.uint64(axis)
+    return np.argsort(codes, kind="stable")

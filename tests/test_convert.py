@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat convert` and `clsplat info` from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calls import Capture
+from models import assert_equal, random_gaussians
+from scipy.spatial.transform import Rotation
+from tiny import cameras, hidden_model
+
+from clsplat import colour, edit, formats
+from clsplat.cli import main
+from clsplat.gaussians import Gaussians
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    path = tmp_path / "model.ply"
+    random_gaussians(300, 2).save(path)
+    return path
+
+
+def convert(*arguments: object) -> int:
+    return main(["convert", *map(str, arguments)])
+
+
+def test_what_was_lost_is_said(model: Path, capsys: Capture) -> None:
+    target = model.with_suffix(".splat")
+    assert convert(model, target) == 0
+    said = capsys.readouterr().out
+    assert f"{model}: 3DGS PLY, 300 Gaussians of SH degree 2, " in said
+    assert f"{target}: splat, 300 Gaussians of SH degree 0, 9,600 bytes" in said
+    for name in ("position", "scale", "rotation", "opacity", "colour", "SH"):
+        assert f"\n{name} " in said
+    assert convert(model, target, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    whole, read = Gaussians.load(model), Gaussians.load(target)
+    errors = found["errors"]
+    assert errors["position"]["largest"] == 0
+    assert errors["sh"]["largest"] == pytest.approx(np.abs(whole.sh[:, 1:]).max())
+    p, q = (each.quaternions / np.linalg.norm(each.quaternions, axis=1)[:, None] for each in (whole, read))
+    angle = (Rotation.from_quat(p[:, [1, 2, 3, 0]]).inv() * Rotation.from_quat(q[:, [1, 2, 3, 0]])).magnitude()
+    assert errors["rotation"]["largest"] == pytest.approx(np.degrees(angle.max()), rel=1e-3)
+    opacity = [1 / (1 + np.exp(-each.opacity_logits.astype(float))) for each in (whole, read)]
+    assert errors["opacity"]["largest"] == pytest.approx(np.abs(opacity[0] - opacity[1]).max())
+    assert 0 < errors["opacity"]["largest"] <= 0.5 / 255 * 1.001  # half a step of a byte
+    assert found["target"]["bytes"] == target.stat().st_size
+
+
+def test_rows_in_another_order_are_compared_with_their_own(model: Path, capsys: Capture) -> None:
+    target = model.with_suffix(".compressed.ply")
+    assert convert(model, target, "--json") == 0
+    errors = json.loads(capsys.readouterr().out)["errors"]
+    assert 0 < errors["position_relative"]["largest"] < 1e-3  # 10 bits of two chunks of the model
+    assert 0 < errors["rotation"]["largest"] < 0.5  # 10 bits
+
+
+def test_edits_are_made_in_the_order_of_the_help(model: Path, tmp_path: Path, capsys: Capture) -> None:
+    other, target, matrix = tmp_path / "other.ply", tmp_path / "out.ply", tmp_path / "matrix.txt"
+    random_gaussians(50, 3, seed=4).save(other)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("xyz", (0.3, 0.2, -1)).as_matrix()
+    turn[:3, 3] = (1, 2, 3)
+    matrix.write_text("\n".join(" ".join(map(repr, row)) for row in turn.tolist()))
+    flags = ["--merge", other, "--crop=-1,-1,-1,1,1.5,2", "--crop-sphere", "0,0,0,1.4", "--prune-opacity", 0.3]
+    assert convert(model, target, *flags, "--transform", matrix, "--scale", 2, "--drop-sh", 1) == 0
+    wanted = edit.merge([Gaussians.load(model), Gaussians.load(other)])
+    wanted = edit.take(wanted, edit.in_box(wanted, (-1, -1, -1), (1, 1.5, 2)))
+    wanted = edit.take(wanted, edit.in_sphere(wanted, (0, 0, 0), 1.4))
+    wanted = edit.take(wanted, edit.opaque(wanted, 0.3))
+    wanted = edit.drop_sh(edit.transform(wanted, edit.scaling(2) @ turn), 1)
+    assert 5 < len(wanted) < 300
+    assert_equal(Gaussians.load(target), wanted)
+    inline = ",".join(map(str, turn.ravel()))
+    assert convert(model, tmp_path / "a.ply", "--transform", matrix) == 0
+    assert convert(model, tmp_path / "b.ply", f"--transform={inline}") == 0
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    capsys.readouterr()
+
+
+def test_pruning_by_contribution_leaves_what_the_cameras_see(scene: Path, tmp_path: Path, capsys: Capture) -> None:
+    """Half of the model is behind the cameras' backs or far below a pixel: it goes, and the frames stay."""
+    seen = hidden_model()
+    unseen = edit.transform(seen, edit.scaling(1e-4))
+    unseen.means += 100
+    both = edit.merge([seen, unseen])
+    source, target = tmp_path / "both.ply", tmp_path / "pruned.ply"
+    both.save(source)
+    assert convert(source, target, "--prune-contribution", 0.01, "--cameras", scene, "--scene", scene, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    kept = Gaussians.load(target)
+    assert 30 <= len(kept) <= len(seen)
+    assert np.abs(kept.means).max() < 50
+    assert found["scene"]["least_between"] > 60, "what adds less than a hundredth of a pixel is not seen"
+
+
+def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_path: Path, capsys: Capture) -> None:
+    source, target = tmp_path / "model.ply", tmp_path / "moved.compressed.ply"
+    hidden_model().save(source)
+    moved = ["--transform=0,-1,0,4, 0,0,1,5, -1,0,0,6, 0,0,0,1", "--scale", 3]
+    assert convert(source, target, *moved, "--scene", scene, "--json") == 0
+    found = json.loads(capsys.readouterr().out)["scene"]
+    assert len(found["views"]) == 2, "the held-out ones"
+    assert found["before"] > 45, "the pictures are of this model, in 8 bits"
+    assert found["between"] > 40
+    assert found["after"] < found["before"]
+    assert found["after"] > 38
+    assert convert(source, tmp_path / "same.ply", "--scene", scene, "--test-every", 0, "--background", "white") == 0
+    said = capsys.readouterr().out
+    assert f"{len(cameras())} views" in said
+    assert "against each other 120.00" in said, "the same numbers give the same frames"
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--crop", "1,2,3"], "--crop 1,2,3: expected 6 numbers"),
+        (["--crop=0,0,0,1,-1,1"], "expected X0 <= X1"),
+        (["--crop=0,0,0,1,nan,1"], "expected 6 numbers"),
+        (["--crop=90,90,90,91,91,91"], "--crop: none of the 300 Gaussians is left"),
+        (["--crop-sphere", "0,0,0,-1"], "--crop-sphere: none of the 300"),
+        (["--transform", "1,2"], "expected 16 numbers"),
+        (["--transform", "1,0,0,0,0,2,0,0,0,0,1,0,0,0,0,1"], "no similarity"),
+        (["--scale", "0"], "--scale 0.0: expected"),
+        (["--scale", "nan"], "--scale nan: expected"),
+        (["--drop-sh", "4"], "--drop-sh 4: expected 0 to 3"),
+        (["--prune-opacity", "-0.1"], "--prune-opacity -0.1: expected 0 to 1"),
+        (["--prune-opacity", "1"], "--prune-opacity: none of the 300"),
+        (["--prune-contribution", "1"], "--prune-contribution and --cameras go together"),
+        (["--cameras", "x"], "--prune-contribution and --cameras go together"),
+        (["--merge", "nowhere.ply"], "nowhere.ply: no such file"),
+    ],
+)
+def test_wrong_calls_are_one_line_and_write_nothing(
+    flags: list[str], message: str, model: Path, capsys: Capture
+) -> None:
+    target = model.with_name("out.ply")
+    assert convert(model, target, *flags) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert not target.exists()
+
+
+def test_the_colour_space_goes_along_or_is_told(model: Path, capsys: Capture) -> None:
+    Gaussians.load(model).save(model, comments=[colour.comment("lin_rec709")])
+    for suffix in (".b.ply", ".compressed.ply"):
+        assert convert(model, target := model.with_suffix(suffix)) == 0
+        assert colour.recorded_space(target) == "lin_rec709"
+    assert not capsys.readouterr().err
+    assert convert(model, model.with_suffix(".splat")) == 0
+    assert "splat has no place for the colour space, which is lin_rec709" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", sorted(s for s in formats.suffixes(writable=True) if s.startswith(".")))
+def test_info_of_every_format(suffix: str, model: Path, capsys: Capture) -> None:
+    target = model.with_name(f"other{suffix}")
+    assert convert(model, target) == 0
+    capsys.readouterr()
+    assert main(["info", str(target), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    whole = Gaussians.load(target)
+    assert found["format"] == formats.format_of(target).NAME
+    assert found["gaussians"] == 300
+    assert found["sh_degree"] == whole.sh_degree
+    assert found["not_finite"] == 0
+    np.testing.assert_allclose(found["bounds"]["min"], whole.means.min(axis=0) + whole.origin, rtol=1e-6)
+    np.testing.assert_allclose(found["scale"]["p100"], np.exp(whole.log_scales.max()), rtol=1e-5)
+    np.testing.assert_allclose(
+        found["opacity"]["p50"], np.median(1 / (1 + np.exp(-whole.opacity_logits.astype(float)))), rtol=1e-5
+    )
+    assert main(["info", str(target)]) == 0
+    said = capsys.readouterr().out
+    assert "\nGaussians     300\n" in said
+
+
+def test_info_counts_what_a_reader_refuses(model: Path, capsys: Capture) -> None:
+    gaussians = Gaussians.load(model)
+    gaussians.means[3, 1] = np.nan
+    gaussians.opacity_logits[[3, 7]] = np.inf
+    gaussians.sh[200, 8, 2] = np.nan
+    gaussians.save(model, comments=["made by hand"])
+    assert main(["info", str(model)]) == 0
+    said = capsys.readouterr().out
+    assert "300, 3 not finite" in said
+    assert "made by hand" in said
+    assert main(["render", str(model), "--cameras", "x", "-o", "y.png"]) == 2
+    assert main(["info", str(model.with_name("none.ply"))]) == 2
+    assert "none.ply: no such file" in capsys.readouterr().err
+
+
+def test_a_run_is_its_model(trained: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert main(["info", str(trained), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["path"] == str(trained / "model.ply")
+    assert convert(trained, tmp_path / "a.splat") == 0
+    assert len(Gaussians.load(tmp_path / "a.splat")) == len(Gaussians.load(trained / "model.ply"))
+
+
+def test_eval_and_render_take_any_format(trained: Path, scene: Path, tmp_path: Path, capsys: Capture) -> None:
+    target = tmp_path / "a.compressed.ply"
+    assert convert(trained, target) == 0
+    assert main(["eval", str(target), "--scene", str(scene), "--json"]) == 0
+    assert main(["render", str(target), "--cameras", str(scene), "-o", str(tmp_path / "{name}.png")]) == 0
+    assert len(list(tmp_path.glob("*.png"))) == len(cameras())

@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every format in turn: a model comes back in its place, with the loss that the format has; bad files are named."""
+
+from __future__ import annotations
+
+import random
+import tracemalloc
+import warnings
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from models import SCENES, assert_equal, random_gaussians
+from scipy.spatial.transform import Rotation
+
+from clsplat import edit, fidelity, formats
+from clsplat.camera import Camera
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.metrics import psnr
+from clsplat.rendering import Renderer
+
+FORMATS = formats.formats()
+WRITTEN = {name: module for name, module in FORMATS.items() if hasattr(module, "write")}
+SIZE = 96
+
+
+def path_of(module: ModuleType, folder: Path, stem: str = "model") -> Path:
+    suffix = next(suffix for suffix in module.SUFFIXES if suffix.startswith("."))
+    return folder / (stem + suffix)
+
+
+@cache
+def asymmetric() -> Gaussians:
+    """Three arms of different length, thickness and colour along x, y and z, each with flat Gaussians turned their own
+    way, SH that are different in every direction: it looks like itself from nowhere else, nor in a mirror."""
+    rng = np.random.default_rng(5)
+    count = 1500
+    arm = rng.integers(0, 3, count)
+    along = rng.uniform(0.1, 1.0, count) * np.array([2.0, 1.2, 0.7])[arm]
+    means = rng.normal(0, 0.05, (count, 3))
+    means[np.arange(count), arm] += along
+    quaternions = Rotation.random(count, random_state=6).as_quat()[:, [3, 0, 1, 2]] * rng.uniform(0.5, 2, (count, 1))
+    log_scales = np.log(rng.uniform(0.01, 0.12, (count, 3)))
+    sh = rng.normal(0, 0.12, (count, 16, 3))
+    sh[:, 0] = np.array([[1.2, -0.8, -1.2], [-1.0, 1.1, -0.6], [-0.7, -0.3, 1.3]])[arm] + rng.normal(
+        0, 0.15, (count, 3)
+    )
+    logits = rng.normal(0.5, 1.5, count)
+    return Gaussians(*(array.astype(np.float32) for array in (means, quaternions, log_scales, logits, sh)))
+
+
+def cameras() -> list[Camera]:
+    """From three sides that no turn by a right angle takes into each other."""
+    found = []
+    for angles in ((20, 15, 5), (130, -25, 40), (255, 50, -70)):
+        rotation = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+        centre = np.array([0.8, 0.4, 0.2])
+        translation = np.array([0.0, 0.0, 4.0]) - rotation @ centre
+        found.append(Camera(SIZE, SIZE, 1.5 * SIZE, 1.5 * SIZE, SIZE / 2, SIZE / 2, rotation, translation))
+    return found
+
+
+@pytest.fixture(scope="module")
+def renderer(default_device: Device) -> Renderer:
+    return Renderer(default_device)
+
+
+def worst(renderer: Renderer, a: Gaussians, b: Gaussians) -> float:
+    """The least PSNR of three views, dB."""
+    return min(psnr(renderer.render(a, c).image, renderer.render(b, c).image) for c in cameras())
+
+
+def as_far_as_it_goes(module: ModuleType, gaussians: Gaussians) -> Gaussians:
+    """Without the SH that the format has no place for."""
+    return edit.drop_sh(gaussians, getattr(module, "MAX_SH_DEGREE", 3))
+
+
+def test_any_mirror_or_turn_of_the_axes_would_be_seen(renderer: Renderer) -> None:
+    """What the next test says is worth something: each mirror, each exchange of axes is far below its 35 dB, and so is
+    SH that was left unturned."""
+    whole = asymmetric()
+    for axes in ((1, 1, -1), (1, -1, 1), (-1, 1, 1), (1, -1, -1), (-1, -1, 1), (-1, -1, -1)):
+        matrix = np.diag([*axes, 1.0])
+        assert worst(renderer, whole, edit.transform(whole, matrix)) < 25
+        only_sh = edit.take(whole, np.arange(len(whole)))
+        only_sh.sh = edit.rotate_sh(whole.sh, np.diag(axes).astype(float))
+        assert worst(renderer, whole, only_sh) < 35
+    swapped = edit.transform(whole, np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]]))
+    assert worst(renderer, whole, swapped) < 25
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_model_comes_back_in_its_place(name: str, renderer: Renderer, tmp_path: Path) -> None:
+    module, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
+    whole = as_far_as_it_goes(module, asymmetric())
+    formats.save(path, whole)
+    assert formats.format_of(path) is module
+    read = Gaussians.load(path)
+    read.check()
+    assert len(read) == len(whole)
+    assert read.sh_degree == whole.sh_degree
+    # the issue's contract: 60 dB for floats, 35 for what is quantised
+    assert worst(renderer, whole, read) >= (60 if getattr(module, "FLOAT", False) else 35)
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("name", WRITTEN)
+def test_every_degree_of_sh(name: str, degree: int, tmp_path: Path) -> None:
+    module, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
+    model = edit.drop_sh(asymmetric(), degree)
+    formats.save(path, model)
+    read = formats.load(path)
+    assert read.sh_degree == min(degree, getattr(module, "MAX_SH_DEGREE", 3))
+    assert len(read) == len(model)
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_the_same_model_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
+    paths = [path_of(WRITTEN[name], tmp_path / folder) for folder in ("a", "b")]  # a name may be in the file
+    for path in paths:
+        path.parent.mkdir()
+        formats.save(path, edit.take(asymmetric(), np.arange(300)))
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_single_gaussian_and_a_point(name: str, tmp_path: Path) -> None:
+    """No extent to divide by."""
+    path = path_of(WRITTEN[name], tmp_path)
+    one = edit.take(asymmetric(), np.arange(1))
+    for model in (one, edit.merge([one, one])):
+        formats.save(path, model)
+        read = formats.load(path)
+        assert len(read) == len(model)
+        np.testing.assert_allclose(read.means, model.means, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_extremes_stay_finite(name: str, tmp_path: Path) -> None:
+    """Opacities of 0 and 1, scales of nothing and of a world, colours beyond what a byte holds, no rotation at all."""
+    path = path_of(WRITTEN[name], tmp_path)
+    model = random_gaussians(64, 1)
+    model.opacity_logits[:4] = (-200, 200, -20, 20)
+    model.log_scales[:4] = ((-60, -60, -60), (12, 12, 12), (-60, 0, 0), (5, -5, 0))
+    model.sh[:2, 0] = ((40, 40, 40), (-40, -40, -40))
+    model.quaternions[3] = 0
+    formats.save(path, model)
+    read = formats.load(path)
+    read.check()
+    for array in (read.means, read.quaternions, read.log_scales, read.opacity_logits, read.sh):
+        assert np.isfinite(array).all()
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_means_that_count_from_elsewhere_are_written_in_the_world(name: str, tmp_path: Path) -> None:
+    path = path_of(WRITTEN[name], tmp_path)
+    model = edit.take(asymmetric(), np.arange(100))
+    model.origin = np.array([1000.0, -2000.0, 500.0])
+    formats.save(path, model)
+    read = formats.load(path)
+    world = read.means + read.origin
+    # Whatever order they are in; float32 at 2000 has steps of 1.2e-4, and quantised formats their own
+    np.testing.assert_allclose(world.mean(axis=0), model.means.mean(axis=0) + model.origin, atol=2e-2)
+    np.testing.assert_allclose(np.sort(world, axis=0), np.sort(model.means + model.origin, axis=0), atol=5e-2)
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_the_loss_is_small_in_every_attribute(name: str, tmp_path: Path) -> None:
+    """The error of each attribute that `clsplat convert` prints: nothing in floats, a few steps of a byte else."""
+    module, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
+    whole = as_far_as_it_goes(module, asymmetric())
+    formats.save(path, whole)
+    written = edit.take(whole, module.order(whole)) if hasattr(module, "order") else whole
+    found = fidelity.errors(written, formats.load(path))
+    exact = getattr(module, "FLOAT", False)
+    # Floats: logs and logits of what is stored, and unit quaternions, are rounded once more. Else: positions to 10
+    # bits, scales and opacities to 7 or 8, rotations to 8, colour to 8. SH of which every one is different are the
+    # worst for a palette: the render has to do, this bound is of four of their standard deviations.
+    limits = {
+        "position_relative": (1e-6, 2e-3),
+        "scale": (2e-6, 0.1),
+        "rotation": (1e-3, 2.0),
+        "opacity": (1e-6, 0.01),
+        "colour": (1e-6, 0.3),
+        "sh": (1e-6, 0.5),
+    }
+    for attribute, (for_floats, else_) in limits.items():
+        assert found[attribute]["largest"] <= (for_floats if exact else else_), attribute
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+@pytest.mark.parametrize("way", ["cut", "flip", "zeros", "ones", "empty"])
+def test_a_spoilt_file_is_one_line_in_bounded_memory(name: str, way: str, tmp_path: Path) -> None:
+    path = path_of(WRITTEN[name], tmp_path)
+    formats.save(path, edit.take(asymmetric(), np.arange(200)))
+    whole = path.read_bytes()
+    rng = random.Random(3)
+    for _ in range(25):
+        data = bytearray(whole)
+        at = rng.choice(
+            (rng.randrange(len(data)), rng.randrange(min(len(data), 64)), rng.randrange(min(len(data), 999)))
+        )
+        if way == "cut":
+            del data[at:]
+        elif way == "empty":
+            data = bytearray()
+        else:
+            values = {"flip": [data[at] ^ 1 << rng.randrange(8)], "zeros": [0] * 8, "ones": [255] * 8}[way]
+            data[at : at + len(values)] = bytes(values)
+        path.write_bytes(data)
+        trouble = ""
+        tracemalloc.start()
+        try:
+            formats.load(path).check()
+        except InputError as error:
+            trouble = str(error)
+        finally:
+            _, peak = tracemalloc.get_traced_memory()
+            tracemalloc.stop()
+        assert trouble == "" or trouble.startswith(str(path.parent)), trouble
+        assert "\n" not in trouble
+        # 200 Gaussians are 50 kB; tables of a codec and imports of a first call are in it too
+        assert peak < 64 << 20
+
+
+def test_no_such_ending_and_no_such_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"x\.doc: the ending is none .*\.ply"):
+        formats.save(tmp_path / "x.doc", asymmetric())
+    with pytest.raises(InputError, match=r"x\.ksplat: ksplat is read only, expected one of .*\.ply"):
+        formats.save(tmp_path / "x.ksplat", asymmetric())
+    for name in ("x.ply", "x.doc", "x.splat"):
+        with pytest.raises(InputError, match=f"{name}: no such file, expected a model file, .*ply"):
+            formats.load(tmp_path / name)
+    (tmp_path / "x.doc").write_bytes(b"words")
+    with pytest.raises(InputError, match=r"x\.doc: the ending is none of a model file"):
+        formats.load(tmp_path / "x.doc")
+
+
+def test_first_bytes_go_before_the_ending(tmp_path: Path) -> None:
+    """A compressed PLY is often called .ply; and a file without any ending may still say what it is."""
+    model = edit.take(asymmetric(), np.arange(300))
+    compressed, plain = tmp_path / "a.compressed.ply", tmp_path / "b.ply"
+    formats.save(compressed, model)
+    formats.save(plain, model)
+    wanted = formats.load(compressed)
+    for name in ("c.ply", "c.splat", "c"):
+        (tmp_path / name).write_bytes(compressed.read_bytes())
+        if name != "c.splat":  # which has no mark to miss
+            assert_equal(formats.load(tmp_path / name), wanted)
+    (tmp_path / "d.compressed.ply").write_bytes(plain.read_bytes())
+    assert_equal(formats.load(tmp_path / "d.compressed.ply"), model)
+
+
+@pytest.mark.parametrize("suffix", formats.suffixes())
+def test_samples_of_other_tools(suffix: str) -> None:
+    found = sorted((SCENES / "samples").rglob(f"*{suffix}"))
+    if not found:
+        pytest.skip(f"no sample with the ending {suffix} is there")
+    for path in found:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # one of them has bytes after its data
+            formats.load(path).check()
+
+
+def test_modules_keep_to_the_contract() -> None:
+    endings = [suffix for module in FORMATS.values() for suffix in module.SUFFIXES]
+    assert len(set(endings)) == len(endings), "an ending of two formats"
+    for module in FORMATS.values():
+        assert module.__doc__
+        assert "http" in module.__doc__, f"{module.NAME} cites no specification"
+        assert all(suffix == suffix.lower() for suffix in module.SUFFIXES)
+        assert callable(module.read)

@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compressed PLY, .splat and .ksplat to the bit, against files that are made here by their specifications."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from models import random_gaussians, real_file
+
+from clsplat import edit, formats
+from clsplat.errors import InputError
+from clsplat.formats import compressed_ply, packing, ply
+from clsplat.gaussians import Gaussians
+from clsplat.reference.sh import C0
+
+CHUNK = [
+    *(f"{end}_{name}" for end in ("min", "max") for name in "xyz"),
+    *(f"{end}_scale_{name}" for end in ("min", "max") for name in "xyz"),
+    *(f"{end}_{name}" for end in ("min", "max") for name in "rgb"),
+]
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
+
+def compressed(
+    vertices: list[tuple[int, ...]],
+    bounds: list[float],
+    *,
+    colours: bool = True,
+    sh: bytes = b"",
+    chunks: int = 1,
+) -> bytes:
+    names = CHUNK if colours else CHUNK[:12]
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
+    lines += [f"property float {name}" for name in names]
+    lines += [f"element vertex {len(vertices)}", *(f"property uint {name}" for name in PACKED)]
+    if sh:
+        lines += [f"element sh {len(vertices)}"]
+        lines += [f"property uchar f_rest_{i}" for i in range(len(sh) // len(vertices))]
+    body = struct.pack(f"<{len(names)}f", *bounds[: len(names)]) * chunks
+    body += b"".join(struct.pack("<4I", *vertex) for vertex in vertices) + sh
+    return "\n".join([*lines, "end_header", ""]).encode() + body
+
+
+BOUNDS = [-1.0, -2.0, 3.0, 1.0, 2.0, 5.0, -6.0, -5.0, -4.0, -1.0, -2.0, -3.0, 0.0, 0.25, 0.5, 1.0, 0.75, 1.5]
+
+
+def test_a_compressed_ply_by_hand(tmp_path: Path) -> None:
+    top = 2047 << 21 | 0 << 11 | 2047
+    middle = 512  # of 1023: 0.00048 over zero in the fields of rotation
+    vertices = [
+        (top, 0 << 30 | middle << 20 | middle << 10 | middle, 0, 0xFF00FF80),
+        (0, 3 << 30 | 1023 << 20 | 0 << 10 | middle, top, 0x00000000),
+    ]
+    (tmp_path / "a.ply").write_bytes(compressed(vertices, BOUNDS, sh=bytes([0, 255, 128, *range(6)] * 2)))
+    read = formats.load(tmp_path / "a.ply")
+    np.testing.assert_allclose(read.means, [[1, -2, 5], [-1, -2, 3]])
+    np.testing.assert_allclose(read.log_scales, [[-6, -5, -4], [-1, -5, -3]])
+    rgb = np.array([[1.0, 0.25, 1.5], [0.0, 0.25, 0.5]])
+    np.testing.assert_allclose(read.sh[:, 0], (rgb - 0.5) / C0, rtol=1e-6)
+    np.testing.assert_allclose(packing.opacities(read.opacity_logits), [128 / 255, 1e-6], rtol=1e-5)
+    tiny = np.sqrt(2) * (512 / 1023 - 0.5)
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(read.quaternions[0], [1, tiny, tiny, tiny], atol=2e-6)
+    np.testing.assert_allclose(read.quaternions[1, :3], [half, -half, tiny], atol=1e-6)
+    np.testing.assert_allclose(read.sh[0, 1:, 0], [-4, 4, 4 / 256], rtol=1e-6)  # red first, then green
+    np.testing.assert_allclose(read.sh[0, 1:, 1], [-4, (1.5 / 256 - 0.5) * 8, (2.5 / 256 - 0.5) * 8], rtol=1e-6)
+
+
+def test_a_compressed_ply_of_old_has_colours_of_0_to_1(tmp_path: Path) -> None:
+    path = tmp_path / "a.compressed.ply"
+    path.write_bytes(compressed([(0, 0, 0, 0xFF00FFFF)], BOUNDS, colours=False))
+    np.testing.assert_allclose(0.5 + C0 * formats.load(path).sh[0, 0], [1, 0, 1], atol=1e-6)
+
+
+def test_chunks_are_of_neighbours_and_the_last_may_be_short(tmp_path: Path) -> None:
+    model = random_gaussians(3 * 256 + 10, 2)
+    model.sh *= 0.5
+    path = tmp_path / "a.compressed.ply"
+    formats.save(path, model)
+    assert b"element chunk 4\n" in path.read_bytes()
+    rows = compressed_ply.order(model)
+    assert sorted(rows.tolist()) == list(range(len(model)))
+    read, written = formats.load(path), edit.take(model, rows)
+    for start in range(0, len(model), 256):
+        block = written.means[start : start + 256]
+        steps = (block.max(axis=0) - block.min(axis=0)) / (2047, 1023, 2047)
+        assert (np.abs(read.means[start : start + 256] - block) <= 0.501 * steps).all()
+    np.testing.assert_allclose(read.sh[:, 1:], written.sh[:, 1:], atol=4 / 256 + 1e-6)
+    assert np.abs(written.sh[:, 1:]).max() < 4
+    extents = [np.ptp(written.means[i : i + 256], axis=0).prod() for i in range(0, 3 * 256, 256)]
+    assert max(extents) < 0.75 * np.ptp(model.means, axis=0).prod()
+
+
+def test_morton_order_interleaves_the_bits() -> None:
+    """Against a loop over bits."""
+    means = np.random.default_rng(0).integers(0, 1 << 21, (300, 3)).astype(np.float32)
+    means[:2] = ((0, 0, 0), ((1 << 21) - 1,) * 3)  # a box in which a cell is 1
+
+    def code(mean: np.ndarray) -> int:
+        return sum((int(mean[axis]) >> bit & 1) << 3 * bit + axis for bit in range(21) for axis in range(3))
+
+    codes = [code(means[row]) for row in packing.morton_order(means)]
+    assert codes == sorted(codes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data.replace(b"element chunk 1\n", b"element chunk 0\n"), "0 chunks are too few for 2"),
+        (lambda data: data.replace(b"element chunk 1\n", b"element chunk 99999999999\n"), "truncated: its header"),
+        (lambda data: data.replace(b"element vertex 2", b"element vertex 255"), "sh has 2 rows, expected 255"),
+        (lambda data: data.replace(b"element vertex 2", b"element vertex 0"), "0 Gaussians"),
+        (lambda data: data.replace(b"uint packed_scale", b"uint packed_other"), "vertex lacks packed_scale"),
+        (lambda data: data.replace(b"uint packed_scale", b"float packed_scale"), "vertex lacks packed_scale"),
+        (lambda data: data.replace(b"float max_b", b"float max_w"), "chunk lacks max_b"),
+        (lambda data: data.replace(b"f_rest_8", b"f_rest_7"), "element sh"),
+        (lambda data: data.replace(b"element sh 2", b"element sh 1"), "sh has 1 rows, expected 2"),
+        (lambda data: data.replace(b"binary_little_endian", b"ascii"), "in ascii"),
+        (lambda data: data.replace(b"element chunk", b"element lumps"), "0 elements 'chunk'"),
+        (lambda data: data[:-1], "truncated: its header promises"),
+        (lambda data: data.replace(struct.pack("<f", 5.0), struct.pack("<f", np.nan)), "chunk 0 has bounds"),
+    ],
+)
+def test_spoilt_compressed_plys_are_named(change: object, message: str, tmp_path: Path) -> None:
+    data = change(compressed([(0, 0, 0, 0), (1, 1, 1, 1)], BOUNDS, sh=bytes(18)))  # type: ignore[operator]
+    path = tmp_path / "a.compressed.ply"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=message) as caught:
+        formats.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+TURN = (0, 0, 0, 0, 64, 192, 128, 219)
+"""Colour, opacity and rotation of a .splat."""
+
+
+def test_a_splat_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "a.splat"
+    record = struct.pack("<6f8B", 1, 2, 3, 0.5, 0.25, 0, 255, 0, 51, 204, 64, 192, 128, 219)
+    path.write_bytes(record)
+    read = formats.load(path)
+    np.testing.assert_array_equal(read.means, [[1, 2, 3]])
+    np.testing.assert_allclose(read.log_scales, np.log([[0.5, 0.25, packing.LEAST_SCALE]]), rtol=1e-6)
+    np.testing.assert_allclose(0.5 + C0 * read.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(packing.opacities(read.opacity_logits), [0.8], rtol=1e-6)
+    np.testing.assert_allclose(read.quaternions, [[-0.5, 0.5, 0, 91 / 128]])
+    for data, message in (
+        (record[:-1], "31 bytes"),
+        (b"", "0 bytes"),
+        (record + struct.pack("<6f8B", 1, np.nan, 3, 1, 1, 1, *TURN), "Gaussian 1 has a position"),
+        (record + struct.pack("<6f8B", 1, 2, 3, 1, -1, 1, *TURN), "Gaussian 1 has the scales 1 -1 1"),
+        (bytes(64), r"not a \.splat file \(rotations of length 2\.00"),
+        (struct.pack("<6f8B", 1, 2, 3, 1, np.inf, 1, *TURN), "Gaussian 0 has a scale that is not finite"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=message):
+            formats.load(path)
+
+
+def ksplat(model: Gaussians, level: int, counts: tuple[int, ...], *, bucket: int = 5) -> tuple[bytes, Gaussians]:
+    """A file with sections of so many Gaussians of the model, in full buckets and two others, and what it should be
+    read as."""
+    degree, block, half = model.sh_degree, 4.0, 32767
+    bands = [model.sh[:, b * b : (b + 1) ** 2].transpose(0, 2, 1).reshape(len(model), -1) for b in range(1, degree + 1)]
+    rest = np.concatenate([np.zeros((len(model), 0), np.float32), *bands], axis=1)
+    rgba = np.random.default_rng(2).integers(1, 255, (len(model), 4))
+    wanted = edit.take(model, np.arange(len(model)))
+    wanted.sh[:, 0] = (rgba[:, :3] / 255 - 0.5) / C0
+    wanted.opacity_logits = np.log(rgba[:, 3] / (255 - rgba[:, 3])).astype(np.float32)
+    header = bytearray(4096)
+    struct.pack_into("<BBxxIIIIHxx3fff", header, 0, 0, 1, *[len(counts)] * 2, *[len(model)] * 2, level, 0, 0, 0, -2, 2)
+    heads, bodies, first = b"", b"", 0
+    for count in counts:
+        full = max(0, (count - 3) // bucket)
+        partial = [count - full * bucket - 2, 2] if level else []
+        buckets = full + len(partial) if level else 0
+        head = bytearray(1024)
+        sizes = (count, count + 2, bucket, buckets, block, 12)
+        struct.pack_into("<IIIIfHxxI4xIIH", head, 0, *sizes, half, full if level else 0, len(partial), degree)
+        heads += bytes(head)
+        which = np.minimum(np.arange(count) // bucket, full) + (np.arange(count) >= count - 2)
+        if full and count - 2 < full * bucket:
+            raise ValueError("the last two are a bucket of their own")
+        centres = np.array([[0.5 * i, -i, 0.25] for i in range(buckets)], np.float32).reshape(-1, 3)
+        bodies += struct.pack(f"<{len(partial)}I", *partial) + centres.tobytes()
+        rows = slice(first, first + count)
+        scales = np.exp(model.log_scales[rows])
+        if level == 0:
+            parts = [model.means[rows].view("u1"), scales.view("u1"), model.quaternions[rows].view("u1")]
+            sh = rest[rows].astype("<f4")
+        else:
+            steps = np.random.default_rng(3).integers(0, 65536, (count, 3)).astype("<u2")
+            wanted.means[rows] = (steps.astype(float) - half) * (block / 2 / half) + centres[which]
+            halves = [scales.astype("<f2"), model.quaternions[rows].astype("<f2")]
+            wanted.log_scales[rows] = np.log(halves[0].astype(float))
+            wanted.quaternions[rows] = halves[1]
+            parts = [steps.view("u1"), *(each.view("u1") for each in halves)]
+            sh = rest[rows].astype("<f2") if level == 1 else np.clip(rest[rows] * 64 + 128, 0, 255).astype("u1")
+            back = sh.astype(np.float32) if level == 1 else sh / np.float32(255) * 4 - 2
+            at = 0
+            for band in range(1, degree + 1):
+                width = 2 * band + 1
+                values = back[:, at : at + 3 * width].reshape(count, 3, width).transpose(0, 2, 1)
+                wanted.sh[rows, band**2 : (band + 1) ** 2] = values
+                at += 3 * width
+        table = np.concatenate([*parts, rgba[rows].astype("u1"), np.ascontiguousarray(sh).view("u1")], axis=1)
+        bodies += table.tobytes() + bytes(2 * table.shape[1])  # room for two more
+        first += count
+    return bytes(header) + heads + bodies, wanted
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_ksplat_of_every_level_and_degree(level: int, degree: int, tmp_path: Path) -> None:
+    model = random_gaussians(40, degree)
+    model.sh *= 0.3
+    data, wanted = ksplat(model, level, (17, 23))
+    path = tmp_path / "a.ksplat"
+    path.write_bytes(data)
+    read = formats.load(path)
+    assert read.sh_degree == degree
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_allclose(getattr(read, name), getattr(wanted, name), rtol=1e-5, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "message"),
+    [
+        (0, b"\1", "version 1.1"),
+        (1, b"\0", "version 0.0"),
+        (20, b"\3", "compression level 3"),
+        (4, b"\xff\xff\xff\xff", "truncated: 4294967295 sections"),
+        (16, b"\xff\xff\xff\xff", "its header 4294967295"),
+        (4096, b"\xff\xff\xff\xff", "section 0 ends at byte"),
+        (4100, b"\xff\xff\xff\xff", "section 0 ends at byte"),
+        (4108, b"\xff\xff\xff\xff", "section 0 ends at byte"),
+        (4112, struct.pack("<f", np.nan), "Gaussian 0 has a position that is not finite"),
+        (4116, b"\5", "buckets of 5 bytes"),
+        (4128, b"\xff\xff\xff\x7f", "2147483647 full and 2 other buckets"),
+        (4104, b"\1", "its buckets have fewer"),
+        (4132, b"\xff\xff\xff\x7f", "section 0 ends at byte"),
+        (4136, b"\4", "SH of degree 4"),
+    ],
+)
+def test_spoilt_ksplats_are_named(at: int, value: bytes, message: str, tmp_path: Path) -> None:
+    data = bytearray(ksplat(random_gaussians(40, 1), 1, (17, 23))[0])
+    data[at : at + len(value)] = value
+    path = tmp_path / "a.ksplat"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=message) as caught:
+        formats.load(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_ply_with_sh_of_degree_4_is_read_up_to_3(tmp_path: Path) -> None:
+    model = random_gaussians(5)
+    ply.write(tmp_path / "a.ply", model)
+    head, mark, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1] for line in head.splitlines() if line.startswith(b"property")]
+    first, last = names.index(b"f_rest_0"), names.index(b"f_rest_44")
+    rows = np.frombuffer(body, "<f4").reshape(5, -1)
+    rest = rows[:, first : last + 1].reshape(5, 3, 15)
+    wide = np.concatenate([rest, np.full((5, 3, 9), 7.0, "<f4")], axis=2).reshape(5, 72)
+    table = np.concatenate([rows[:, :first], wide, rows[:, last + 1 :]], axis=1)
+    more = b"".join(b"property float f_rest_%d\n" % i for i in range(45, 72))
+    head = head.replace(b"property float f_rest_44\n", b"property float f_rest_44\n" + more)
+    (tmp_path / "b.ply").write_bytes(head + mark + table.astype("<f4").tobytes())
+    with pytest.warns(UserWarning, match=r"b\.ply: SH of degree 4 is left out"):
+        read = formats.load(tmp_path / "b.ply")
+    np.testing.assert_array_equal(read.sh, model.sh)
+
+
+def test_the_same_four_gaussians_in_splat_and_ksplat() -> None:
+    a, b = (formats.load(real_file(f"samples/splat-transform_minimal.{kind}")) for kind in ("splat", "ksplat"))
+    np.testing.assert_array_equal(a.means, b.means)
+    np.testing.assert_array_equal(a.sh, b.sh)
+    np.testing.assert_array_equal(a.opacity_logits, b.opacity_logits)
+    np.testing.assert_array_equal(a.log_scales, b.log_scales)
+    np.testing.assert_allclose(a.quaternions, b.quaternions, atol=1 / 128)
