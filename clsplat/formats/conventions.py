@@ -90,11 +90,11 @@ def unit_quaternions(quaternions: Float32) -> Float32:
 
 def require_finite(path: Path, gaussians: Gaussians, *, writing: bool = False) -> None:
     """Raise InputError naming the first value that is not finite, as the reader of PLY does."""
-    bad = ~np.isfinite(gaussians.means).all(axis=1)
+    bad = ~np.isfinite(gaussians.means.sum(axis=1, dtype=np.float64))
     verb = "cannot be written: the model has" if writing else "has"
     if bad.any():
         raise InputError(
-            f"{path}: {verb} {int(bad.sum())} of {len(bad)} Gaussians with a position that is not finite, the first is "
+            f"{path}: {verb} {int(bad.sum())} of {len(gaussians)} Gaussians with a position that is not finite, the first is "
             f"{int(bad.argmax())}"
         )
     for name in ("quaternions", "log_scales", "opacity_logits", "sh"):
@@ -173,7 +173,8 @@ def _multiply(left: Float64, right: Float32) -> Float32:
     """Hamilton's product of one quaternion and (N, 4)."""
     w, x, y, z = left
     matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return (right @ matrix.T).astype(np.float32)
+    product: Float32 = (right @ matrix.T).astype(np.float32)
+    return product
 
 
 def _rotate_sh(sh: Float32, rotation: Float64) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import warnings
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,8 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
     ordered = np.sort(values.ravel())
     distinct = np.unique(ordered) if len(ordered) <= SAMPLES else _thinned(ordered)
     if len(distinct) <= size:
-        return np.pad(distinct, (0, size - len(distinct)), mode="edge").astype(np.float32)
+        padded: Float32 = np.pad(distinct, (0, size - len(distinct)), mode="edge").astype(np.float32)
+        return padded
     samples = _thinned(ordered).astype(np.float64)
     wanted = np.cumsum(np.concatenate([[0.0], np.diff(samples) ** (2 / 3)]))
     entries = np.interp((np.arange(size) + 0.5) / size * wanted[-1], wanted, samples)
@@ -32,7 +34,8 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
         count = np.bincount(index, minlength=size)
         total = np.bincount(index, samples, minlength=size)
         entries = np.where(count > 0, total / np.maximum(count, 1), entries)
-    return entries.astype(np.float32)
+    result: Float32 = entries.astype(np.float32)
+    return result
 
 
 def _thinned(ordered: Float32) -> Float32:
@@ -50,8 +53,8 @@ def nearest(entries: NDArray[np.floating], values: NDArray[np.floating]) -> NDAr
 def palette(vectors: Float32, size: int, iterations: int = 10) -> tuple[Float32, NDArray[np.int64]]:
     """Up to `size` vectors, and which of them stands for each: (n, d) -> (size, d), (n,).
 
-    k-means in two levels: clusters, and in each of them a share of the palette by its squared error, so that the work is
-    n d sqrt(size) and not n d size.
+    k-means in two levels: clusters, and in each of them a share of the palette by its squared error, so that the work
+    is n d sqrt(size) and not n d size.
     """
     count, width = vectors.shape
     size = min(size, count)
@@ -59,8 +62,10 @@ def palette(vectors: Float32, size: int, iterations: int = 10) -> tuple[Float32,
     _, cluster = _k_means(vectors, coarse, iterations)
     order = np.argsort(cluster, kind="stable")
     bounds = np.searchsorted(cluster[order], np.arange(coarse + 1))
-    members = [order[start:stop] for start, stop in zip(bounds[:-1], bounds[1:], strict=True)]
-    errors = np.array([vectors[rows].var(axis=0, dtype=np.float64).sum() * len(rows) if len(rows) else 0 for rows in members])
+    members = [order[start:stop] for start, stop in pairwise(bounds)]
+    errors = np.array(
+        [vectors[rows].var(axis=0, dtype=np.float64).sum() * len(rows) if len(rows) else 0 for rows in members]
+    )
     # vectors of more dimensions than clusters have structure: between a share by count and one by error
     weights = np.sqrt(errors * [len(rows) for rows in members])
     shares = np.floor(weights / max(weights.sum(), 1e-30) * (size - coarse)).astype(np.int64) + 1
@@ -83,7 +88,9 @@ def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDA
     from scipy.cluster.vq import kmeans2, vq
 
     if size <= 1 or not np.ptp(vectors, axis=0).any():
-        return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(len(vectors), np.int64)
+        return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
+            len(vectors), np.int64
+        )
     sample = vectors[:: max(1, len(vectors) // max(SAMPLES, 8 * size))]
     centred = sample - sample.mean(axis=0)
     _, axes = np.linalg.eigh((centred.T @ centred).astype(np.float64))

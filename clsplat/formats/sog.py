@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """SOG, PlayCanvas's models in pictures: meta.json with lossless WebP beside it, or all of it in a .sog archive (zip).
 
-Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2; version 1, without
-a number in meta.json, is read as https://github.com/playcanvas/splat-transform does).
+Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2; version 1,
+without a number in meta.json, is read as https://github.com/playcanvas/splat-transform does).
 
 - Frame: as ours (that of the PLY). A pixel is a Gaussian, row by row from the top.
 - means_l, means_u: low and high bytes of 16 bits between an axis's smallest and largest sign(x) ln(1 + |x|).
 - quats: w x y z, the largest component left out, 252 + its index in alpha, the others in steps of 1/180.
-- scales, sh0: bytes of a codebook of 256 natural logs, and of as many SH coefficients 0; opacity in steps of 1/255 in alpha.
+- scales, sh0: bytes of a codebook of 256 natural logs, and of as many SH coefficients 0; alpha is the opacity in steps
+  of 1/255, and where it is 0 the colours are lost.
 - shN: a palette of up to 65,536 sets of coefficients, which are bytes of a third codebook; order and signs as ours.
 - Version 1 has ranges, cut in 255 steps, instead of codebooks, and opacity as a logit.
 """
@@ -15,6 +16,7 @@ a number in meta.json, is read as https://github.com/playcanvas/splat-transform 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import tempfile
@@ -168,7 +170,9 @@ class _Meta:
             raise InputError(f"{self.path}: has {str(count)[:20]} Gaussians, expected at least one")
         self.count = count
         if meta.get("antialias"):
-            warnings.warn(plain(f"{self.path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=4)
+            warnings.warn(
+                plain(f"{self.path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=4
+            )
 
     def section(self, name: str) -> dict[str, Any]:
         found = self.meta.get(name)
@@ -262,7 +266,8 @@ class _Meta:
         colours = table.reshape(-1, width, 3)
         if needed > len(colours):
             raise InputError(f"{self.path}: shN has an index {needed - 1} into a palette of {len(colours)}")
-        return self.dequantised("shN", colours)[label]
+        rest: Float32 = self.dequantised("shN", colours)[label]
+        return rest
 
 
 def _unpacked_quaternions(pixels: Bytes) -> Float32:
@@ -322,8 +327,8 @@ def morton_order(means: Float32) -> NDArray[np.intp]:
 def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int) -> dict[str, Any]:
     """Write them, and give meta.json."""
     count = len(gaussians)
-    width = -(-int(np.ceil(np.sqrt(count))) // 4) * 4
-    height = -(-(-(-count // width)) // 4) * 4
+    width = 4 * math.ceil(math.sqrt(count) / 4)
+    height = 4 * math.ceil(count / width / 4)
 
     def picture(name: str, columns: list[Bytes]) -> str:
         pixels = np.zeros((height * width, sum(each.shape[1] for each in columns)), np.uint8)
@@ -335,7 +340,9 @@ def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int) -
     folded = np.sign(world) * np.log1p(np.abs(world))
     low, high = folded.min(axis=0), folded.max(axis=0)
     steps = np.rint((folded - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
-    means = [picture(f"means_{half}.webp", [(steps >> shift & 255).astype(np.uint8)]) for half, shift in (("l", 0), ("u", 8))]
+    means = [
+        picture(f"means_{half}.webp", [(steps >> shift & 255).astype(np.uint8)]) for half, shift in (("l", 0), ("u", 8))
+    ]
     log_scales, sh0 = gaussians.log_scales[order], gaussians.sh[order, 0]
     scale_codes, colour_codes = codebook(log_scales), codebook(sh0)
     opacity = np.rint(conventions.opacities(gaussians.opacity_logits[order]) * 255).astype(np.uint8)

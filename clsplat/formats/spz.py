@@ -124,7 +124,9 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     header, stream = _open(file, size, path)
     require_count(path, header.count, size)
     if header.degree > MAX_SH_DEGREE:
-        warnings.warn(plain(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out"), stacklevel=3)
+        warnings.warn(
+            plain(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out"), stacklevel=3
+        )
     if header.flags & ANTIALIASED:
         warnings.warn(plain(f"{path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=3)
     count, coefficients = header.count, (min(header.degree, MAX_SH_DEGREE) + 1) ** 2
@@ -173,11 +175,11 @@ def _open(file: BinaryIO, size: int, path: Path) -> tuple[Header, Any]:
         stream = file
     else:
         raise InputError(f"{path}: not an SPZ file (it begins with neither gzip's signature nor NGSP)")
-    head = bytearray(16)
-    _fill(stream, memoryview(head), path, "the header")
-    if head[:4] != MAGIC:
+    start = bytearray(16)
+    _fill(stream, memoryview(start), path, "the header")
+    if start[:4] != MAGIC:
         raise InputError(f"{path}: not an SPZ file (a gzip file of something else)")
-    header = Header(*struct.unpack("<IIBBB", head[4:15]))
+    header = Header(*struct.unpack("<IIBBB", start[4:15]))
     _check(header, path)
     return header, stream
 
@@ -212,17 +214,15 @@ def _frame(records: dict[int, bytes], path: Path) -> Signs:
     return FRAMES[value]
 
 
-class _Slice(io.RawIOBase):
+class _Slice(io.BytesIO):
     """The next `left` bytes of a file."""
 
     def __init__(self, file: BinaryIO, left: int) -> None:
+        super().__init__()
         self.file, self.left = file, left
 
-    def readable(self) -> bool:
-        return True
-
-    def read(self, size: int = -1) -> bytes:
-        data = self.file.read(self.left if size < 0 else min(size, self.left))
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = self.file.read(self.left if size is None or size < 0 else min(size, self.left))
         self.left -= len(data)
         return data
 
@@ -279,9 +279,7 @@ def _rest(stream: Any, path: Path) -> bytes:
         raise InputError(f"{path}: does not decompress to its end ({error}); is it damaged?") from None
 
 
-def _unpack(
-    streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs, result: Gaussians, path: Path
-) -> None:
+def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs, result: Gaussians, path: Path) -> None:
     buffer = bytearray(BLOCK_ROWS * max(header.widths.values()))
     alpha_logits = byte_logits()
     # as wide as the array: NumPy is several times slower where the last axis is short
@@ -357,9 +355,9 @@ def write(
     """Write an SPZ file, atomically; the same Gaussians give the same bytes.
 
     fractional_bits: of positions; by default 12, as the format's library has it, more for a model so small that this
-    would be coarse, fewer for one that does not fit. sh_bits: of band 1 and of those above, 1 to 8. Means count from the
-    world's origin: far from it they lose more. Raises InputError for values that are not finite or positions that no
-    number of bits holds, ValueError for settings out of range.
+    would be coarse, fewer for one that does not fit. sh_bits: of band 1 and of those above, 1 to 8. Means count from
+    the world's origin: far from it they lose more. Raises InputError for values that are not finite or positions that
+    no number of bits holds, ValueError for settings out of range.
     """
     if version not in VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
@@ -392,8 +390,8 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
     import zstandard
 
     names = [name for name, width in header.widths.items() if width]
-    fields = (4, header.count, header.degree, header.fractional_bits, header.flags, len(names), 32)
-    file.write(MAGIC + struct.pack("<IIBBBBI12x", *fields))
+    numbers = (4, header.count, header.degree, header.fractional_bits, header.flags, len(names), 32)
+    file.write(MAGIC + struct.pack("<IIBBBBI12x", *numbers))
     table = file.tell()
     file.write(bytes(16 * len(names)))
     sizes = b""
@@ -411,7 +409,9 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
 
 def _fractional_bits(path: Path, gaussians: Gaussians, wanted: int | None) -> int:
     """As many as asked for, if the positions fit; or by the model's size, without its farthest hundredth."""
-    low, high = (world_means(gaussians, rows) for rows in (gaussians.means.argmin(axis=0), gaussians.means.argmax(axis=0)))
+    low, high = (
+        world_means(gaussians, rows) for rows in (gaussians.means.argmin(axis=0), gaussians.means.argmax(axis=0))
+    )
     largest = max(float(np.abs(low).max()), float(np.abs(high).max()))
     fits = 23 - max(0, int(np.ceil(np.log2(largest + 1e-30)))) if largest > 1 else 23
     while fits >= 0 and round(largest * 2**fits) >= 1 << 23:
@@ -453,11 +453,13 @@ def _pack(
 
 
 def _to_byte(values: NDArray[np.float32]) -> Bytes:
-    return np.clip(np.floor(values + np.float32(0.5)), 0, 255).astype(np.uint8)
+    rounded: Bytes = np.clip(np.floor(values + np.float32(0.5)), 0, 255).astype(np.uint8)
+    return rounded
 
 
 def _to_fixed(values: NDArray[np.float64]) -> Bytes:
-    return np.rint(values).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
+    fixed: Bytes = np.rint(values).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
+    return fixed
 
 
 def _to_first_three(unit: NDArray[np.float32]) -> Bytes:
@@ -474,7 +476,8 @@ def _to_smallest_three(unit: NDArray[np.float32]) -> Bytes:
     others = np.array([[place for place in range(4) if place != index] for index in range(4)])[largest]
     three = np.take_along_axis(fields, others, axis=1)
     packed = largest.astype(np.uint32) << 30 | three[:, 0] << 20 | three[:, 1] << 10 | three[:, 2]
-    return packed.astype("<u4").view(np.uint8)
+    as_bytes: Bytes = packed.astype("<u4").view(np.uint8)
+    return as_bytes
 
 
 def _to_sh(rest: NDArray[np.float32], sh_bits: tuple[int, int]) -> Bytes:
@@ -482,4 +485,5 @@ def _to_sh(rest: NDArray[np.float32], sh_bits: tuple[int, int]) -> Bytes:
     steps = np.array([1 << (8 - sh_bits[0 if index < 3 else 1]) for index in range(coefficients)], np.int16)[:, None]
     signs = sh_signs(UP_BACK)[1 : coefficients + 1, None]
     values = np.clip(rest * (signs * np.float32(128)) + np.float32(128.5), 0, 256).astype(np.int16)
-    return np.minimum((values + steps // 2) & -steps, 255).astype(np.uint8)  # steps are powers of two
+    rounded: Bytes = np.minimum((values + steps // 2) & -steps, 255).astype(np.uint8)  # steps are powers of two
+    return rounded

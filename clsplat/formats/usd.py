@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """OpenUSD's ParticleField3DGaussianSplat, through usd-core (an optional extra): .usd, .usda, .usdc and .usdz.
 
-Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html, in OpenUSD from 26.03;
-a release without the schema writes the same prim with the same attributes.
+Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html, in OpenUSD from
+26.03; a release without the schema writes the same prim with the same attributes.
 
-- Frame: the numbers in the stage are the model's world, as they are for cameras (clsplat/paths/usd.py): the world is not
-  turned to the stage's upAxis, nor scaled to its metersPerUnit. What is read goes through the prims' transforms. An
+- Frame: the numbers in the stage are the model's world, as they are for cameras (clsplat/paths/usd.py): the world is
+  not turned to the stage's upAxis, nor scaled to its metersPerUnit. What is read goes through the prims' transforms. An
   `origin` is the translation of the prim above.
-- Values are float32 (half is read too): linear scales, opacities in [0, 1], unit quaternions, SH coefficients by Gaussian,
-  order and signs as ours.
+- Values are float32 (half is read too): linear scales, opacities in [0, 1], unit quaternions, SH coefficients by
+  Gaussian, order and signs as ours.
 - Hints: perspective projection, sorted by depth along the camera's axis, as this renderer does.
 """
 
@@ -155,7 +155,9 @@ def _gaussians(where: str, prim: Any, time: Any) -> Gaussians:
         raise InputError(f"{where}: has an opacity outside [0, 1]")
     return Gaussians(
         means,
-        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)) if quaternions is None else quaternions[:, [3, 0, 1, 2]],
+        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+        if quaternions is None
+        else quaternions[:, [3, 0, 1, 2]],
         np.zeros((count, 3), np.float32) if scales is None else np.log(np.maximum(scales, np.float32(2.0**-149))),
         conventions.logits(np.ones(count, np.float32) if opacity is None else opacity[:, 0]),
         sh,
