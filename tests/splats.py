@@ -39,6 +39,28 @@ def with_origin(gaussians: Gaussians, *origin: float) -> Gaussians:
     return replace(gaussians, origin=np.array(origin, np.float64))
 
 
+def read_plainly(path: Path) -> Gaussians:
+    """A 3DGS PLY of floats alone, with no more care than NumPy takes; infinite logits become 30."""
+    data = path.read_bytes()
+    end = data.index(b"end_header\n") + 11
+    names = [line.split()[2].decode() for line in data[:end].split(b"\n") if line.startswith(b"property float ")]
+    table = np.frombuffer(data[end:], np.dtype([(name, "<f4") for name in names]))
+
+    def columns(*wanted: str) -> np.ndarray:
+        return np.stack([table[name] for name in wanted], axis=1)
+
+    rest = sum(name.startswith("f_rest") for name in names)
+    sh = [columns("f_dc_0", "f_dc_1", "f_dc_2")]
+    sh += [columns(*(f"f_rest_{index + channel * rest // 3}" for channel in range(3))) for index in range(rest // 3)]
+    return Gaussians(
+        columns("x", "y", "z"),
+        columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        columns("scale_0", "scale_1", "scale_2"),
+        np.clip(table["opacity"], -30, 30),
+        np.stack(sh, axis=1),
+    )
+
+
 def rotations(gaussians: Gaussians) -> Rotation:
     return Rotation.from_quat(gaussians.quaternions[:, [1, 2, 3, 0]])
 

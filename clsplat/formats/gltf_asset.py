@@ -283,7 +283,7 @@ class Asset:
             inside = False
         if not inside:
             raise InputError(f"{self.path}: has its buffer in {uri[:80]!r}, expected a file beside it")
-        with open_input(file, f"the buffer of {self.path.name}") as opened:
+        with open_input(file, f"the buffer of {self.path}") as opened:
             size = os.fstat(opened.fileno()).st_size
         return _map(file, 0, size)
 

@@ -94,18 +94,18 @@ def read(path: Path) -> Gaussians:
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
     parts = []
-    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-        if prim.GetTypeName() not in TYPES:
-            continue
-        where = f"{path}: {prim.GetPath()}"
-        try:
+    try:
+        for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+            if prim.GetTypeName() not in TYPES:
+                continue
+            where = f"{path}: {prim.GetPath()}"
             part = _gaussians(where, prim, time)
             # USD's vectors are rows, so its matrices are the transposes of ours
-            matrix = np.array(transforms.GetLocalToWorldTransform(prim), np.float64).T
-        except Tf.ErrorException:
-            raise InputError(f"{where}: has values that USD cannot read; is it damaged?") from None
-        conventions.place(part, matrix, where)
-        parts.append(part)
+            conventions.place(part, np.array(transforms.GetLocalToWorldTransform(prim), np.float64).T, where)
+            parts.append(part)
+    except (Tf.ErrorException, UnicodeDecodeError, TypeError, ValueError, RuntimeError):
+        # what its bindings raise for the names and values of a damaged file
+        raise InputError(f"{path}: has values that USD cannot read; is it damaged?") from None
     if not parts:
         raise InputError(f"{path}: has no {TYPE} in it, expected at least one")
     model = conventions.concatenated(parts)
