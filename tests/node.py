@@ -57,7 +57,9 @@ def _node(*arguments: str) -> str:
     if isinstance(folder, str):
         pytest.skip(folder)
     environment = os.environ | {"NODE_PATH": str(folder / "node_modules")}
-    done = subprocess.run(["node", *arguments], capture_output=True, text=True, check=False, env=environment, timeout=120)
+    done = subprocess.run(
+        ["node", *arguments], capture_output=True, text=True, check=False, env=environment, timeout=120
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -135,7 +134,9 @@ def test_nodes_move_turn_and_scale(tmp_path: Path) -> None:
     np.testing.assert_allclose(colours(moved, directions @ local.T), colours(model, directions), atol=2e-6)
 
 
-@pytest.mark.parametrize("node", [{"scale": [1, 2, 1]}, {"scale": [-1, 1, 1]}, {"scale": [0, 0, 0]}, {"rotation": [0] * 4}])
+@pytest.mark.parametrize(
+    "node", [{"scale": [1, 2, 1]}, {"scale": [-1, 1, 1]}, {"scale": [0, 0, 0]}, {"rotation": [0] * 4}]
+)
 def test_nodes_that_no_gaussian_can_follow(tmp_path: Path, node: dict[str, Any]) -> None:
     path = tmp_path / "model.gltf"
     gltf.write(path, lopsided(5))
@@ -151,7 +152,11 @@ def test_several_primitives_are_one_model(tmp_path: Path) -> None:
     def double(asset: dict[str, Any]) -> None:
         asset["nodes"] = [{"mesh": 0}, {"mesh": 1, "translation": [1, 0, 0]}]
         asset["scenes"] = [{"nodes": [0, 1]}]
-        flat = {name: index for name, index in asset["meshes"][0]["primitives"][0]["attributes"].items() if "_2_" not in name}
+        flat = {
+            name: index
+            for name, index in asset["meshes"][0]["primitives"][0]["attributes"].items()
+            if "_2_" not in name
+        }
         asset["meshes"] += [{"primitives": [asset["meshes"][0]["primitives"][0] | {"attributes": flat}]}]
 
     changed(path, double)
@@ -171,7 +176,9 @@ def test_a_buffer_in_the_document(tmp_path: Path) -> None:
     assert_within(gltf.read(path), model, **EXACT)
 
 
-@pytest.mark.parametrize("uri", ["../secret.bin", "/etc/hostname", "file:///etc/hostname", "//host/x", "%2e%2e/secret.bin"])
+@pytest.mark.parametrize(
+    "uri", ["../secret.bin", "/etc/hostname", "file:///etc/hostname", "//host/x", "%2e%2e/secret.bin"]
+)
 def test_no_buffer_is_outside_the_folder(tmp_path: Path, uri: str) -> None:
     folder = tmp_path / "inside"
     folder.mkdir()
@@ -181,7 +188,7 @@ def test_no_buffer_is_outside_the_folder(tmp_path: Path, uri: str) -> None:
     changed(path, lambda asset: asset["buffers"][0].update(uri=uri))
     with pytest.raises(InputError, match="expected a file beside it"):
         gltf.read(path)
-    os.symlink(tmp_path / "secret.bin", folder / "link.bin")
+    (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
     changed(path, lambda asset: asset["buffers"][0].update(uri="link.bin"))
     with pytest.raises(InputError, match="expected a file beside it"):
         gltf.read(path)
@@ -299,7 +306,9 @@ def test_scales_below_zero_and_opacities_over_one_are_refused(tmp_path: Path) ->
 
 def test_nothing_is_written_where_it_cannot_be(tmp_path: Path) -> None:
     model = lopsided(5)
-    none = Gaussians(*(getattr(model, name)[:0] for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh")))
+    none = Gaussians(
+        *(getattr(model, name)[:0] for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"))
+    )
     with pytest.raises(InputError, match="no Gaussians"):
         gltf.write(tmp_path / "model.glb", none)
     model.means[2] = np.inf

@@ -29,8 +29,8 @@ BOUNDS = {
 }
 ROTATION = {2: 0.25, 3: 0.005, 4: 0.005}
 """Version 2's w comes from x y z, which are off by sqrt(3) / 255 together: where w is near 0 that leaves it open by
-sqrt(2 sqrt(3) / 255) = 0.117, and the angle by twice that. From version 3 each of three is off by 1/1446 at most, and the
-largest by no more."""
+sqrt(2 sqrt(3) / 255) = 0.117, and the angle by twice that. From version 3 each of three is off by 1/1446 at most, and
+the largest by no more."""
 SAME = dict.fromkeys(BOUNDS, 2e-6) | {"rotations": 2e-6, "opacities": 0.0011}
 """float32's rounding; bytes of opacity 0 and 255 count as a quarter of a step from the end here, as the end there."""
 SAMPLES = ["biker", "amaebi-dm_pod", *(f"splat-transform_minimal-{each}" for each in ("v2", "v3", "v4"))]
@@ -137,7 +137,9 @@ def with_extensions(data: bytes, *records: tuple[int, bytes]) -> bytes:
     packed = b"".join(struct.pack("<II", kind, len(value)) + value for kind, value in records)
     (table,) = struct.unpack_from("<I", data, 16)
     flags = data[14] | spz.HAS_EXTENSIONS
-    return data[:14] + bytes([flags, data[15]]) + struct.pack("<I", table + len(packed)) + data[20:32] + packed + data[32:]
+    return (
+        data[:14] + bytes([flags, data[15]]) + struct.pack("<I", table + len(packed)) + data[20:32] + packed + data[32:]
+    )
 
 
 def test_extensions_are_passed_over_and_a_frame_is_honoured(tmp_path: Path) -> None:
@@ -195,7 +197,10 @@ def header(version: int, count: int, degree: int = 0, bits: int = 12) -> bytes:
         (gzip.compress(header(3, 10) + bytes(100)), "truncated within its colours"),
         (header(3, 1 << 31), "2147483648 Gaussians in 16 bytes"),
         (b"NGSP" + struct.pack("<IIBBBBI12x", 4, 1 << 31, 0, 12, 0, 5, 32) + bytes(80), "2147483648 Gaussians"),
-        (b"NGSP" + struct.pack("<IIBBBBI12x", 4, 10, 0, 12, 0, 5, 32) + struct.pack("<QQ", 1 << 60, 90) * 5, "truncated"),
+        (
+            b"NGSP" + struct.pack("<IIBBBBI12x", 4, 10, 0, 12, 0, 5, 32) + struct.pack("<QQ", 1 << 60, 90) * 5,
+            "truncated",
+        ),
         (b"NGSP" + struct.pack("<IIBBBBI12x", 4, 10, 0, 12, 0, 5, 1 << 30) + bytes(80), "table of streams"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -13,6 +13,7 @@ import io
 import os
 import struct
 import warnings
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,7 +39,8 @@ COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")
 JSON_CHUNK, BIN_CHUNK = 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-MAX_NODES = 100_000
+MAX_NODES, MAX_PRIMITIVES = 100_000, 4096
+"""Of a scene; the second of those that have Gaussians: more are a bomb, which may be one mesh in many nodes."""
 BLOCK_ROWS = 1 << 15
 
 Array = NDArray[Any]
@@ -106,10 +108,11 @@ class Asset:
             roots = self.item("scenes", self.document.get("scene", 0)).get("nodes", [])
         else:
             roots = list(range(len(nodes))) if isinstance(nodes, list) else []
-        todo: list[tuple[object, NDArray[np.float64]]] = [(root, np.eye(4)) for root in _list(roots)]
+        todo: deque[tuple[object, NDArray[np.float64]]] = deque((root, np.eye(4)) for root in _list(roots))
         seen: set[int] = set()
+        found = 0
         while todo:
-            index, parent = todo.pop(0)
+            index, parent = todo.popleft()
             node = self.item("nodes", index)
             assert isinstance(index, int)
             if index in seen or len(seen) >= MAX_NODES:
@@ -123,6 +126,9 @@ class Asset:
                 continue
             for place, primitive in enumerate(_list(self.item("meshes", node["mesh"]).get("primitives", []))):
                 if isinstance(primitive, dict) and EXTENSION in as_object(primitive.get("extensions")):
+                    found += 1
+                    if found > MAX_PRIMITIVES:
+                        raise InputError(f"{self.path}: has more than {MAX_PRIMITIVES} primitives of Gaussians")
                     yield f"primitive {place} of node {index}", matrix, primitive
 
     def matrix(self, node: dict[str, Any], index: int) -> NDArray[np.float64]:
