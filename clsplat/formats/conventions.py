@@ -94,8 +94,8 @@ def require_finite(path: Path, gaussians: Gaussians, *, writing: bool = False) -
     verb = "cannot be written: the model has" if writing else "has"
     if bad.any():
         raise InputError(
-            f"{path}: {verb} {int(bad.sum())} of {len(gaussians)} Gaussians with a position that is not finite, the first "
-            f"is {int(bad.argmax())}"
+            f"{path}: {verb} {int(bad.sum())} of {len(gaussians)} Gaussians with a position that is not finite, "
+            f"the first is {int(bad.argmax())}"
         )
     for name in ("quaternions", "log_scales", "opacity_logits", "sh"):
         values = getattr(gaussians, name)

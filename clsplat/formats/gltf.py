@@ -78,7 +78,7 @@ def read(path: Path) -> Gaussians:
     """Read every primitive of Gaussians in the scene, as one model. Raises InputError."""
     asset = Asset.open(path)
     parts = []
-    for name, matrix, primitive in asset.primitives():
+    for name, matrix, primitive in list(asset.primitives()):  # all of them are counted first
         part = asset.gaussians(name, primitive)
         # the node's matrix is in glTF's frame, the Gaussians are in ours already
         turn = np.diag([*LEFT_UP, 1.0])

@@ -12,7 +12,7 @@ for all Gaussians: positions, alphas, colours, scales, rotations, spherical harm
 - Rotations: x y z w. Version 2: x y z in steps of 1/127.5 where w is positive. From version 3: the largest component is
   left out, its index in 2 bits, the others in 10 (a sign, and steps of 1/723).
 - SH: order and signs as ours, red green blue of each coefficient together, in steps of 1/128 within +-1, of which
-  writers use fewer bits (5 for band 1, 4 above it) so that they compress.
+  writers keep fewer bits so that they compress.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
 NAME = "SPZ"
 SUFFIXES = (".spz",)
-LOSES = "positions to 24 bits fixed point, the rest to 8 or 10 bits, spherical harmonics to 4 or 5"
+LOSES = "positions to 24 bits fixed point, the rest to 8 or 10 bits, spherical harmonics to 6"
 FLOAT = False
 
 Bytes = NDArray[np.uint8]
@@ -58,6 +58,9 @@ MAGIC = b"NGSP"
 VERSIONS = (2, 3, 4)
 DEFAULT_VERSION = 4
 """What the format's library and splat-transform write."""
+SH_BITS = (6, 6)
+"""Of band 1, and of those above. The format's library keeps 5 and 4: files a fifth smaller, and a trained model of strong
+view dependence 11 dB worse, at 36 (docs/formats.md). Readers need not know."""
 ANTIALIASED, HAS_EXTENSIONS = 1, 2
 COORDINATE_SYSTEM = 0xADBE0003
 FRAMES: tuple[Signs, ...] = (
@@ -349,7 +352,7 @@ def write(
     *,
     version: int = DEFAULT_VERSION,
     fractional_bits: int | None = None,
-    sh_bits: tuple[int, int] = (5, 4),
+    sh_bits: tuple[int, int] = SH_BITS,
     antialiased: bool = False,
 ) -> None:
     """Write an SPZ file, atomically; the same Gaussians give the same bytes.
@@ -378,7 +381,7 @@ def header_for(
     return Header(version, len(gaussians), gaussians.sh_degree, bits, flags)
 
 
-def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tuple[int, int] = (5, 4)) -> None:
+def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tuple[int, int] = SH_BITS) -> None:
     """Write what an SPZ file has into a file that can seek, from where it is."""
     if header.version < 4:
         fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
