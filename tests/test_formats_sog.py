@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SOG: what comes back, what others read and write, version 1, and damage."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from models import real_file
+from node import splat_transform
+from splats import assert_refused_or_sound, assert_within, damaged, lopsided, losses, opacity, read_plainly, with_origin
+
+from clsplat import ply
+from clsplat.errors import InputError
+from clsplat.formats import sog
+from clsplat.formats.palette import codebook, nearest, palette
+from clsplat.gaussians import Gaussians
+
+SAME = {"means": 2e-6, "rotations": 2e-6, "log_scales": 0, "sh0": 0, "sh": 0, "opacities": 0.0011}
+"""float32's rounding; opacities of 0 and 255 count as a quarter of a step from the end here, as the end there."""
+
+
+def spread(gaussians: Gaussians) -> dict[str, float]:
+    """What each attribute may lose: half a step of 16 bits in ln(1 + |x|); of 255 in +-sqrt(1/2), in the three
+    components that are there and once more in the one that follows, twice that as an angle; 1/64 of the range where a
+    codebook of 256 is spread by density, of which 64 would be a uniform one's; opacity half a step."""
+    folded = np.log1p(np.abs(gaussians.means + gaussians.origin)).max() * 2 / 65535 / 2
+    return {
+        "means": float(folded * (1 + np.abs(gaussians.means).max())),
+        "rotations": 2 * 2 * 3**0.5 * 2**0.5 / 255 / 2,
+        "log_scales": float(np.ptp(gaussians.log_scales)) / 64 / 2,
+        "opacities": 0.5 / 255 * 1.001,
+    }
+
+
+def visible(gaussians: Gaussians) -> Gaussians:
+    """Without those whose opacity rounds to 0, which have no colour in the file."""
+    kept = opacity(gaussians) >= 0.5 / 255
+    arrays = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    return Gaussians(*(getattr(gaussians, name)[kept] for name in arrays))
+
+
+@pytest.mark.parametrize("name", ["model.sog", "meta.json"])
+@pytest.mark.parametrize("degree", range(4))
+def test_it_comes_back_with_the_stated_loss(tmp_path: Path, name: str, degree: int) -> None:
+    model, path = visible(lopsided(degree=degree)), tmp_path / name
+    sog.write(path, model)
+    back = sog.read(path)
+    assert_within(back, model, **spread(model), sh0=float(np.ptp(model.sh[:, 0])) / 64 / 2)
+    assert sog.describe(path) == {"version": 2, "antialiased": False}
+    if degree:
+        # a palette of 256 for 500 random vectors, the worst that there is: no better than their middle, but no worse
+        error = np.square(back.sh[:, 1:] - model.sh[:, 1:]).mean()
+        assert error < np.square(model.sh[:, 1:] - model.sh[:, 1:].mean(axis=0)).mean() * (0.8 if degree > 1 else 0.3)
+    first = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
+    sog.write(path, model)
+    assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == first
+
+
+def test_a_folder_is_a_model(tmp_path: Path) -> None:
+    model = lopsided(50)
+    sog.write(tmp_path / "meta.json", model)
+    sog.write(tmp_path / "model.sog", model)
+    assert_within(sog.read(tmp_path), sog.read(tmp_path / "model.sog"), **dict.fromkeys(SAME, 0))
+
+
+def test_sorted_it_is_the_same_model_and_smaller(tmp_path: Path) -> None:
+    model = lopsided(5000, degree=0)
+    for sort in (False, True):
+        sog.write(tmp_path / f"{sort}.sog", model, sort=sort)
+    plain, ordered = sog.read(tmp_path / "False.sog"), sog.read(tmp_path / "True.sog")
+    order = sog.morton_order(model.means)
+    np.testing.assert_array_equal(ordered.means, plain.means[order])
+    np.testing.assert_array_equal(ordered.quaternions, plain.quaternions[order])
+    assert (tmp_path / "True.sog").stat().st_size < (
+        tmp_path / "False.sog"
+    ).stat().st_size * 0.97  # only positions are smooth here
+
+
+@pytest.mark.parametrize("name", ["5_0", "6_0"])
+def test_samples_are_what_another_reader_has(tmp_path: Path, name: str) -> None:
+    path = real_file(f"samples/sog/{name}/meta.json")
+    splat_transform(path, tmp_path / "other.ply")
+    assert_within(sog.read(path), read_plainly(tmp_path / "other.ply"), **SAME)
+
+
+@pytest.mark.parametrize("name", ["model.sog", "meta.json"])
+def test_another_reader_has_the_same_values(tmp_path: Path, name: str) -> None:
+    sog.write(tmp_path / name, with_origin(lopsided(), 100, -50, 3))
+    splat_transform(tmp_path / name, tmp_path / "other.ply")
+    there = read_plainly(tmp_path / "other.ply")
+    assert_within(sog.read(tmp_path / name), there, **SAME | {"means": 2e-5})  # float32 near 100
+
+
+def test_what_another_writes_is_the_same_model(tmp_path: Path) -> None:
+    model = visible(lopsided(degree=0))  # palettes of its making are in the samples
+    ply.write(tmp_path / "model.ply", model)
+    splat_transform(tmp_path / "model.ply", tmp_path / "theirs.sog")
+    theirs = sog.read(tmp_path / "theirs.sog")
+    near = np.argmin(np.linalg.norm(model.means[:, None] - theirs.means[None], axis=2), axis=1)  # it sorts
+    assert len(set(near)) == len(model)
+    arrays = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    found = losses(Gaussians(*(getattr(theirs, name)[near] for name in arrays)), model)
+    bounds = spread(model)
+    # it cuts where we round, so that a whole step may be lost
+    assert found["means"] <= 2 * bounds["means"]
+    assert found["rotations"] <= 2 * bounds["rotations"]
+    assert found["opacities"] <= 1.1 / 255
+    assert found["log_scales"] < 0.1
+    assert found["sh0"] < 0.1
+
+
+def as_version_1(folder: Path) -> dict[str, Any]:
+    """A meta.json of version 2 told as version 1 would; bytes are then steps of ranges."""
+    meta = json.loads((folder / "meta.json").read_text())
+    count = meta.pop("count")
+    del meta["version"]
+    meta["means"]["shape"] = [count, 3]
+    meta["scales"] = {"mins": [-6, -5, -4], "maxs": [-1, -2, -3], "files": meta["scales"]["files"]}
+    meta["sh0"] = {"mins": [-1, -2, -3, -4], "maxs": [1, 2, 3, 4], "files": meta["sh0"]["files"]}
+    meta["shN"] = {"mins": -0.5, "maxs": 0.75, "quantization": 8, "files": meta["shN"]["files"]}
+    (folder / "meta.json").write_text(json.dumps(meta))
+    return dict(meta)
+
+
+def test_version_1(tmp_path: Path) -> None:
+    sog.write(tmp_path / "meta.json", lopsided(100, degree=2))
+    second = sog.read(tmp_path)
+    as_version_1(tmp_path)
+    first = sog.read(tmp_path)
+    np.testing.assert_array_equal(first.means, second.means)
+    np.testing.assert_array_equal(first.quaternions, second.quaternions)
+    assert first.sh.shape == (100, 9, 3)
+    assert -4 <= first.opacity_logits.min() < first.opacity_logits.max() <= 4
+    splat_transform(tmp_path / "meta.json", tmp_path / "other.ply")
+    assert_within(
+        first, read_plainly(tmp_path / "other.ply"), **SAME | dict.fromkeys(("log_scales", "sh0", "sh"), 1e-6)
+    )
+
+
+def test_codebooks() -> None:
+    rng = np.random.default_rng(0)
+    few = np.float32([3, 1, 2, 2])
+    np.testing.assert_array_equal(codebook(few)[:4], [1, 2, 3, 3])
+    values = np.concatenate([rng.standard_normal(200_000), [30.0]]).astype(np.float32)
+    entries = codebook(values)
+    assert len(entries) == 256 and (np.diff(entries) >= 0).all()
+    error = np.square(values - entries[nearest(entries, values)]).mean()
+    # Panter and Dite's best for a normal distribution is sqrt(3) pi / 2 / 256^2; an even spread to 30 has 6 times that
+    assert error < 1.15 * 3**0.5 * np.pi / 2 / 256**2
+
+
+def test_palettes() -> None:
+    rng = np.random.default_rng(0)
+    centres = rng.standard_normal((64, 9)).astype(np.float32)
+    vectors = centres[rng.integers(0, 64, 4000)] + rng.standard_normal((4000, 9)).astype(np.float32) * 0.01
+    entries, labels = palette(vectors, 512)
+    assert entries.shape == (512, 9)
+    assert np.sqrt(np.square(vectors - entries[labels]).mean()) < 0.011  # the clusters are found, and not more
+    again = palette(vectors, 512)
+    np.testing.assert_array_equal(again[0], entries)
+    one, label = palette(np.zeros((5, 3), np.float32), 4)
+    assert not one.any() and not one[label].any()
+
+
+def test_damaged_files(tmp_path: Path) -> None:
+    path = tmp_path / "model.sog"
+    sog.write(path, lopsided(8, degree=1))
+    data = path.read_bytes()
+    refused = 0
+    for each in damaged(data, step=len(data) // 100):
+        path.write_bytes(each)
+        refused += assert_refused_or_sound(sog.read, path)
+    assert refused > 150  # every cut, and most changes: zip has sums
+
+
+def change(folder: Path, edit: Callable[[dict[str, Any]], object]) -> None:
+    meta = json.loads((folder / "meta.json").read_text())
+    edit(meta)
+    (folder / "meta.json").write_text(json.dumps(meta))
+
+
+LIES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "version": lambda meta: meta.update(version=3),
+    "count": lambda meta: meta.update(count=1 << 30),
+    "no count": lambda meta: meta.update(count="many"),
+    "no means": lambda meta: meta.pop("means"),
+    "no scales": lambda meta: meta.pop("scales"),
+    "mins": lambda meta: meta["means"].update(mins=[1, 2]),
+    "infinite": lambda meta: meta["means"].update(maxs=[1e300, 1, 1]),
+    "too far": lambda meta: meta["means"].update(maxs=[90, 1, 1]),
+    "short codebook": lambda meta: meta["scales"].update(codebook=[1.0]),
+    "no codebook": lambda meta: meta["sh0"].update(codebook="x"),
+    "no files": lambda meta: meta["quats"].update(files=[]),
+    "missing": lambda meta: meta["quats"].update(files=["missing.webp"]),
+    "outside": lambda meta: meta["quats"].update(files=["../quats.webp"]),
+    "absolute": lambda meta: meta["quats"].update(files=["/etc/hostname"]),
+    "zero byte": lambda meta: meta["quats"].update(files=["\0"]),
+    "not a picture": lambda meta: meta["quats"].update(files=["meta.json"]),
+    "three channels": lambda meta: meta["quats"].update(files=["scales.webp"]),
+    "bands": lambda meta: meta["shN"].update(bands=3),
+    "palette": lambda meta: meta["shN"].update(files=["shN_labels.webp", "shN_centroids.webp"]),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_lies(tmp_path: Path, lie: str) -> None:
+    folder = tmp_path / "model"
+    folder.mkdir()
+    sog.write(folder / "meta.json", lopsided(20, degree=1))
+    (tmp_path / "quats.webp").write_bytes((folder / "quats.webp").read_bytes())
+    change(folder, LIES[lie])
+    assert assert_refused_or_sound(sog.read, folder / "meta.json")
+
+
+def test_an_archive_cannot_unpack_to_more_than_its_gaussians(tmp_path: Path) -> None:
+    path, bomb = tmp_path / "model.sog", tmp_path / "bomb.sog"
+    sog.write(path, lopsided(20, degree=0))
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as target:
+        for name in source.namelist():
+            target.writestr(name, bytes(64 << 20) if name == "quats.webp" else source.read(name))
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"bomb\.sog: quats\.webp has more than \d+ bytes unpacked"):
+        sog.read(bomb)
+    assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    tracemalloc.stop()
+    path.write_bytes(b"PK\3\4 and nothing more")
+    with pytest.raises(InputError, match=r"model\.sog: is no \.sog archive"):
+        sog.read(path)

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""OpenUSD's ParticleField3DGaussianSplat: what comes back, what USD itself says of it, transforms, and damage."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from splats import assert_refused_or_sound, assert_within, colours, covariances, damaged, lopsided, with_origin
+
+from clsplat.errors import InputError
+from clsplat.formats import usd
+
+pytest.importorskip("pxr", reason="usd-core is not installed")
+from pxr import Gf, Sdf, Usd, UsdGeom
+
+EXACT = {"means": 0, "rotations": 1e-6, "log_scales": 5e-7, "opacities": 2e-7, "sh0": 0, "sh": 0}
+"""The rest is float32's rounding of unit quaternions, of exp and of the sigmoid."""
+
+
+@pytest.mark.parametrize("suffix", usd.SUFFIXES)
+def test_it_comes_back_as_it_was(tmp_path: Path, suffix: str) -> None:
+    for degree in range(4):
+        model, path = lopsided(100, degree), tmp_path / f"model{degree}{suffix}"
+        usd.write(path, model)
+        assert_within(usd.read(path), model, **EXACT)
+    assert usd.describe(path) == {"up_axis": "Y", "meters_per_unit": 1.0}
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+@pytest.mark.parametrize("suffix", [".usda", ".usdz"])
+def test_usd_has_nothing_against_it(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"model{suffix}"
+    usd.write(path, with_origin(lopsided(), 4e5, 0, 1))
+    validation = pytest.importorskip("pxr.UsdValidation", reason="this usd-core has no validators")
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 10
+    found = validation.ValidationContext(validators).Validate(Usd.Stage.Open(str(path)))
+    assert not [each.GetErrorAsString() for each in found]
+
+
+def test_the_stage_has_what_the_schema_asks_for(tmp_path: Path) -> None:
+    model, path = lopsided(degree=2), tmp_path / "model.usdc"
+    usd.write(path, model, up_axis="Z", meters_per_unit=0.5)
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 0.5
+    prim = stage.GetPrimAtPath(usd.PRIM)
+    definition = prim.GetPrimDefinition()
+    if not definition.GetPropertyNames():
+        pytest.skip("this usd-core has no such schema")
+    for attribute in prim.GetAuthoredAttributes():
+        spec = definition.GetSchemaAttributeSpec(attribute.GetName())
+        assert spec is not None, attribute.GetName()
+        assert attribute.GetTypeName() == spec.typeName, attribute.GetName()
+        assert attribute.GetVariability() == spec.variability, attribute.GetName()
+    get: Any = lambda name: prim.GetAttribute(name).Get()  # noqa: E731
+    np.testing.assert_array_equal(np.array(get("positions")), model.means)
+    turn = Rotation.from_quat([[*q.GetImaginary(), q.GetReal()] for q in get("orientations")])
+    wanted = Rotation.from_quat(model.quaternions[:, [1, 2, 3, 0]])
+    assert (turn.inv() * wanted).magnitude().max() < 1e-6
+    np.testing.assert_allclose(np.array(get("scales")), np.exp(model.log_scales), rtol=1e-6)
+    np.testing.assert_allclose(np.array(get("opacities")), 1 / (1 + np.exp(-model.opacity_logits)), rtol=1e-6)
+    assert get(usd.DEGREE) == 2
+    # "grouped by particle"
+    np.testing.assert_array_equal(np.array(get(usd.COEFFICIENTS)).reshape(-1, 9, 3), model.sh)
+    low, high = np.array(get("extent"))
+    assert (low < model.means.min(axis=0)).all() and (high > model.means.max(axis=0)).all()
+
+
+def test_a_far_model_counts_from_the_prim_above(tmp_path: Path) -> None:
+    model, path = with_origin(lopsided(), 4.5e5, 5.4e6, 123), tmp_path / "model.usdc"
+    usd.write(path, model)
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath(usd.PRIM))[3] == (4.5e5, 5.4e6, 123, 1)
+    back = usd.read(path)
+    np.testing.assert_array_equal(back.origin, model.origin)
+    np.testing.assert_array_equal(back.means, model.means)
+
+
+def test_prims_move_turn_and_scale(tmp_path: Path) -> None:
+    model, path = lopsided(), tmp_path / "model.usda"
+    usd.write(path, model)
+    turn = Rotation.from_rotvec([0.3, -0.8, 0.5])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = 2 * turn.as_matrix(), [1, 2, 3]
+    stage = Usd.Stage.Open(str(path))
+    UsdGeom.Xformable(stage.GetPrimAtPath(usd.WORLD)).AddTransformOp().Set(Gf.Matrix4d(matrix.T))
+    stage.GetRootLayer().Save()
+    moved = usd.read(path)
+    np.testing.assert_allclose(moved.means, 2 * model.means @ turn.as_matrix().T + [1, 2, 3], atol=1e-5)
+    local = turn.as_matrix()
+    np.testing.assert_allclose(covariances(moved), 4 * local @ covariances(model) @ local.T, rtol=1e-4, atol=1e-7)
+    directions = np.random.default_rng(0).standard_normal((20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    np.testing.assert_allclose(colours(moved, directions @ local.T), colours(model, directions), atol=2e-6)
+
+
+def test_halves_and_what_is_absent(tmp_path: Path) -> None:
+    path = tmp_path / "model.usda"
+    stage = Usd.Stage.CreateNew(str(path))
+    prim = stage.DefinePrim("/Splats", usd.TYPES[1])  # the name of the draft
+    prim.CreateAttribute("positionsh", Sdf.ValueTypeNames.Point3hArray).Set([(1, 2, 3), (4, 5, 6)])
+    prim.CreateAttribute(usd.DEGREE, Sdf.ValueTypeNames.Int).Set(0)
+    prim.CreateAttribute(f"{usd.COEFFICIENTS}h", Sdf.ValueTypeNames.Half3Array).Set([(0.5, 0.25, 0), (1, 1, 1)])
+    stage.GetRootLayer().Save()
+    model = usd.read(path)
+    np.testing.assert_array_equal(model.means, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(model.quaternions, [[1, 0, 0, 0]] * 2)
+    np.testing.assert_array_equal(model.log_scales, np.zeros((2, 3)))
+    np.testing.assert_array_equal(model.sh, [[[0.5, 0.25, 0]], [[1, 1, 1]]])
+    assert (model.opacity_logits > 16).all()
+
+
+def test_layers_elsewhere_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    usd.write(tmp_path / "model.usda", lopsided(5))
+    (folder / "shot.usda").write_text("#usda 1.0\n(\n    subLayers = [@../model.usda@]\n)\n")
+    with pytest.raises(InputError, match=r"shot\.usda: refers to .*model\.usda"):
+        usd.read(folder / "shot.usda")
+    usd.write(folder / "model.usda", lopsided(5))
+    (folder / "shot.usda").write_text("#usda 1.0\n(\n    subLayers = [@model.usda@]\n)\n")
+    assert len(usd.read(folder / "shot.usda")) == 5
+
+
+@pytest.mark.parametrize("suffix", usd.SUFFIXES[:3])
+def test_damaged_files(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"model{suffix}"
+    usd.write(path, lopsided(4, degree=0))
+    refused = 0
+    whole = path.read_bytes()
+    for index, data in enumerate(damaged(whole, step=max(1, len(whole) // 60))):
+        each = tmp_path / f"{index}{suffix}"  # USD keeps layers by their name
+        each.write_bytes(data)
+        refused += assert_refused_or_sound(usd.read, each)
+    assert refused > 55  # the cuts
+
+
+def test_a_stage_without_gaussians(tmp_path: Path) -> None:
+    (tmp_path / "model.usda").write_text('#usda 1.0\ndef Xform "World" {}\n')
+    with pytest.raises(InputError, match="has no ParticleField3DGaussianSplat"):
+        usd.read(tmp_path / "model.usda")
+    with pytest.raises(InputError, match="no such file"):
+        usd.read(tmp_path / "missing.usda")
+
+
+def test_without_usd_core_there_is_one_line(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.modules['pxr'] = None\n"
+        "from pathlib import Path\nfrom clsplat.formats import usd\n"
+        f"usd.read(Path({str(tmp_path / 'model.usda')!r}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "USD needs usd-core, expected it installed: pip install 'clsplat[usd]'" in done.stderr
