@@ -38,6 +38,8 @@ Flag = Annotated[bool, FlagCreatePairsOff]
 Output = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
 Device = Annotated[str | None, arg(metavar="DEVICE")]
 Memory = Annotated[str | None, arg(metavar="SIZE")]
+Host = Annotated[str, arg(metavar="ADDRESS")]
+Folder = Annotated[Path | None, arg(metavar="DIR")]
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,14 @@ class Train:
     max_device_mem: Memory = None
     """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
     If not given: all that the device has."""
+    view: Flag = False
+    """Show the model as it grows on a page in the browser, where training can be paused too (see clsplat view)."""
+    host: Host = "127.0.0.1"
+    """Address that the page is served at: this machine alone, unless another is given."""
+    port: int = 8080
+    """Port of the page; 0 is any that is free."""
+    paths: Folder = None
+    """Folder in which the page may save camera paths; they can be downloaded without it."""
     json: Flag = False
     """Print the final evaluation as JSON on standard output."""
     preset: Preset = "default"
@@ -222,6 +232,33 @@ class Render:
 
 
 @dataclass(frozen=True)
+class View:
+    """Look at a model in the browser: the device renders, the page shows it. Ctrl-C ends it.
+
+    docs/viewer.md has what the page can do.
+    """
+
+    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
+    """A run's folder or a model file; for a file in a run's folder that run's settings hold."""
+    scene: Annotated[Path | None, arg(metavar="SCENE")] = None
+    """Folder with the scene, for its cameras and photos; the one the run was trained on if not given."""
+    background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
+    """Background behind the Gaussians; as the run has it, or black."""
+    host: Host = "127.0.0.1"
+    """Address that the page is served at: this machine alone, unless another is given."""
+    port: int = 8080
+    """Port of the page; 0 is any that is free."""
+    paths: Folder = None
+    """Folder in which the page may save camera paths; they can be downloaded without it."""
+    device: Device = None
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
+    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    max_device_mem: Memory = None
+    """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
+    If not given: all that the device has."""
+
+
+@dataclass(frozen=True)
 class Bench:
     """Measure each stage of a frame and of a training step, and the device's own limits in the same run.
 
@@ -282,7 +319,7 @@ class Selftest:
     """Print the result as JSON."""
 
 
-Verb = Devices | Demo | Sfm | Train | Eval | Render | Bench | Tune | Selftest
+Verb = Devices | Demo | Sfm | Train | Eval | Render | View | Bench | Tune | Selftest
 Commands = (
     Annotated[Devices, subcommand("devices")]
     | Annotated[Demo, subcommand("demo")]
@@ -290,6 +327,7 @@ Commands = (
     | Annotated[Train, subcommand("train")]
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Render, subcommand("render")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Tune, subcommand("tune")]
     | Annotated[Selftest, subcommand("selftest")]
@@ -353,12 +391,12 @@ def parse(arguments: Sequence[str]) -> Verb:
         check_output(verb.output, resume=True, overwrite=verb.overwrite)
         # Once more, with the run's settings as the defaults: only flags that are given differ from them.
         earlier = Run.open(verb.output)
-        default = replace(verb, config=earlier.config, resume=False, overwrite=False)
+        default = replace(verb, config=earlier.config, resume=False, overwrite=False, view=False)
         verb = replace(_tyro(Train, arguments[1:], prog="clsplat train", default=default), resume=True)
     elif isinstance(verb, Train) and (verb.preset, verb.schedule) != ("default", None):
         # Once more, as above, with the bundles' settings as the defaults.
         config = bundled(verb.preset, verb.schedule, verb.config.iterations)
-        default = replace(verb, config=config, overwrite=False, json=False)
+        default = replace(verb, config=config, overwrite=False, json=False, view=False)
         verb = _tyro(Train, arguments[1:], prog="clsplat train", default=default)
     elif isinstance(verb, Bench) and verb.preset != "default":
         bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False)

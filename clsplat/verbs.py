@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb
+from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb, View
 from clsplat.errors import DeviceError, InputError
 from clsplat.memory import Plan, parse_bytes
 
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.runs import Run
     from clsplat.scene import Scene
+    from clsplat.training import Between
 
 
 def run(verb: Verb) -> int:
@@ -37,6 +40,10 @@ def run(verb: Verb) -> int:
             from clsplat.verb_render import render
 
             return render(verb)
+        case View():
+            from clsplat.verb_view import view
+
+            return view(verb)
         case Bench():
             return bench(verb)
         case Tune():
@@ -124,6 +131,11 @@ def train(verb: Train) -> int:
     check_output(verb.output, resume=verb.resume, overwrite=verb.overwrite)
     limit = parse_bytes(verb.max_device_mem)
     verb.config.check()
+    page: Callable[[Scene], AbstractContextManager[Between]] | None = None
+    if verb.view:
+        from clsplat.verb_view import training_view
+
+        page = training_view(verb)
     source = verb.scene
     if verb.resume:
         earlier = Run.open(verb.output)
@@ -152,7 +164,8 @@ def train(verb: Train) -> int:
         file=sys.stderr,
     )
     try:
-        _train_verb(scene, run, device)
+        with page(scene) if page else nullcontext() as between:
+            _train_verb(scene, run, device, between)
     except KeyboardInterrupt:
         steps = run.checkpoints()
         at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
@@ -167,7 +180,7 @@ def train(verb: Train) -> int:
     return 0
 
 
-def _train_verb(scene: Scene, run: Run, device: Device) -> Gaussians:
+def _train_verb(scene: Scene, run: Run, device: Device, between: Between | None = None) -> Gaussians:
     """The one place that calls the trainer."""
     from clsplat.progress import TrainProgress
     from clsplat.training import train as run_training
@@ -178,7 +191,14 @@ def _train_verb(scene: Scene, run: Run, device: Device) -> Gaussians:
 
     with TrainProgress(run.config.iterations) as progress:
         return run_training(
-            scene, run.config, device=device, run=run, resume=run.resuming, on_step=progress, on_plan=tell
+            scene,
+            run.config,
+            device=device,
+            run=run,
+            resume=run.resuming,
+            on_step=progress,
+            on_plan=tell,
+            between=between,
         )
 
 
