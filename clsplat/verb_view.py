@@ -8,18 +8,18 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clsplat.cli import Train, View
 from clsplat.config import TrainConfig
-from clsplat.errors import CapacityError, InputError
+from clsplat.errors import InputError
 from clsplat.evaluate import background_colour
 from clsplat.gaussians import Gaussians
 from clsplat.memory import parse_bytes
 from clsplat.runs import Run, is_run, model_file
-from clsplat.viewer.look import MODES, Look
+from clsplat.viewer.look import Look
 from clsplat.viewer.models import HeldModel, LiveModel
 from clsplat.viewer.server import Address, Server, World
 from clsplat.viewer.session import Share, extent_of, looking, start_of
@@ -141,13 +141,10 @@ def _world(gaussians: Gaussians, scene: Scene | None, title: str) -> World:
 
 
 def _warm(model: HeldModel, world: World) -> None:
-    """Make a picture of each kind, as the first of all waits for kernels to be built."""
-    start = world.start
-    pose = looking(start, FIRST)
+    """Make a picture in motion and one at rest, as the first of all wait for kernels to be built."""
+    camera = looking(world.start, FIRST).camera()
     for exact in (False, True):
-        for mode in MODES:
-            with suppress(CapacityError, InputError):  # told to who asks for it
-                model.picture(pose.camera(), Look(mode), exact=exact)
+        model.picture(camera, Look(), exact=exact)
 
 
 @contextmanager

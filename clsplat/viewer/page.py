@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import re
+import threading
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,8 @@ THUMBNAIL = 240
 """Longest side of a photo on the page."""
 FRUSTUM = 0.05
 """Size of a camera in relation to its distance from what is looked at."""
+CAMERAS = ("hidden", "frames", "photos")
+"""What is drawn of the scene's cameras."""
 CAMERA_COLOURS = {"train": (80, 160, 255), "test": (255, 160, 60), "key": (255, 60, 90)}
 SIZE = (1280, 720)
 """Of a path's pictures and of screenshots, unless another is asked for."""
@@ -39,6 +42,7 @@ class ViserPage:
         self.key: int = client.client_id
         self.recorder = Recorder()
         self._status: Any = None
+        self._drawing, self._drawn = 0, threading.Lock()
 
     def show(self, image: Image, level: Level, text: str) -> None:
         """As `viewing.Page` has it."""
@@ -105,20 +109,22 @@ class ViserPage:
         scene.add_line_segments("/crop", edges_of(low, high), colors=CAMERA_COLOURS["key"])
 
     def _add_cameras(self, gui: Any) -> None:
-        cameras = gui.add_checkbox("Cameras", initial_value=False, hint="Blue: trained on. Orange: held out.")
-        photos = gui.add_checkbox("Photos", initial_value=False)
+        shown = gui.add_dropdown(
+            "Cameras", CAMERAS, initial_value=CAMERAS[0], hint="Blue: trained on; orange: held out. A click goes there."
+        )
 
-        def changed(_: Any) -> None:  # in a thread of its own: photos take a while to read
-            self._clear("/cameras")
-            if not (cameras.value or photos.value):
-                return
-            for index, view in enumerate(self.world.views):
-                if not (cameras.value or photos.value):
-                    return
-                self._add_camera(index, view, photo=photos.value)
+        def changed(_: Any) -> None:  # in a thread of viser's: photos take a while to read
+            self._drawing += 1
+            mine = self._drawing
+            with self._drawn:  # the latest wish is the last to be drawn
+                if mine == self._drawing:
+                    self._clear("/cameras")
+                for index, view in enumerate(self.world.views):
+                    if mine != self._drawing or shown.value == CAMERAS[0]:
+                        return
+                    self._add_camera(index, view, photo=shown.value == CAMERAS[2])
 
-        cameras.on_update(changed)
-        photos.on_update(changed)
+        shown.on_update(changed)
 
     def _clear(self, name: str) -> None:
         """Remove what is under this name of the scene."""
@@ -218,6 +224,8 @@ class ViserPage:
             color=CAMERA_COLOURS["key"],
             wxyz=quaternion_of(pose.rotation),
             position=pose.position - self.world.origin,
+            thickness=2.0,
+            thickness_units="screen",  # where the camera still stands, it would frame the page
         )
 
     def _add_screenshot(self, gui: Any) -> None:

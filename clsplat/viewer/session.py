@@ -212,7 +212,7 @@ class Refinement:
         """The next picture, if its time has come; model: counts its changes, while it is trained."""
         if self.moving:
             return Level(self.pace.scale, exact=False)
-        if now - self._at < SETTLE or (self._level.exact and self._model == model):
+        if now < self._at + SETTLE or (self._level.exact and self._model == model):
             return None
         if self._level.exact or self.pace.patient or self._level.scale >= 0.5:
             return Level(1.0, exact=True)
