@@ -23,8 +23,8 @@ from clsplat.paths import choose_shot
 from clsplat.rendering import Renderer
 
 PAGE = {"width": 900, "height": 600}
-CLEAR = (slice(250, 600), slice(0, 560))
-"""Rows and columns of the page where no panel is."""
+CLEAR = (slice(250, 580), slice(20, 560))
+"""Rows and columns of the page where no panel is, nor the frame of a key that was recorded here."""
 
 
 @pytest.fixture(scope="module")
