@@ -9,6 +9,7 @@ been handed to WebGL; when viser's page has its canvas, before it connects, is t
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import statistics
@@ -64,9 +65,25 @@ def made_up(count: int) -> Gaussians:
     return Gaussians(*(np.ascontiguousarray(each, np.float32) for each in arrays))
 
 
+def processor_seconds(process: int) -> float:
+    """Of a process and all that it started and that still runs, on Linux; 0 elsewhere."""
+    used, parents = {}, {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            words = stat.read_text().rsplit(")", 1)[1].split()
+        except OSError:  # it has just ended
+            continue
+        number = int(stat.parent.name)
+        parents[number], used[number] = int(words[1]), (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    family = {process}
+    while more := {child for child, parent in parents.items() if parent in family} - family:
+        family |= more
+    return sum(used.get(each, 0.0) for each in family)
+
+
 @contextmanager
-def serving(model: Path, device: str | None) -> Iterator[str]:
-    """The address of `clsplat view` of this model."""
+def serving(model: Path, device: str | None) -> Iterator[tuple[str, int]]:
+    """The address of `clsplat view` of this model, and its process."""
     command = [sys.executable, "-m", "clsplat", "view", str(model), "--port", "0"]
     process = subprocess.Popen(
         command + (["--device", device] if device else []), stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL
@@ -77,7 +94,7 @@ def serving(model: Path, device: str | None) -> Iterator[str]:
         for line in process.stderr:
             lines.append(line)
             if found := re.search(r"viewer at (http://\S+);", line):
-                yield found[1]
+                yield found[1], process.pid
                 return
         raise ClsplatError(f"clsplat view ended: {' '.join(lines)}")
     finally:
@@ -85,7 +102,7 @@ def serving(model: Path, device: str | None) -> Iterator[str]:
         process.communicate(timeout=30)
 
 
-def visit(browser: Any, url: str) -> dict[str, float]:
+def visit(browser: Any, url: str, server: int) -> dict[str, float]:
     """One page, opened, and its camera moved."""
     page = browser.new_page(viewport=WINDOW)
     page.add_init_script(WATCH)
@@ -98,19 +115,23 @@ def visit(browser: Any, url: str) -> dict[str, float]:
     page.mouse.move(300, 300)
     page.mouse.down()
     before, start = page.evaluate("[window.pictures.length, performance.now()]")
-    begin = time.perf_counter()
+    begin, server_before, before_all = time.perf_counter(), processor_seconds(server), processor_seconds(os.getpid())
     while (passed := time.perf_counter() - begin) < DRAG:
         page.mouse.move(300 + 250 * passed / DRAG, 300 + 40 * np.sin(passed))
         page.wait_for_timeout(15)
     end, moved = page.evaluate("[performance.now(), window.pictures]")
+    served, used = processor_seconds(server) - server_before, processor_seconds(os.getpid()) - before_all
     page.mouse.up()
     page.close()
+    count = max(len(moved) - before, 1)
     sizes = [width for _, width, _ in moved[before:]]
     return {
         "canvas_s": drawn / 1000,
         "first_s": first / 1000,
         "exact_width": max(widths),
         "moving_per_s": 1000 * (len(moved) - before) / (end - start),
+        "server_ms": 1000 * served / count,
+        "browser_ms": 1000 * (used - served) / count,
         "moving_width": statistics.median(sizes) if sizes else 0,
     }
 
@@ -121,10 +142,10 @@ def bench(model: Path, device: str | None, repeat: int) -> list[dict[str, float]
 
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     measuring.require(path is not None, "no chromium on the path, expected Debian's: apt install chromium")
-    with serving(model, device) as url, sync_playwright() as playwright:
+    with serving(model, device) as (url, server), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=list(FLAGS))
-        visit(browser, url)  # the browser's own first time
-        found = [visit(browser, url) for _ in range(repeat)]
+        visit(browser, url, server)  # the browser's own first time
+        found = [visit(browser, url, server) for _ in range(repeat)]
         browser.close()
     return found
 
@@ -153,6 +174,8 @@ def main() -> int:
         f"first picture      {medians['first_s']:6.2f} s ({first})",
         f"moving             {medians['moving_per_s']:6.2f} pictures a second ({moving})",
         f"                   {medians['moving_width']:6.0f} pixels wide",
+        f"a picture's share  {medians['server_ms']:6.0f} ms of the processor in the server",
+        f"                   {medians['browser_ms']:6.0f} ms in the browser, without a GPU",
     ]
     measuring.show(result, lines, as_json=options.json)
     return 0
