@@ -14,9 +14,11 @@ from pathlib import Path
 import pytest
 from calls import Capture, error_line
 from models import random_gaussians
+from tiny import CONFIG
 from viewer_browser import clsplat
 
-from clsplat.cli import main
+from clsplat.cli import Train, main, parse
+from clsplat.runs import Run
 from clsplat.viewer.server import Address
 
 pytest.importorskip("viser", reason="the extra `view` brings it")
@@ -152,3 +154,18 @@ def test_ctrl_c_ends_it(model: Path) -> None:
     assert process.returncode == 0
     assert out == ""
     assert "Traceback" not in err
+
+
+def test_the_flags_of_a_trainings_page(tmp_path: Path) -> None:
+    plain = parse(["train", "scene", "-o", "run"])
+    assert isinstance(plain, Train)
+    assert not plain.view
+    for more in ([], ["--preset", "fast"], ["--schedule", "short"]):
+        verb = parse(["train", "scene", "-o", "run", "--view", "--port", "81", "--host", "::1", *more])
+        assert isinstance(verb, Train)
+        assert (verb.view, verb.port, verb.host) == (True, 81, "::1")
+    run = tmp_path / "run"
+    Run.create(run, CONFIG, scene=tmp_path)
+    verb = parse(["train", "-o", str(run), "--resume", "--view", "--paths", str(tmp_path)])
+    assert isinstance(verb, Train)
+    assert (verb.view, verb.resume, verb.paths, verb.config) == (True, True, tmp_path, CONFIG)

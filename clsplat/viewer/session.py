@@ -22,11 +22,11 @@ Float64 = NDArray[np.float64]
 
 SETTLE = 0.2
 """Seconds without a change after which a picture is refined."""
-TARGET = 0.05
+TARGET = 0.04
 """Seconds that a picture in motion may take, with its encoding: what the browser needs comes on top."""
 PATIENCE = 0.6
 """An exact picture that takes longer is led up to by pictures of growing size."""
-SMALLEST = 1 / 12
+SMALLEST = 1 / 8
 """Of the page's size: a coarser picture would not be told apart from another."""
 QUALITIES = (60, 95)
 """Of JPEG, in motion and at rest."""
