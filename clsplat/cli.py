@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args, get_origin
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
+from tyro.conf import Positional, arg, subcommand
 
-from clsplat.cli_files import Convert, Info
+from clsplat.cli_models import Compare, Convert, Device, Flag, Folder, Host, Info, Memory, Report, View
 from clsplat.config import (
     PRESETS,
     Compression,
@@ -36,10 +36,7 @@ from clsplat.config import (
 from clsplat.errors import ClsplatError, InputError
 from clsplat.picture_config import ColourConfig, DeepConfig, FramingConfig, SamplingConfig, VideoConfig
 
-Flag = Annotated[bool, FlagCreatePairsOff]
 Output = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
-Device = Annotated[str | None, arg(metavar="DEVICE")]
-Memory = Annotated[str | None, arg(metavar="SIZE")]
 
 
 @dataclass(frozen=True)
@@ -110,6 +107,14 @@ class Train:
     max_device_mem: Memory = None
     """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
     If not given: all that the device has."""
+    view: Flag = False
+    """Show the model as it grows on a page in the browser, where training can be paused too (see clsplat view)."""
+    host: Host = "127.0.0.1"
+    """Address that the page is served at: this machine alone, unless another is given."""
+    port: int = 8080
+    """Port of the page; 0 is any that is free."""
+    paths: Folder = None
+    """Folder in which the page may save camera paths; they can be downloaded without it."""
     json: Flag = False
     """Print the final evaluation as JSON on standard output."""
     preset: Preset = "default"
@@ -291,36 +296,7 @@ class Selftest:
     """Print the result as JSON."""
 
 
-@dataclass(frozen=True)
-class Report:
-    """Write a run's report: one HTML file with curves, pictures, figures and settings, that loads nothing else.
-
-    docs/report.md says what is in it. A run that is not finished has a report too.
-    """
-
-    run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """A run's folder."""
-    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
-    """The file; report.html in the run's folder if not given."""
-    views: int = 8
-    """Most held-out views with pictures: the worst, the best and some between. All are in the table."""
-    json: Flag = False
-    """Print the figures as JSON."""
-
-
-@dataclass(frozen=True)
-class Compare:
-    """Print runs side by side: scores, Gaussians, times, and the settings that differ."""
-
-    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN")]
-    """Folders of runs, two or more."""
-    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
-    """Write a page too, with the curves overlaid and time against error: one HTML file that loads nothing else."""
-    json: Flag = False
-    """Print JSON instead of the table."""
-
-
-Verb = Devices | Demo | Sfm | Train | Eval | Render | Report | Compare | Convert | Info | Bench | Tune | Selftest
+Verb = Devices | Demo | Sfm | Train | Eval | Render | View | Report | Compare | Convert | Info | Bench | Tune | Selftest
 Commands = (
     Annotated[Devices, subcommand("devices")]
     | Annotated[Demo, subcommand("demo")]
@@ -328,6 +304,7 @@ Commands = (
     | Annotated[Train, subcommand("train")]
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Render, subcommand("render")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Report, subcommand("report")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Convert, subcommand("convert")]
@@ -395,12 +372,12 @@ def parse(arguments: Sequence[str]) -> Verb:
         check_output(verb.output, resume=True, overwrite=verb.overwrite)
         # Once more, with the run's settings as the defaults: only flags that are given differ from them.
         earlier = Run.open(verb.output)
-        default = replace(verb, config=earlier.config, resume=False, overwrite=False)
+        default = replace(verb, config=earlier.config, resume=False, overwrite=False, view=False)
         verb = replace(_tyro(Train, arguments[1:], prog="clsplat train", default=default), resume=True)
     elif isinstance(verb, Train) and (verb.preset, verb.schedule) != ("default", None):
         # Once more, as above, with the bundles' settings as the defaults.
         config = bundled(verb.preset, verb.schedule, verb.config.iterations)
-        default = replace(verb, config=config, overwrite=False, json=False)
+        default = replace(verb, config=config, overwrite=False, json=False, view=False)
         verb = _tyro(Train, arguments[1:], prog="clsplat train", default=default)
     elif isinstance(verb, Bench) and verb.preset != "default":
         bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False)

@@ -38,6 +38,10 @@ REPORT_EVERY = 10
 """Steps between readings of the loss, which make host and device wait for each other."""
 
 
+Between = Callable[[Trainer, Callable[[], bool]], None]
+"""What is called before each step, with the trainer and whether Ctrl-C was pressed, after which it should return."""
+
+
 @dataclass(frozen=True)
 class StepReport:
     """step: number of steps done; loss and psnr of that step's view; seconds of training alone, so far."""
@@ -253,13 +257,15 @@ def train(
     resume: bool = False,
     on_step: Callable[[StepReport], None] | None = None,
     on_plan: Callable[[Plan], None] | None = None,
+    between: Between | None = None,
 ) -> Gaussians:
     """Train on a scene; the model.
 
     device: open, or as `clsplat devices` names it, then with at most `max_device_mem` of its memory, such as "256MiB";
     run: a folder for metrics, checkpoints, held-out renders and
     the model, or None for none of them; resume: go on from the run's latest checkpoint; on_step: called every
-    REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes.
+    REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes;
+    between: called before each step; it may render what the trainer has, and take its time, which is not counted.
     Raises InputError for a scene without views, ClsplatError where numbers are not finite again and again
     (docs/decisions/0016-never-a-nan.md; a warning tells of what could be mended), and KeyboardInterrupt on Ctrl-C after
     a checkpoint has been written.
@@ -276,6 +282,8 @@ def train(
     with _interruption() as interrupted:
         while True:
             while trainer.step < config.iterations and not interrupted():
+                if between is not None:
+                    between(trainer, interrupted)
                 session.step(on_step)
             session.save()
             if trainer.step < config.iterations or not session.go_back():

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clsplat import colour, edit, fidelity
-from clsplat.cli_files import Convert, Info
+from clsplat.cli_models import Convert, Info
 from clsplat.errors import InputError
 from clsplat.files import is_file, read_document
 from clsplat.formats import format_of, format_of_name, load, model_path, save

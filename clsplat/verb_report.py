@@ -6,7 +6,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from clsplat.cli import Compare, Report
+from clsplat.cli_models import Compare, Report
 from clsplat.errors import InputError, plain
 from clsplat.runs import Run
 

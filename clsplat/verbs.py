@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clsplat.cli import Bench, Compare, Demo, Devices, Eval, Render, Report, Selftest, Sfm, Train, Tune, Verb
-from clsplat.cli_files import Convert, Info
+from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb
+from clsplat.cli_models import Compare, Convert, Info, Report, View
 from clsplat.errors import DeviceError, InputError
 from clsplat.memory import Plan, parse_bytes
 
@@ -19,49 +22,33 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.runs import Run
     from clsplat.scene import Scene
+    from clsplat.training import Between
+
+
+_WHERE: dict[type, tuple[str, str]] = {
+    Devices: ("verbs", "devices"),
+    Demo: ("verbs", "demo"),
+    Sfm: ("verbs", "sfm"),
+    Train: ("verbs", "train"),
+    Eval: ("verbs", "evaluate"),
+    Render: ("verb_render", "render"),
+    View: ("verb_view", "view"),
+    Report: ("verb_report", "report"),
+    Compare: ("verb_report", "compare"),
+    Convert: ("verb_convert", "convert"),
+    Info: ("verb_convert", "info"),
+    Bench: ("verbs", "bench"),
+    Tune: ("verbs", "tune"),
+    Selftest: ("selftest_table", "selftest"),
+}
+"""The module and function of each; a module is loaded when it is called."""
 
 
 def run(verb: Verb) -> int:
     """Do it; returns the exit status. Raises ClsplatError, OSError, KeyboardInterrupt."""
-    match verb:
-        case Devices():
-            return devices(verb)
-        case Demo():
-            return demo(verb)
-        case Sfm():
-            return sfm(verb)
-        case Train():
-            return train(verb)
-        case Eval():
-            return evaluate(verb)
-        case Render():
-            from clsplat.verb_render import render
-
-            return render(verb)
-        case Report():
-            from clsplat.verb_report import report
-
-            return report(verb)
-        case Compare():
-            from clsplat.verb_report import compare
-
-            return compare(verb)
-        case Convert():
-            from clsplat.verb_convert import convert
-
-            return convert(verb)
-        case Info():
-            from clsplat.verb_convert import info
-
-            return info(verb)
-        case Bench():
-            return bench(verb)
-        case Tune():
-            return tune(verb)
-        case Selftest():
-            from clsplat.selftest_table import selftest
-
-            return selftest(verb)
+    module, name = _WHERE[type(verb)]
+    status: int = getattr(import_module(f"clsplat.{module}"), name)(verb)
+    return status
 
 
 def devices(verb: Devices) -> int:
@@ -141,6 +128,11 @@ def train(verb: Train) -> int:
     check_output(verb.output, resume=verb.resume, overwrite=verb.overwrite)
     limit = parse_bytes(verb.max_device_mem)
     verb.config.check()
+    page: Callable[[Scene], AbstractContextManager[Between]] | None = None
+    if verb.view:
+        from clsplat.verb_view import training_view
+
+        page = training_view(verb)
     source = verb.scene
     if verb.resume:
         earlier = Run.open(verb.output)
@@ -169,7 +161,8 @@ def train(verb: Train) -> int:
         file=sys.stderr,
     )
     try:
-        _train_verb(scene, run, device)
+        with page(scene) if page else nullcontext() as between:
+            _train_verb(scene, run, device, between)
     except KeyboardInterrupt:
         steps = run.checkpoints()
         at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
@@ -184,7 +177,7 @@ def train(verb: Train) -> int:
     return 0
 
 
-def _train_verb(scene: Scene, run: Run, device: Device) -> Gaussians:
+def _train_verb(scene: Scene, run: Run, device: Device, between: Between | None = None) -> Gaussians:
     """The one place that calls the trainer."""
     from clsplat.progress import TrainProgress
     from clsplat.training import train as run_training
@@ -195,7 +188,14 @@ def _train_verb(scene: Scene, run: Run, device: Device) -> Gaussians:
 
     with TrainProgress(run.config.iterations) as progress:
         return run_training(
-            scene, run.config, device=device, run=run, resume=run.resuming, on_step=progress, on_plan=tell
+            scene,
+            run.config,
+            device=device,
+            run=run,
+            resume=run.resuming,
+            on_step=progress,
+            on_plan=tell,
+            between=between,
         )
 
 

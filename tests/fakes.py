@@ -117,7 +117,15 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         return Scene(views if test_every else views[1:], ["one photo is dark"])
 
     def train(
-        scene: Scene, config: TrainConfig, *, device: FakeDevice, run: Run, resume: bool, on_step: Any, on_plan: Any
+        scene: Scene,
+        config: TrainConfig,
+        *,
+        device: FakeDevice,
+        run: Run,
+        resume: bool,
+        on_step: Any,
+        on_plan: Any,
+        between: Any = None,
     ) -> Gaussians:
         pipe.calls.append(("train", config.iterations, config.seed, resume))
         on_step(Report(1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line of the verbs for model files, as `clsplat.cli` has it for the others."""
+"""The command line of the verbs for what has been trained, as `clsplat.cli` has it for the others."""
 
 from __future__ import annotations
 
@@ -10,6 +10,66 @@ from typing import Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 Flag = Annotated[bool, FlagCreatePairsOff]
+Device = Annotated[str | None, arg(metavar="DEVICE")]
+Memory = Annotated[str | None, arg(metavar="SIZE")]
+Host = Annotated[str, arg(metavar="ADDRESS")]
+Folder = Annotated[Path | None, arg(metavar="DIR")]
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a model in the browser: the device renders, the page shows it. Ctrl-C ends it.
+
+    docs/viewer.md has what the page can do.
+    """
+
+    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
+    """A run's folder or a model file; for a file in a run's folder that run's settings hold."""
+    scene: Annotated[Path | None, arg(metavar="SCENE")] = None
+    """Folder with the scene, for its cameras and photos; the one the run was trained on if not given."""
+    background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
+    """Background behind the Gaussians; as the run has it, or black."""
+    host: Host = "127.0.0.1"
+    """Address that the page is served at: this machine alone, unless another is given."""
+    port: int = 8080
+    """Port of the page; 0 is any that is free."""
+    paths: Folder = None
+    """Folder in which the page may save camera paths; they can be downloaded without it."""
+    device: Device = None
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
+    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    max_device_mem: Memory = None
+    """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
+    If not given: all that the device has."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write a run's report: one HTML file with curves, pictures, figures and settings, that loads nothing else.
+
+    docs/report.md says what is in it. A run that is not finished has a report too.
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A run's folder."""
+    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
+    """The file; report.html in the run's folder if not given."""
+    views: int = 8
+    """Most held-out views with pictures: the worst, the best and some between. All are in the table."""
+    json: Flag = False
+    """Print the figures as JSON."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Print runs side by side: scores, Gaussians, times, and the settings that differ."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN")]
+    """Folders of runs, two or more."""
+    output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
+    """Write a page too, with the curves overlaid and time against error: one HTML file that loads nothing else."""
+    json: Flag = False
+    """Print JSON instead of the table."""
 
 
 @dataclass(frozen=True)

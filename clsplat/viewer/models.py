@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is looked at: a model that does not change, or one in training. Pictures of them, by `clsplat.rendering`.
+
+Only the thread that made them may ask for pictures: a device has one queue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+from clsplat.camera import Camera
+from clsplat.config import PRESETS, RasterizerConfig
+from clsplat.device.context import Device
+from clsplat.errors import CapacityError, InputError
+from clsplat.gaussians import Gaussians
+from clsplat.needs import frame_pixels
+from clsplat.rendering import Rasterizer, Renderer
+from clsplat.stages.project import AnyGaussians
+from clsplat.trainer import Trainer
+from clsplat.viewer.look import Image, Look, alpha_picture, colour_picture, count_picture, depth_picture, edited
+from clsplat.viewer.session import MOST_PIXELS
+
+HELD = 2
+"""Models on the device: the one of the file, and one that is looked at in another way."""
+FEATURES = 3
+"""Floats of a Gaussian, at least, that go into channels beside colour."""
+
+
+class Model(Protocol):
+    """version: counts its changes; pixels: the most a picture on a page may have."""
+
+    @property
+    def version(self) -> int: ...
+    @property
+    def pixels(self) -> int: ...
+    def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
+        """(H, W, 3) uint8, and what there is to be said of it. Raises CapacityError and InputError."""
+        ...
+
+
+def draft(config: RasterizerConfig) -> RasterizerConfig:
+    """For pictures in motion: what is approximate where that is quick, of the same SH."""
+    fast = PRESETS["fast"]
+    return replace(
+        config,
+        alpha_min=max(config.alpha_min, fast.alpha_min),
+        transmittance_min=max(config.transmittance_min, fast.transmittance_min),
+    )
+
+
+class HeldModel:
+    """Of a file. The device holds it as it is, and as it was last looked at otherwise."""
+
+    version = 0
+
+    def __init__(
+        self, gaussians: Gaussians, device: Device, config: RasterizerConfig, background: Sequence[float]
+    ) -> None:
+        self.gaussians, self.device, self.background = gaussians, device, background
+        config = replace(config, sh_angle=0.0)  # a picture must not depend on those before
+        self._rasterizers = {True: Rasterizer(device, config), False: Rasterizer(device, draft(config))}
+        self._held: dict[Look | None, tuple[Gaussians, dict[bool, Renderer]]] = {}
+
+    @property
+    def pixels(self) -> int:
+        """As `Model` has it."""
+        return min(MOST_PIXELS, frame_pixels(self.device, FEATURES))
+
+    def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
+        """As `Model` has it."""
+        key = look.changes(self.gaussians.sh_degree)
+        try:
+            return self._picture(key, camera, look, exact=exact)
+        except CapacityError:
+            self._held = {key: (self._held[key][0], {})}  # all other models make room
+            return self._picture(key, camera, look, exact=exact)
+
+    def _picture(self, key: Look | None, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
+        gaussians, renderers = self._held.pop(key) if key in self._held else (self._made(key), {})
+        while len(self._held) >= HELD:
+            del self._held[next(iter(self._held))]
+        self._held[key] = (gaussians, renderers)  # the latest is the last
+        renderer = renderers.get(exact)
+        if renderer is None:
+            renderer = renderers[exact] = Renderer(self.device, self._rasterizers[exact])
+        return render_picture(renderer, gaussians, camera, look, self.background)
+
+    def _made(self, key: Look | None) -> Gaussians:
+        return self.gaussians if key is None else edited(self.gaussians, key)
+
+
+class LiveModel:
+    """In training, between two of its steps. It works in the trainer's memory, and leaves alone what a step needs."""
+
+    def __init__(self, trainer: Trainer, background: Sequence[float]) -> None:
+        self.trainer, self.background = trainer, background
+        self._renderer = Renderer(trainer.device, trainer.rasterizer)
+        self._edited: tuple[tuple[int, Look], Gaussians] | None = None
+        self._other: Renderer | None = None
+
+    @property
+    def version(self) -> int:
+        """As `Model` has it: the step."""
+        return self.trainer.step
+
+    @property
+    def pixels(self) -> int:
+        """As `Model` has it: what training has memory for."""
+        return max(view.camera.width * view.camera.height for view in self.trainer.views)
+
+    def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
+        """As `Model` has it. Raises InputError for what needs more memory than a limited training leaves."""
+        trainer = self.trainer
+        degree = round(trainer.parameters.coefficients**0.5) - 1
+        key = look.changes(degree)
+        if (key is not None or look.mode in ("depth", "count")) and (
+            trainer.device.memory.limit is not None or any(trainer.plan.pieces)
+        ):
+            raise InputError("this training has just the memory that it needs: only colour and alpha can be shown")
+        if key is None:
+            local = camera.from_origin(trainer.origin)
+            return render_picture(self._renderer, trainer.parameters, local, look, self.background)
+        if self._edited is None or self._edited[0] != (trainer.step, key):
+            self._edited = ((trainer.step, key), edited(trainer.gaussians(), key))
+        self._other = self._other or Renderer(trainer.device, config=trainer.config.rasterizer)
+        return render_picture(self._other, self._edited[1], camera, look, self.background)
+
+
+def render_picture(
+    renderer: Renderer, model: Gaussians | AnyGaussians, camera: Camera, look: Look, background: Sequence[float]
+) -> tuple[Image, str]:
+    """What `Model.picture` gives, of a model or what of it is on the device."""
+    if isinstance(model, Gaussians) and not len(model):
+        raise InputError("nothing of the model is left: the crop box holds no Gaussian")
+    if look.mode in ("depth", "count"):
+        frame, found = renderer.render_channels(model, camera, background=background, contiguous=False)
+        if look.mode == "depth":
+            return depth_picture(found.depth, frame.alpha)
+        return count_picture(found.count)
+    frame = renderer.render(model, camera, background, contiguous=False)
+    return (alpha_picture(frame.alpha) if look.mode == "alpha" else colour_picture(frame.image)), ""

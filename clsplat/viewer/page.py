@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One page of the viewer: its controls, and what they ask for. By viser; what they mean is in `look` and `recorder`."""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clsplat.errors import ClsplatError, InputError, plain
+from clsplat.viewer.look import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
+from clsplat.viewer.recorder import FPS, Recorder, save_path
+from clsplat.viewer.session import LARGEST_SIDE, MOST_PIXELS, Level, quaternion_of
+from clsplat.viewer.viewing import Viewing
+
+if TYPE_CHECKING:
+    from clsplat.scene import View
+    from clsplat.viewer.models import Model
+    from clsplat.viewer.server import World
+
+THUMBNAIL = 240
+"""Longest side of a photo on the page."""
+FRUSTUM = 0.05
+"""Size of a camera in relation to its distance from what is looked at."""
+CAMERAS = ("hidden", "frames", "photos")
+"""What is drawn of the scene's cameras."""
+CAMERA_COLOURS = {"train": (80, 160, 255), "test": (255, 160, 60), "key": (255, 60, 90)}
+SIZE = (1280, 720)
+"""Of a path's pictures and of screenshots, unless another is asked for."""
+
+
+class ViserPage:
+    """What one who watches sees, and their controls. The methods that render are called by the device's thread."""
+
+    def __init__(self, client: Any, viewing: Viewing, world: World, paths: Path | None) -> None:
+        self.client, self.viewing, self.world, self.paths = client, viewing, world, paths
+        self.key: int = client.client_id
+        self.recorder = Recorder()
+        self._status: Any = None
+        self._drawing, self._drawn = 0, threading.Lock()
+
+    def show(self, image: Image, level: Level, text: str) -> None:
+        """As `viewing.Page` has it."""
+        self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
+        if level.exact and self._status is not None:
+            height, width = image.shape[:2]
+            self._say(", ".join(filter(None, (f"{width} x {height}, exact", text))))
+
+    def tell(self, message: str) -> None:
+        """As `viewing.Page` has it."""
+        self.client.add_notification("clsplat", plain(message), auto_close_seconds=10.0)
+        self._say(plain(message))
+
+    def build(self) -> None:
+        """Make the controls."""
+        gui, scene = self.client.gui, self.client.scene
+        for name in ("/cameras", "/keys"):
+            scene.add_frame(name, show_axes=False)
+        self._status = gui.add_markdown("")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("View"):
+            self._add_view(gui)
+        with tabs.add_tab("Path"):
+            self._add_path(gui)
+        with tabs.add_tab("Screenshot"):
+            self._add_screenshot(gui)
+
+    def _say(self, text: str) -> None:
+        if self._status is not None and self._status.content != text:
+            self._status.content = text
+
+    def _add_view(self, gui: Any) -> None:
+        mode = gui.add_dropdown("Show", MODES, initial_value="colour")
+        degree = gui.add_slider("SH degree", 0, 3, 1, max(self.world.degree, 0))
+        size = gui.add_slider("Size", *SIZES, 0.05, 1.0)
+        opacity = gui.add_slider("Opacity", *OPACITIES, 0.05, 1.0)
+        low, high = self.world.box
+        reach = np.maximum(high - low, 1e-6)
+        low, high = low - 0.5 * reach, high + 0.5 * reach
+        with gui.add_folder("Crop", expand_by_default=False):
+            crop = gui.add_checkbox("Crop", initial_value=False)
+            sides = [
+                gui.add_multi_slider(name, float(a), float(b), float(b - a) / 400, (float(a), float(b)))
+                for name, a, b in zip("xyz", low, high, strict=True)
+            ]
+
+        async def changed(_: Any) -> None:
+            box = [[side.value[0] for side in sides], [side.value[1] for side in sides]] if crop.value else None
+            look = read_look(mode.value, degree.value, size.value, opacity.value, box)
+            self.viewing.looks(self.key, look)
+            self._draw_box(look)
+
+        for control in (mode, degree, size, opacity, crop, *sides):
+            control.on_update(changed)
+        if self.world.views:
+            self._add_cameras(gui)
+
+    def _draw_box(self, look: Look) -> None:
+        scene = self.client.scene
+        if look.crop is None:
+            scene.remove_by_name("/crop")
+            return
+        low, high = (np.array(corner) - self.world.origin for corner in (look.crop[:3], look.crop[3:]))
+        scene.add_line_segments("/crop", edges_of(low, high), colors=CAMERA_COLOURS["key"])
+
+    def _add_cameras(self, gui: Any) -> None:
+        shown = gui.add_dropdown(
+            "Cameras", CAMERAS, initial_value=CAMERAS[0], hint="Blue: trained on; orange: held out. A click goes there."
+        )
+
+        def changed(_: Any) -> None:  # in a thread of viser's: photos take a while to read
+            self._drawing += 1
+            mine = self._drawing
+            with self._drawn:  # the latest wish is the last to be drawn
+                if mine == self._drawing:
+                    self._clear("/cameras")
+                for index, view in enumerate(self.world.views):
+                    if mine != self._drawing or shown.value == CAMERAS[0]:
+                        return
+                    self._add_camera(index, view, photo=shown.value == CAMERAS[2])
+
+        shown.on_update(changed)
+
+    def _clear(self, name: str) -> None:
+        """Remove what is under this name of the scene."""
+        with self.client.atomic():
+            self.client.scene.remove_by_name(name)
+            self.client.scene.add_frame(name, show_axes=False)
+
+    def _add_camera(self, index: int, view: View, *, photo: bool) -> None:
+        camera, start = view.camera, self.world.start
+        if camera.projection != "perspective":
+            return
+        fov = 2 * math.atan2(0.5 * camera.height, camera.fy)
+        handle = self.client.scene.add_camera_frustum(
+            f"/cameras/{index}",
+            fov,
+            camera.width / camera.height,
+            scale=FRUSTUM * float(np.linalg.norm(start.position - start.target)),
+            color=CAMERA_COLOURS[view.split],
+            image=thumbnail(view) if photo else None,
+            wxyz=quaternion_of(camera.rotation.T),
+            position=camera.position - self.world.origin,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+        async def clicked(_: Any) -> None:
+            own = self.client.camera
+            ahead = float(np.linalg.norm(own.look_at - own.position))
+            with self.client.atomic():
+                own.position = camera.position - self.world.origin
+                own.look_at = camera.position - self.world.origin + ahead * camera.rotation[2]
+                own.fov = fov
+
+        handle.on_click(clicked)
+
+    def _add_path(self, gui: Any) -> None:
+        add, remove, clear = (gui.add_button(name) for name in ("Add key", "Remove last key", "Clear keys"))
+        count = gui.add_markdown("no keys")
+        apart = gui.add_number("Seconds between keys", 2.0, min=0.05, max=3600.0, step=0.05)
+        fps = gui.add_number("Frames a second", FPS, min=1.0, max=240.0, step=1.0)
+        loop = gui.add_checkbox("Closed loop", initial_value=False)
+        width, height = self._add_size(gui)
+        download = gui.add_button("Download path")
+        save = gui.add_button("Save path") if self.paths is not None else None
+
+        def counted() -> None:
+            keys = len(self.recorder.keys)
+            count.content = f"{keys or 'no'} key{'' if keys == 1 else 's'}"
+
+        async def added(_: Any) -> None:
+            pose = self.viewing.pose(self.key)
+            if pose is not None:
+                self._attempt(lambda: self.recorder.add(pose))
+                self._draw_key(len(self.recorder.keys) - 1)
+            counted()
+
+        async def removed(_: Any) -> None:
+            self.recorder.remove_last()
+            self.client.scene.remove_by_name(f"/keys/{len(self.recorder.keys)}")
+            counted()
+
+        async def cleared(_: Any) -> None:
+            self.recorder.clear()
+            self._clear("/keys")
+            counted()
+
+        def document() -> str:
+            size = (int(width.value), int(height.value))
+            return self.recorder.document(size, apart=float(apart.value), fps=float(fps.value), loop=loop.value)
+
+        async def downloaded(_: Any) -> None:
+            self._attempt(
+                lambda: self.client.send_file_download("path.json", document().encode(), save_immediately=True)
+            )
+
+        def write() -> None:
+            if self.paths is not None:
+                self.tell(f"saved as {save_path(self.paths, document()).name}")
+
+        async def saved(_: Any) -> None:
+            self._attempt(write)
+
+        add.on_click(added)
+        remove.on_click(removed)
+        clear.on_click(cleared)
+        download.on_click(downloaded)
+        if save is not None:
+            save.on_click(saved)
+
+    def _draw_key(self, index: int) -> None:
+        pose, start = self.recorder.keys[index], self.world.start
+        self.client.scene.add_camera_frustum(
+            f"/keys/{index}",
+            pose.fov,
+            pose.width / pose.height,
+            scale=FRUSTUM * float(np.linalg.norm(start.position - start.target)),
+            color=CAMERA_COLOURS["key"],
+            wxyz=quaternion_of(pose.rotation),
+            position=pose.position - self.world.origin,
+            thickness=2.0,
+            thickness_units="screen",  # where the camera still stands, it would frame the page
+        )
+
+    def _add_screenshot(self, gui: Any) -> None:
+        width, height = self._add_size(gui)
+        take = gui.add_button("Take screenshot")
+
+        async def taken(_: Any) -> None:
+            size = (int(width.value), int(height.value))
+            self.viewing.ask(self.key, lambda model: self.screenshot(model, size))
+
+        take.on_click(taken)
+
+    def _add_size(self, gui: Any) -> tuple[Any, Any]:
+        sides = {"min": 1, "max": LARGEST_SIDE, "step": 1}
+        return gui.add_number("Width", SIZE[0], **sides), gui.add_number("Height", SIZE[1], **sides)
+
+    def screenshot(self, model: Model, size: tuple[int, int]) -> None:
+        """Send an exact picture of this size, as `clsplat render` would make it. Raises InputError."""
+        pose = self.viewing.pose(self.key)
+        if pose is None:
+            return
+        width, height = size
+        if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and width * height <= 4 * MOST_PIXELS):
+            raise InputError(f"a screenshot of {width} x {height}: expected at most {4 * MOST_PIXELS:,} pixels")
+        image, _ = model.picture(pose.camera(width, height), self.viewing.look(self.key), exact=True)
+        self.client.send_file_download("screenshot.png", png(image), save_immediately=True)
+
+    def _attempt(self, action: Any) -> None:
+        """Do it, and tell of what is wrong with it."""
+        try:
+            action()
+        except ClsplatError as error:
+            self.tell(str(error))
+        except OSError as error:
+            self.tell(re.sub(r": '.*'$", "", str(error)))  # paths of this machine are not for a page
+
+
+def png(image: Image) -> bytes:
+    """The file."""
+    import imageio.v3 as iio
+
+    data: bytes = iio.imwrite("<bytes>", image, extension=".png")
+    return data
+
+
+@cache
+def thumbnail(view: View) -> Image | None:
+    """(H, W, 3), small; None for a photo that cannot be read."""
+    camera = view.camera
+    scale = min(THUMBNAIL / max(camera.width, camera.height), 1.0)
+    try:
+        pixels = view.load(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    except (ClsplatError, OSError):
+        return None
+    return colour_picture(pixels[:, :, :3])
+
+
+def edges_of(low: Any, high: Any) -> Any:
+    """(12, 2, 3) float32: the edges of a box."""
+    corners = np.array([[(low, high)[bit][axis] for axis, bit in enumerate(bits)] for bits in np.ndindex(2, 2, 2)])
+    pairs = [(a, b) for a in range(8) for b in range(a) if (a ^ b).bit_count() == 1]
+    return corners[np.array(pairs)].astype(np.float32)

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The viewer's server, by viser (the extra `view`): who comes and goes, and what all of them see.
+
+What is served are viser's own page and the messages of its web socket; no path of this machine is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import ipaddress
+import re
+import socket
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError
+from clsplat.viewer.session import Start, read_pose
+from clsplat.viewer.viewing import Viewing
+
+if TYPE_CHECKING:
+    from clsplat.scene import View
+
+Float64 = NDArray[np.float64]
+LOCAL = r"https?://(localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
+"""Where a page may come from that talks to a server for this machine alone."""
+FAR = 1000.0
+"""viser's own far plane, of what it draws itself: cameras and boxes."""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What the pages begin with. origin (3,): subtracted from the world for the browser, whose numbers are float32;
+    box: corners (3,) of what the crop's sliders reach; degree: of the model's SH."""
+
+    title: str
+    start: Start
+    origin: Float64
+    box: tuple[Float64, Float64]
+    degree: int
+    views: Sequence[View] = ()
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the server listens, and the folder for paths that are saved, None for none."""
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    paths: Path | None = None
+
+    def check(self) -> None:
+        """Raise InputError where viser is missing, the folder is, or nothing can listen there. viser itself would take
+        the next port that is free."""
+        require_viser()
+        if not 0 <= self.port <= 65535:
+            raise InputError(f"--port {self.port}: expected 0 to 65535; 0 is any that is free")
+        if self.paths is not None and not self.paths.is_dir():
+            raise InputError(f"--paths {self.paths}: no such folder, expected one to save camera paths in")
+        try:
+            found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+            family, kind, protocol, _, address = found[0]
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+                probe.listen()
+        except (OSError, UnicodeError, IndexError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise InputError(
+                f"--host {self.host} --port {self.port}: cannot listen there ({reason}), expected an address of this "
+                "machine and a port that no other program has; --port 0 takes any"
+            ) from None
+
+    @property
+    def local(self) -> bool:
+        """Whether only this machine can reach it."""
+        if self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+
+def require_viser() -> None:
+    """Raise InputError, with what installs it, where viser is missing."""
+    try:
+        import viser  # noqa: F401
+    except ImportError:
+        raise InputError("the viewer needs viser: pip install 'clsplat[view]'") from None
+
+
+class Server:
+    """Serves pages until it is closed. Raises InputError where it cannot listen.
+
+    training: whether there is one to be paused.
+    """
+
+    def __init__(self, viewing: Viewing, world: World, address: Address, *, training: bool = False) -> None:
+        from clsplat.viewer.page import ViserPage
+
+        address.check()
+        import viser
+
+        self.viewing, self.world, self.address = viewing, world, address
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # who has left is no news
+        with _quiet(), _origins(address):
+            self._server: Any = viser.ViserServer(host=address.host, port=address.port, label="clsplat", verbose=False)
+        server = self._server
+        server.request_share_url = lambda *_, **__: None  # a page may not ask for a tunnel out of this machine
+        server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
+        server.scene.set_up_direction(world.start.up)
+        begin, start = server.initial_camera, world.start
+        begin.position, begin.look_at = start.position - world.origin, start.target - world.origin
+        begin.up, begin.fov = start.up, start.fov
+        begin.far = max(FAR, 20 * float(np.linalg.norm(start.position - start.target)))
+        self.paused = False
+        self._status: Any = None
+        if training:
+            self._add_training()
+        pages: dict[int, ViserPage] = {}
+
+        async def came(client: Any) -> None:
+            key = client.client_id
+            page = pages[key] = ViserPage(client, viewing, world, address.paths)
+            viewing.join(key, page)
+
+            async def moved(camera: Any) -> None:
+                size = (camera.image_width, camera.image_height)
+                pose = read_pose(camera.wxyz, camera.position, camera.fov, size, world.origin)
+                if pose is not None:
+                    viewing.moved(key, pose)
+
+            client.camera.on_update(moved)
+            await moved(client.camera)
+            page.build()
+
+        async def left(client: Any) -> None:
+            viewing.leave(client.client_id)
+            pages.pop(client.client_id, None)
+
+        server.on_client_connect(came)
+        server.on_client_disconnect(left)
+
+    @property
+    def url(self) -> str:
+        """For this machine's browser, or the host's name where it listens elsewhere."""
+        host = self.address.host
+        name = "localhost" if self.address.local else f"[{host}]" if ":" in host else host
+        return f"http://{name}:{self._server.get_port()}"
+
+    def tell(self, text: str) -> None:
+        """What there is to be said of a training."""
+        if self._status is not None and self._status.content != text:
+            self._status.content = text
+
+    def close(self) -> None:
+        """All pages lose their server."""
+        with _quiet():
+            self._server.stop()
+
+    def _add_training(self) -> None:
+        gui = self._server.gui
+        with gui.add_folder("Training"):
+            self._status = gui.add_markdown("waiting for the first step")
+            button = gui.add_button("Pause")
+
+        async def pressed(_: Any) -> None:
+            self.paused = not self.paused
+            button.label = "Resume" if self.paused else "Pause"
+            self.viewing.wake()
+
+        button.on_click(pressed)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """viser prints to standard output, which belongs to --json."""
+    with contextlib.redirect_stdout(io.StringIO() if sys.stdout is not None else None):
+        yield
+
+
+@contextlib.contextmanager
+def _origins(address: Address) -> Iterator[None]:
+    """Inside, a server for this machine alone refuses pages that other sites have made a browser on it open: viser has
+    no setting for that, the library it listens with has."""
+    if not address.local:
+        yield
+        return
+    from websockets.asyncio import server
+
+    usual = server.serve
+    server.serve = functools.partial(usual, origins=[re.compile(LOCAL), None])  # type: ignore[misc, assignment]
+    try:
+        yield
+    finally:
+        server.serve = usual  # type: ignore[misc]

@@ -1,0 +1,549 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The viewer's policy: cameras, what is shown when, how a model is looked at, recorded paths. No device, no browser."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from models import assert_equal, random_gaussians
+from tiny import cameras
+
+from clsplat.errors import InputError
+from clsplat.paths import choose_shot
+from clsplat.viewer.look import (
+    LARGEST_OPACITY,
+    SCALE,
+    Look,
+    alpha_picture,
+    colour_picture,
+    count_picture,
+    depth_picture,
+    edited,
+    read_look,
+)
+from clsplat.viewer.recorder import MOST_KEYS, Recorder, save_path
+from clsplat.viewer.session import (
+    PATIENCE,
+    SETTLE,
+    SMALLEST,
+    TARGET,
+    Level,
+    Pace,
+    Pose,
+    Refinement,
+    Share,
+    extent_of,
+    fitted,
+    looking,
+    quaternion_of,
+    read_pose,
+    start_of,
+)
+from clsplat.viewer.viewing import Viewing
+
+ZERO = np.zeros(3)
+TURN = np.array([0.5, -0.5, 0.5, 0.5])
+"""A rotation by 120 degrees: w x y z."""
+
+
+def pose(x: float = 0.0, size: tuple[int, int] = (640, 360)) -> Pose:
+    found = read_pose((1.0, 0.0, 0.0, 0.0), (x, 0.0, -4.0), 1.0, size, ZERO)
+    assert found is not None
+    return found
+
+
+# cameras
+
+
+def test_a_browsers_camera_is_ours() -> None:
+    origin = np.array([1e6, -2e6, 30.0])
+    found = read_pose(2 * TURN, (1.0, 2.0, 3.0), math.radians(60), (800, 600), origin)
+    assert found is not None
+    camera = found.camera()
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (800, 600, 400, 300)
+    assert camera.fx == camera.fy == pytest.approx(300 / math.tan(math.radians(30)))
+    # x y z -> y z x up to signs, by hand: R e_x = (2 (w^2 + x^2) - 1, 2 (xy + wz), 2 (xz - wy)) = (0, 0, -1)
+    np.testing.assert_allclose(camera.rotation.T @ [1, 0, 0], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(camera.rotation.T @ [0, 0, 1], [0, 1, 0], atol=1e-12)
+    # the position, that far out, to float64's rounding of 2e6, which multiplying by a rotation makes a few of
+    np.testing.assert_allclose(camera.position, origin + np.array([1, 2, 3]), rtol=0, atol=2e-9)
+
+
+def test_another_size_keeps_the_vertical_angle() -> None:
+    wide, tall = pose().camera(1000, 500), pose().camera(100, 500)
+    assert wide.fy == tall.fy == pytest.approx(250 / math.tan(0.5))
+    assert (tall.cx, tall.cy) == (50, 250)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"wxyz": (math.nan, 0, 0, 1)},
+        {"wxyz": (0, 0, 0, 0)},
+        {"wxyz": (1, 0, 0)},
+        {"wxyz": "1000"},
+        {"position": (math.inf, 0, 0)},
+        {"position": (1e300, 0, 0)},
+        {"position": None},
+        {"fov": 0.0},
+        {"fov": math.pi},
+        {"fov": math.nan},
+        {"fov": "wide"},
+        {"size": (0, 10)},
+        {"size": (1 << 20, 10)},
+        {"size": (math.inf, 10)},
+    ],
+)
+def test_what_no_camera_has_is_left_out(change: dict[str, Any]) -> None:
+    given: dict[str, Any] = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov": 1.0, "size": (10, 10)}
+    assert read_pose(**given, origin=ZERO) is not None
+    assert read_pose(**{**given, **change}, origin=ZERO) is None
+
+
+def test_quaternions_go_there_and_back() -> None:
+    found = read_pose(-TURN, (0, 0, 0), 1.0, (8, 8), ZERO)
+    assert found is not None
+    np.testing.assert_allclose(quaternion_of(found.rotation), TURN, atol=1e-12)
+
+
+def test_the_start_is_where_the_first_camera_stands() -> None:
+    start = start_of(cameras(), np.zeros((0, 3)))
+    first = cameras()[0]
+    page = looking(start, (first.width, first.height)).camera()
+    np.testing.assert_allclose(page.position, first.position, atol=1e-12)
+    np.testing.assert_allclose(page.rotation, first.rotation, atol=1e-9)  # the cameras of the scene are level
+    assert page.fy == pytest.approx(first.fy)
+    np.testing.assert_allclose(
+        start.target, ZERO, atol=0.7
+    )  # they look at the origin, some from above, some from below
+    np.testing.assert_allclose(start.up, [0, -1, 0], atol=0.05)
+
+
+def test_without_cameras_the_start_is_before_the_points() -> None:
+    points = np.random.default_rng(0).normal(size=(5000, 3)) + np.array([7.0, 0.0, 0.0])
+    points[0] = 1e6
+    start = start_of([], points)
+    camera = looking(start, (640, 480)).camera()
+    seen = points[1:] @ camera.rotation.T + camera.translation
+    pixels = seen[:, :2] / seen[:, 2:] * camera.fx
+    assert np.mean((abs(pixels[:, 0]) < 320) & (abs(pixels[:, 1]) < 240) & (seen[:, 2] > 0)) > 0.95
+    np.testing.assert_array_equal(camera.rotation, np.eye(3))  # y down, along z, as COLMAP's
+    assert np.isfinite(looking(start_of([], np.zeros((0, 3))), (8, 8)).camera().translation).all()
+    assert np.isfinite(looking(start_of([], np.ones((1, 3))), (8, 8)).camera().translation).all()
+
+
+def test_extent_leaves_strays_out() -> None:
+    points = np.linspace(0, 1, 1001)[:, None].repeat(3, axis=1)
+    points[7] = 1e9
+    low, high = extent_of(points)
+    np.testing.assert_allclose(low, 0.02, atol=2e-3)
+    np.testing.assert_allclose(high, 0.98, atol=2e-3)
+
+
+def test_fitted_sizes() -> None:
+    assert fitted(640, 360, 0.5) == (320, 180)
+    assert fitted(3, 1, 0.01) == (1, 1)
+    width, height = fitted(8000, 4000, 1.0, 2_000_000)
+    assert (width, height) == (2000, 1000)
+
+
+# refinement
+
+
+def shown(refinement: Refinement, level: Level, seconds: float, now: float, model: int = 0) -> None:
+    refinement.shown(refinement.begun(), level, seconds, now, model)
+
+
+def test_coarse_in_motion_exact_at_rest() -> None:
+    refinement = Refinement(0.0)
+    refinement.changed(1.0)
+    level = refinement.due(1.0)
+    assert level is not None and not level.exact and level.scale < 1
+    shown(refinement, level, 0.05, 1.05)
+    assert refinement.due(1.1) is None
+    assert refinement.wait(1.1) == pytest.approx(SETTLE - 0.1)
+    assert refinement.due(1.0 + SETTLE) == Level(1.0, exact=True)
+    assert refinement.wait(1.0 + SETTLE) == 0
+    shown(refinement, Level(1.0, exact=True), 0.3, 1.5)
+    assert refinement.due(100.0) is None
+    assert refinement.wait(100.0) is None
+    refinement.changed(100.0)
+    moving = refinement.due(100.0)
+    assert moving is not None and not moving.exact
+    assert moving.quality < level.quality + 1 <= Level(1.0, exact=True).quality
+
+
+def test_what_changes_while_a_picture_is_made_is_shown_next() -> None:
+    refinement = Refinement(0.0)
+    begun, level = refinement.begun(), refinement.due(0.0)
+    assert level is not None
+    refinement.changed(0.02)
+    refinement.shown(begun, level, 0.05, 0.05)
+    again = refinement.due(0.05)
+    assert again is not None and not again.exact
+    assert refinement.moving
+
+
+def test_a_slow_exact_picture_is_led_up_to() -> None:
+    refinement = Refinement(0.0)
+    refinement.pace.scale = 0.2
+    shown(refinement, Level(0.2, exact=False), 2 * PATIENCE, 0.0)
+    refinement.changed(0.0)
+    shown(refinement, Level(0.2, exact=False), 2 * PATIENCE, 0.0)
+    seen = []
+    while (level := refinement.due(10.0)) is not None:
+        seen.append(level)
+        shown(refinement, level, 2 * PATIENCE, 10.0)
+    assert seen == [Level(0.4, exact=False), Level(0.8, exact=False), Level(1.0, exact=True)]
+
+
+def test_a_model_in_training_is_shown_again() -> None:
+    refinement = Refinement(0.0)
+    shown(refinement, Level(0.25, exact=False), 0.01, 0.0, model=3)
+    shown(refinement, Level(1.0, exact=True), 0.01, 1.0, model=3)
+    assert refinement.due(2.0, model=3) is None
+    assert refinement.due(2.0, model=4) == Level(1.0, exact=True)
+    assert not refinement.moving
+
+
+@pytest.mark.parametrize("fixed", [0.0, 0.01])
+def test_the_pace_finds_the_size_that_takes_the_time(fixed: float) -> None:
+    pace = Pace()
+    for _ in range(40):
+        pace.moved(pace.scale, fixed + 0.4 * pace.scale**2)
+    assert fixed + 0.4 * pace.scale**2 == pytest.approx(TARGET, rel=0.05)
+
+
+def test_the_pace_stays_in_its_range() -> None:
+    pace = Pace()
+    for _ in range(50):
+        pace.moved(pace.scale, 10.0)
+    assert pace.scale == SMALLEST
+    for _ in range(50):
+        pace.moved(pace.scale, 0.0)
+    assert pace.scale == 1.0
+
+
+def test_a_share_of_the_time() -> None:
+    share = Share((0.2, 0.05))
+    assert share.ready(0.0, moving=False)
+    share.spent(10.0, 1.0)
+    assert not share.ready(13.9, moving=True)
+    assert share.ready(14.1, moving=True)
+    assert not share.ready(28.9, moving=False)
+    assert share.ready(29.1, moving=False)
+
+
+# how a model is looked at
+
+
+def test_looks_of_a_page_are_brought_into_range() -> None:
+    assert read_look("depth", 2, 0.5, 2.0) == Look("depth", 2, 0.5, 2.0)
+    assert read_look("../etc", 99, -1, math.nan) == Look("colour", 3, 0.05, 1.0)
+    assert read_look("alpha", 0, 1, 1, [[3, 2, 1], [0, 5, 0]]).crop == (0, 2, 0, 3, 5, 1)
+    assert read_look("alpha", 0, 1, 1, [[math.nan, 2, 1], [0, 5, 0]]).crop is None
+
+
+def test_only_what_changes_the_model_is_another_model() -> None:
+    assert Look("depth").changes(3) is None
+    assert Look("colour", degree=3).changes(1) is None
+    assert Look("depth", degree=1).changes(3) == Look("alpha", degree=1).changes(3)
+    assert Look(size=0.5).changes(3) is not None
+
+
+def test_edits() -> None:
+    model = random_gaussians(500)
+    model.origin = np.array([10.0, 20.0, 30.0])
+    before = random_gaussians(500)
+    plain = edited(model, Look())
+    assert_equal(plain, model)
+    assert plain.sh is model.sh
+
+    assert edited(model, Look(degree=1)).sh.shape == (500, 4, 3)
+    np.testing.assert_allclose(
+        np.exp(edited(model, Look(size=0.5)).log_scales), np.exp(model.log_scales) / 2, rtol=1e-5
+    )
+
+    def opacity(logits: np.ndarray) -> np.ndarray:
+        return 1 / (1 + np.exp(-logits.astype(np.float64)))
+
+    faint = opacity(edited(model, Look(opacity=0.5)).opacity_logits)
+    np.testing.assert_allclose(faint, opacity(model.opacity_logits) / 2, rtol=1e-5)
+    strong = edited(model, Look(opacity=3.0)).opacity_logits
+    assert np.isfinite(strong).all()
+    assert opacity(strong).max() == pytest.approx(LARGEST_OPACITY, rel=1e-5)
+    assert np.isfinite(edited(model, Look(opacity=0.0)).opacity_logits).all()
+
+    half = edited(model, Look(crop=(10.0, -1e9, -1e9, 1e9, 1e9, 1e9)))
+    assert 150 < len(half) < 350
+    assert (half.means[:, 0] >= 0).all()
+    half.check()
+    assert len(edited(model, Look(crop=(0, 0, 0, 1, 1, 1)))) == 0
+    assert_equal(model, before)
+
+
+def test_pictures() -> None:
+    image = np.array([[[0.0, 0.5, 1.0], [np.nan, -1.0, 2.0]]], np.float32)
+    assert colour_picture(image).tolist() == [[[0, 128, 255], [0, 0, 255]]]
+    assert alpha_picture(np.array([[0.0, 1.0]], np.float32)).tolist() == [[[0, 0, 0], [255, 255, 255]]]
+
+    depth, alpha = np.array([[1.0, 2.0, 3.0, 0.0]], np.float32), np.array([[1.0, 1.0, 1.0, 0.0]], np.float32)
+    picture, text = depth_picture(depth, alpha)
+    brightness = picture.sum(axis=2)[0]
+    assert brightness[0] > brightness[1] > brightness[2] > brightness[3] == 0
+    np.testing.assert_array_equal(picture[0, 0], SCALE[-1])
+    assert text == "depth 1.04 (bright) to 2.96"
+    nothing, text = depth_picture(depth, np.zeros_like(alpha))
+    assert (nothing == 0).all()
+    assert text == "nothing is seen"
+
+    counts, text = count_picture(np.array([[0, 5, 10]], np.int32))
+    assert counts[0, 0].tolist() == SCALE[0].tolist()
+    assert counts[0, 2].tolist() == SCALE[-1].tolist()
+    assert text.endswith("10 at most")
+    assert count_picture(np.zeros((2, 2), np.int32))[0].shape == (2, 2, 3)
+
+
+# paths
+
+
+def recorded(*positions: float) -> Recorder:
+    recorder = Recorder()
+    for x in positions:
+        recorder.add(pose(x))
+    return recorder
+
+
+def test_a_recorded_path_is_read_by_render(tmp_path: Path) -> None:
+    path = save_path(tmp_path, recorded(0.0, 1.0, 3.0).document((320, 200), apart=0.5, fps=24))
+    shot = choose_shot(path, path=None, count=None)
+    assert [frame.number for frame in shot.frames] == list(range(1, 26))
+    for number, x in ((0, 0.0), (12, 1.0), (24, 3.0)):
+        camera, wanted = shot.frames[number].camera, pose(x).camera(320, 200)
+        np.testing.assert_allclose(camera.position, wanted.position, atol=1e-9)
+        np.testing.assert_allclose(camera.rotation, wanted.rotation, atol=1e-9)
+        assert (camera.width, camera.height, camera.fy) == (320, 200, pytest.approx(wanted.fy))
+
+
+def test_a_closed_loop_has_as_many_frames_as_a_turn(tmp_path: Path) -> None:
+    recorder = recorded(0.0, 1.0)
+    path = save_path(tmp_path, recorder.document((32, 20), apart=1.0, fps=10, loop=True))
+    assert len(choose_shot(path, path=None, count=None).frames) == 20
+    assert "loop_frames" not in json.loads(recorded(0.0).document((32, 20), loop=True))
+
+
+def test_keys_are_taken_back() -> None:
+    recorder = recorded(0.0, 1.0)
+    recorder.remove_last()
+    assert [key.position[0] for key in recorder.keys] == [0.0]
+    recorder.clear()
+    recorder.remove_last()
+    with pytest.raises(InputError, match="no key frames"):
+        recorder.document((32, 20))
+
+
+@pytest.mark.parametrize(
+    ("size", "numbers"),
+    [((0, 20), {}), ((1 << 20, 20), {}), ((32, 20), {"apart": math.nan}), ((32, 20), {"fps": 0.0})],
+)
+def test_numbers_that_make_no_path(size: tuple[int, int], numbers: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="expected"):
+        recorded(0.0).document(size, **numbers)
+
+
+def test_too_many_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = recorded(0.0)
+    recorder.keys *= MOST_KEYS
+    with pytest.raises(InputError, match="10,000"):
+        recorder.add(pose())
+
+
+def test_saved_paths_replace_nothing(tmp_path: Path) -> None:
+    (tmp_path / "path-002.json").symlink_to(tmp_path / "elsewhere")
+    names = [save_path(tmp_path, "{}").name for _ in range(2)]
+    assert names == ["path-001.json", "path-003.json"]
+    assert not (tmp_path / "elsewhere").exists()
+
+
+# who is next
+
+
+class FakeModel:
+    """version and pixels as `Model` has them; what was asked for."""
+
+    def __init__(self) -> None:
+        self.version, self.pixels = 0, 10**7
+        self.asked: list[tuple[int, int, Look, bool]] = []
+        self.trouble: Exception | None = None
+
+    def picture(self, camera: Any, look: Look, *, exact: bool) -> tuple[np.ndarray, str]:
+        if self.trouble is not None:
+            raise self.trouble
+        self.asked.append((camera.width, camera.height, look, exact))
+        return np.zeros((camera.height, camera.width, 3), np.uint8), "words"
+
+
+class FakePage:
+    def __init__(self) -> None:
+        self.shown: list[Level] = []
+        self.told: list[str] = []
+
+    def show(self, _image: np.ndarray, level: Level, _text: str) -> None:
+        self.shown.append(level)
+
+    def tell(self, message: str) -> None:
+        self.told.append(message)
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def viewing(*poses: float) -> tuple[Viewing, FakeModel, list[FakePage], Clock]:
+    model, clock = FakeModel(), Clock()
+    found, pages = Viewing(model, clock), [FakePage() for _ in poses]
+    for key, (page, x) in enumerate(zip(pages, poses, strict=True)):
+        found.join(key, page)
+        found.moved(key, pose(x))
+    return found, model, pages, clock
+
+
+def test_each_sees_their_own_camera_in_turn() -> None:
+    found, model, pages, clock = viewing(0.0, 1.0)
+    assert found.work() and found.work()
+    assert [len(page.shown) for page in pages] == [1, 1]
+    assert not found.work()
+    clock.now = 1.0
+    found.moved(0, pose(5.0))
+    assert found.work() and found.work()
+    assert pages[1].shown[-1].exact, "who moves does not keep the others from their exact picture"
+    assert not pages[0].shown[-1].exact
+    assert model.asked[-1][:2] != (0, 0)
+
+
+def test_the_same_camera_once_more_is_no_news() -> None:
+    found, _, pages, _ = viewing(0.0)
+    found.work()
+    found.moved(0, pose(0.0))
+    assert not found.work()
+    found.moved(0, pose(0.0, (320, 200)))
+    assert found.work()
+    assert len(pages[0].shown) == 2
+
+
+def test_another_look_is_shown() -> None:
+    found, model, _, _ = viewing(0.0)
+    found.work()
+    found.looks(0, Look("depth"))
+    assert found.work()
+    assert model.asked[-1][2] == Look("depth")
+    found.looks(0, Look("depth"))
+    assert not found.work()
+
+
+def test_an_exact_picture_is_no_larger_than_the_model_allows() -> None:
+    found, model, _, clock = viewing(0.0)
+    model.pixels = 10_000
+    found.work()
+    clock.now = 1.0
+    found.work()
+    width, height, _, exact = model.asked[-1]
+    assert exact
+    assert width * height <= 10_200  # rounded
+    assert width / height == pytest.approx(16 / 9, rel=0.02)
+
+
+def test_trouble_is_told_once_and_the_next_picture_is_tried() -> None:
+    found, model, pages, clock = viewing(0.0)
+    model.trouble = InputError("no room")
+    found.work()
+    clock.now = 1.0
+    found.work()
+    assert pages[0].told == ["no room"]
+    assert not found.work(), "no second try of the same"
+    model.trouble = None
+    found.moved(0, pose(2.0))
+    found.work()
+    assert len(pages[0].shown) == 1
+
+
+def test_jobs_go_first_and_their_trouble_is_told() -> None:
+    found, model, pages, _ = viewing(0.0)
+    done: list[object] = []
+
+    def failing(_: object) -> None:
+        raise InputError("too large")
+
+    found.ask(0, done.append)
+    found.ask(0, failing)
+    assert found.work() and found.work()
+    assert done == [model]
+    assert pages[0].told == ["too large"]
+    assert pages[0].shown == []
+
+
+def test_who_has_left_gets_nothing() -> None:
+    found, _, pages, _ = viewing(0.0)
+    found.leave(0)
+    assert not found.work()
+    found.moved(0, pose(1.0))
+    found.looks(0, Look("alpha"))
+    assert found.pose(0) is None and found.look(0) == Look()
+    assert pages[0].shown == []
+
+
+def test_without_a_model_nobody_is_served() -> None:
+    found = Viewing(None)
+    found.join(0, FakePage())
+    found.moved(0, pose())
+    assert not found.work()
+
+
+def test_a_training_gives_its_share_only() -> None:
+    found, _, _, clock = viewing(0.0)
+    share = Share((0.2, 0.05))
+
+    class Slow(FakeModel):
+        def picture(self, camera: Any, look: Look, *, exact: bool) -> tuple[np.ndarray, str]:
+            clock.now += 0.1
+            return super().picture(camera, look, exact=exact)
+
+    found.model = slow = Slow()
+    spent, end = 0.0, 100.0
+    while clock.now < end:
+        before = clock.now
+        found.moved(0, pose(clock.now))
+        if found.work(share):
+            spent += clock.now - before
+        clock.now += 0.01
+        slow.version += 1
+    assert 0.17 < spent / end < 0.2  # less by what a step of 0.01 s makes it late
+    spent, start = 0.0, clock.now
+    while clock.now < start + end:
+        before = clock.now
+        if found.work(share):
+            spent += clock.now - before
+        clock.now += 0.01
+        slow.version += 1
+    assert 0.04 < spent / end < 0.051
+
+
+def test_waiting_ends_with_news() -> None:
+    found = Viewing(FakeModel())
+    found.join(0, FakePage())
+    timer = threading.Timer(0.05, lambda: found.moved(0, pose()))
+    timer.start()
+    found.wait(20.0)
+    timer.join()
+    assert found.work()
+    found.wake()
+    found.wait(20.0)
