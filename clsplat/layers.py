@@ -53,7 +53,8 @@ _MATRICES = {"worldToCamera": "worldtocamera", "worldToNDC": "worldtoscreen"}
 """OpenImageIO's names of them."""
 HALF_MAX = np.float32(65504)
 _PNG_LEVEL = 2
-"""A quarter of the time of the usual 6, which would be longer than a CPU device's for the frame, and an eighth larger."""
+"""Takes a quarter of the time of the usual 6, which can be more than a CPU device takes for the frame; files are an
+eighth larger."""
 _LARGEST_FLOAT_INDEX = 2**24
 
 EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
