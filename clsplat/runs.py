@@ -249,8 +249,10 @@ def _read_checkpoint(path: Path) -> Checkpoint:
         raise ValueError("its state is none")
     digests = record.get("sha256")  # runs of earlier versions have none
     if digests is not None:
-        if not isinstance(digests, dict) or arrays.keys() != digests.keys():
-            raise ValueError("it has not the arrays it was written with")
+        if not isinstance(digests, dict):
+            raise ValueError("its state has no digests")
+        if odd := arrays.keys() ^ digests.keys():
+            raise ValueError(f"{min(odd)[:80]!r} is not among the arrays it was written with, or is missing")
         for name, array in arrays.items():
             if _digest(array) != digests[name]:
                 raise ValueError(f"{name} is not what was written: its sha256 differs")

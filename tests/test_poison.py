@@ -137,9 +137,9 @@ def started(scene: Scene, device: Device, config: TrainConfig | None = None) -> 
 
 
 def put(array: DeviceArray, value: float, row: int = ROW) -> None:
-    """Into the first element of a row."""
+    """Into the last element of a row: of a quaternion's, the first has no gradient while the others are 0."""
     values = array.get()
-    values.reshape(len(values), -1)[row, 0] = value
+    values.reshape(len(values), -1)[row, -1] = value
     array.set(values)
 
 
@@ -221,10 +221,10 @@ def test_a_broken_gradient_costs_its_gaussian_alone(
     for value in (*BROKEN, 1e30):
         poisoned, plain = started(scene, default_device), started(scene, default_device)
         poison_gradients(poisoned, monkeypatch, group, value)
-        before = poisoned.parameters[group].get().reshape(40, -1)[ROW, 0]
+        before = poisoned.parameters[group].get().reshape(40, -1)[ROW, -1]
         poisoned.train_step()
         plain.train_step()
-        assert poisoned.parameters[group].get().reshape(40, -1)[ROW, 0] == before, "it was not moved"
+        assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before, "it was not moved"
         assert_others_alike(poisoned, plain)
         assert not any(poisoned.gradients[each].get().any() for each in GROUPS)
         poisoned.mend(look=True)
@@ -246,13 +246,13 @@ def test_broken_moments_begin_again(scene: Scene, default_device: Device, which:
             continue  # that is a moment as good as any
         poisoned, plain = started(scene, default_device), started(scene, default_device)
         put(getattr(poisoned, which)[group], value)
-        before = poisoned.parameters[group].get().reshape(40, -1)[ROW, 0]
+        before = poisoned.parameters[group].get().reshape(40, -1)[ROW, -1]
         poisoned.train_step()
         plain.train_step()
         assert_others_alike(poisoned, plain)
-        assert poisoned.parameters[group].get().reshape(40, -1)[ROW, 0] == before
+        assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before
         for moments in (poisoned.first, poisoned.second):
-            assert moments[group].get().reshape(40, -1)[ROW, 0] == 0
+            assert moments[group].get().reshape(40, -1)[ROW, -1] == 0
         poisoned.mend(look=True)
         (incident,) = poisoned.watch.incidents
         assert incident.stage == "adam"
