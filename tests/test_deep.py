@@ -219,3 +219,16 @@ def test_what_cannot_be(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             config.check()
+
+
+def test_a_model_that_counts_from_far_away() -> None:
+    gaussians, camera = scenes.random_cloud(600, 8, 70, 50)
+    origin = np.array([4e5, -3e5, 2e5])
+    far = replace(gaussians, origin=origin)
+    away = replace(camera, translation=camera.translation - camera.rotation @ origin)
+    bounds = bin_bounds(far, away, DeepConfig(bins=5))
+    assert_close(bounds, bin_bounds(gaussians, camera, DeepConfig(bins=5)), relative=1e-6)
+    picture = Renderer().render(far, away)
+    assert picture.alpha.max() > 0.5
+    flat = flattened(render_deep(Renderer(), far, away, bounds))
+    assert_close(flat[:, :, 3], picture.alpha, absolute=1e-6)  # as above

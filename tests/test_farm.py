@@ -172,20 +172,25 @@ def scene_of(shot: list[str]) -> farm.Scene:
     return farm.Scene(shot[0], digest(shot[0]), RenderOptions(), RasterizerConfig())
 
 
+def record_of(result: farm.Result | farm.Failure) -> farm.Record:
+    assert not isinstance(result, farm.Failure), result.message
+    record, planes = result
+    assert planes is None  # no video
+    return record
+
+
 def test_what_a_worker_does(shot: list[str], tmp_path: Path) -> None:
     path = Shot(numbered(cameras()))
     (task,) = make_tasks(path.only("3"), path, str(tmp_path / "#.exr"), lambda camera: camera, ("rgb",))
     scene = scene_of(shot)
-    record = farm.render_frame(task, scene)
-    assert isinstance(record, farm.Record)
+    record = record_of(farm.render_frame(task, scene))
     assert record.seconds > 0
     first = stamp(task.path)
     # another worker finished the frame and was lost before it could say so
-    assert farm.render_frame(task, scene) == replace(record, seconds=0.0)
+    assert record_of(farm.render_frame(task, scene)) == replace(record, seconds=0.0)
     assert stamp(task.path) == first
     # what was there before the job is rendered again
-    again = farm.render_frame(replace(task, before=first), scene)
-    assert isinstance(again, farm.Record)
+    again = record_of(farm.render_frame(replace(task, before=first), scene))
     assert again.seconds > 0
     assert stamp(task.path) != first
     shader = farm._HELD.shader

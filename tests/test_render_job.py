@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import threading
 import time
 from dataclasses import replace
@@ -24,7 +25,7 @@ from clsplat.layers import LAYERS, Encoding
 from clsplat.paths.shot import Frame, Shot, numbered
 from clsplat.render_job import Record, is_complete, make_tasks, run_tasks, write_frame
 from clsplat.shading import FrameShader, RenderOptions, Shaded, Task
-from clsplat.shutter import camera_after
+from clsplat.shutter import camera_after, stretches
 
 EVERYTHING = tuple(LAYERS)
 OPTIONS = RenderOptions(("rgb", "alpha", "depth"), attributes={"clsplat:model": "abc", "Software": "clsplat"})
@@ -97,6 +98,33 @@ def test_tasks_know_the_whole_shot(tmp_path: Path) -> None:
     mixed = Shot((*whole.frames, Frame(6, panorama, "0006")))
     with pytest.raises(InputError, match="--channels motion: frame 6 is equirectangular"):
         make_tasks(mixed.only("1-5"), mixed, pattern, half, ("motion",))
+
+
+def test_a_stretch_is_the_shot_there() -> None:
+    rng = np.random.default_rng(1)
+    frames = [replace(camera, fx=camera.fx + rng.uniform(0, 5)) for camera in circle(12).cameras]
+    shot = Shot(numbered(frames))
+    of = stretches(shot, lambda camera: camera, -0.25, 0.75)
+    for number in (4, 7):
+        stretch = of(number)
+        assert stretch is not None and len(stretch.keys) < 8  # and not all of the shot goes to a worker
+        sent = pickle.loads(pickle.dumps(stretch))
+        for time_ in (-0.25, 0.0, 0.1, 0.75):
+            wanted, got = shot.at(number + time_), sent.at(time_)
+            assert_same_pose(got, wanted)
+            np.testing.assert_allclose(got.fx, wanted.fx, rtol=1e-12)
+        assert stretch.at(0) is frames[number - 1]
+    even = circle(12)
+    of = stretches(even, lambda camera: camera, -2.5, 2.5)
+    for number, angle in ((1, -0.15), (12, 1.25)):  # before its first and after its last frame it goes on
+        stretch = of(number)
+        assert stretch is not None
+        time_ = -1.5 if number == 1 else 1.5
+        np.testing.assert_allclose(stretch.at(time_).rotation, turned(angle).rotation, atol=1e-6)
+    assert stretches(Shot(even.frames[:1]), lambda camera: camera, -1, 1)(1) is None
+    mixed = Shot(numbered([turned(0), turned(0.1).resized(80, 60)]))
+    with pytest.raises(InputError, match="an open shutter: frame 1 is 40x30 perspective and frame 2 80x60"):
+        stretches(mixed, lambda camera: camera, -1, 1)
 
 
 class FakeRenderer:
