@@ -161,9 +161,12 @@ def run_all(listed: list[Job], folder: Path) -> list[Row]:
     from tiny import write_scene
 
     scene = write_scene(folder / "scene")
-    numbered = list(enumerate(listed))
+    # the one that builds longest first, so that nothing waits for it at the end
+    numbered = sorted(enumerate(listed), key=lambda pair: pair[1].driver != "Rusticl")
     with ThreadPoolExecutor(max_workers=2) as pool:
-        rows = list(pool.map(lambda pair: _in_a_process(pair[1], folder / f"{pair[0]}.npz", scene), numbered))
+        done = pool.map(lambda pair: _in_a_process(pair[1], folder / f"{pair[0]}.npz", scene), numbered)
+        by_number = {number: row for (number, _), row in zip(numbered, done, strict=True)}
+    rows = [by_number[number] for number in range(len(listed))]
     first = next((number for number, row in enumerate(rows) if not row.trouble), None)
     if first is not None:
         wanted = np.load(folder / f"{first}.npz")

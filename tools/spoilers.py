@@ -161,7 +161,7 @@ def _lines(data: bytes, rng: random.Random) -> bytes:
     elif kind == 3:
         lines[at] = b""
     else:
-        lines = lines[:at] + [lines[at]] * 1000 + lines[at:]
+        lines = lines[:at] + [lines[at]] * min(1000, MOST_BYTES // (1 + len(lines[at]))) + lines[at:]
     return b"\n".join(lines)
 
 
