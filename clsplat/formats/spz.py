@@ -59,8 +59,8 @@ VERSIONS = (2, 3, 4)
 DEFAULT_VERSION = 4
 """What the format's library and splat-transform write."""
 SH_BITS = (6, 6)
-"""Of band 1, and of those above. The format's library keeps 5 and 4: files a fifth smaller, and a trained model of strong
-view dependence 11 dB worse, at 36 (docs/formats.md). Readers need not know."""
+"""Of band 1, and of those above. The format's library keeps 5 and 4: files a fifth smaller, and a trained model of
+strong view dependence 11 dB worse, at 36 (docs/formats.md). Readers need not know."""
 ANTIALIASED, HAS_EXTENSIONS = 1, 2
 COORDINATE_SYSTEM = 0xADBE0003
 FRAMES: tuple[Signs, ...] = (
