@@ -16,7 +16,6 @@ from node import splat_transform, validate_gltf
 from scipy.spatial.transform import Rotation
 from splats import assert_refused_or_sound, assert_within, colours, covariances, damaged, lopsided, with_origin
 
-from clsplat import ply
 from clsplat.errors import InputError
 from clsplat.formats import gltf, spz
 from clsplat.gaussians import Gaussians
@@ -51,7 +50,7 @@ def test_it_comes_back_as_it_was(tmp_path: Path, name: str, degree: int) -> None
 
 def test_the_validator_knows_all_but_the_extension(tmp_path: Path) -> None:
     model = lopsided()
-    ply.write(tmp_path / "model.ply", model)
+    model.save(tmp_path / "model.ply")
     splat_transform(tmp_path / "model.ply", tmp_path / "theirs.glb")
     gltf.write(tmp_path / "ours.glb", model)
     gltf.write(tmp_path / "ours.gltf", with_origin(model, 5e5, 1, -2))
@@ -69,7 +68,7 @@ def test_the_validator_knows_all_but_the_extension(tmp_path: Path) -> None:
 
 def test_what_another_writes_is_the_same_model(tmp_path: Path) -> None:
     model = lopsided()
-    ply.write(tmp_path / "model.ply", model)
+    model.save(tmp_path / "model.ply")
     splat_transform(tmp_path / "model.ply", tmp_path / "theirs.glb")
     theirs = gltf.read(tmp_path / "theirs.glb")
     assert_within(theirs, model, **EXACT | {"rotations": 4})

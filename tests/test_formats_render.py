@@ -88,8 +88,7 @@ def test_a_flip_of_the_harmonics_alone_would_be_seen(default_device: Device) -> 
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_trained_model(default_device: Device, tmp_path: Path, name: str) -> None:
-    from clsplat import ply
 
-    model = ply.read(real_file("samples/kacytran1122_iter7000_9080.ply"))
+    model = Gaussians.load(real_file("samples/kacytran1122_iter7000_9080.ply"))
     views = [scenes.straight_camera(240, 160, 220.0), scenes.tilted_camera(200, 150, 120.0)]
     assert compare(default_device, model, through(name, model, tmp_path), views) >= FILES[name][1]

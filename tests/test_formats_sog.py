@@ -16,7 +16,6 @@ from models import real_file
 from node import splat_transform
 from splats import assert_refused_or_sound, assert_within, damaged, lopsided, losses, opacity, read_plainly, with_origin
 
-from clsplat import ply
 from clsplat.errors import InputError
 from clsplat.formats import sog
 from clsplat.formats.palette import codebook, nearest, palette
@@ -100,7 +99,7 @@ def test_another_reader_has_the_same_values(tmp_path: Path, name: str) -> None:
 
 def test_what_another_writes_is_the_same_model(tmp_path: Path) -> None:
     model = visible(lopsided(degree=0))  # palettes of its making are in the samples
-    ply.write(tmp_path / "model.ply", model)
+    model.save(tmp_path / "model.ply")
     splat_transform(tmp_path / "model.ply", tmp_path / "theirs.sog")
     theirs = sog.read(tmp_path / "theirs.sog")
     near = np.argmin(np.linalg.norm(model.means[:, None] - theirs.means[None], axis=2), axis=1)  # it sorts
