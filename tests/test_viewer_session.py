@@ -32,6 +32,7 @@ from clsplat.viewer.session import (
     PATIENCE,
     SETTLE,
     SMALLEST,
+    START,
     TARGET,
     Level,
     Pace,
@@ -192,6 +193,13 @@ def test_a_camera_that_jumps_is_not_at_rest_between_two_jumps() -> None:
         refinement.changed(now)
         shown(refinement, Level(0.25, exact=False), 0.01, now)
     assert refinement.due(now + SETTLE[0]) == Level(1.0, exact=True)
+
+
+def test_the_first_exact_picture_leaves_the_browser_some_time() -> None:
+    refinement = Refinement(0.0)
+    shown(refinement, Level(0.25, exact=False), 0.01, 0.0)
+    assert refinement.due(START - 0.01) is None
+    assert refinement.due(START) == Level(1.0, exact=True)
 
 
 def test_what_changes_while_a_picture_is_made_is_shown_next() -> None:

@@ -22,6 +22,8 @@ Float64 = NDArray[np.float64]
 
 SETTLE = (0.2, 1.0)
 """Seconds without a change after which a picture is refined: at least; at most, where a slow browser's camera jumps."""
+START = 0.5
+"""The same for the first picture of all, which the browser has to get ready to show."""
 JUMPS = 3.0
 """A camera that has not changed for so many times as long as it usually takes is at rest."""
 TARGET = 0.04
@@ -196,7 +198,7 @@ class Refinement:
         self.pace = pace or Pace()
         self.served = -math.inf
         self._changed, self._at = 1, now
-        self._settle = SETTLE[0]
+        self._settle = START
         self._shown = 0
         self._model = 0
         self._level = Level(0.0, exact=False)
@@ -210,7 +212,8 @@ class Refinement:
         """The camera, or how the model is looked at."""
         apart = now - self._at
         usual = JUMPS * apart if self._changed > 1 and apart < SETTLE[1] else 0.0
-        self._settle = min(max(0.7 * self._settle + 0.3 * usual, SETTLE[0]), SETTLE[1])
+        before = self._settle if self._changed > 1 else 0.0
+        self._settle = min(max(0.7 * before + 0.3 * usual, SETTLE[0]), SETTLE[1])
         self._changed += 1
         self._at = now
 
