@@ -32,6 +32,7 @@ from clsplat.viewer.session import (
     PATIENCE,
     SETTLE,
     SMALLEST,
+    START,
     TARGET,
     Level,
     Pace,
@@ -167,9 +168,9 @@ def test_coarse_in_motion_exact_at_rest() -> None:
     assert level is not None and not level.exact and level.scale < 1
     shown(refinement, level, 0.05, 1.05)
     assert refinement.due(1.1) is None
-    assert refinement.wait(1.1) == pytest.approx(SETTLE - 0.1)
-    assert refinement.due(1.0 + SETTLE) == Level(1.0, exact=True)
-    assert refinement.wait(1.0 + SETTLE) == 0
+    assert refinement.wait(1.1) == pytest.approx(SETTLE[0] - 0.1)
+    assert refinement.due(1.0 + SETTLE[0]) == Level(1.0, exact=True)
+    assert refinement.wait(1.0 + SETTLE[0]) == 0
     shown(refinement, Level(1.0, exact=True), 0.3, 1.5)
     assert refinement.due(100.0) is None
     assert refinement.wait(100.0) is None
@@ -177,6 +178,28 @@ def test_coarse_in_motion_exact_at_rest() -> None:
     moving = refinement.due(100.0)
     assert moving is not None and not moving.exact
     assert moving.quality < level.quality + 1 <= Level(1.0, exact=True).quality
+
+
+def test_a_camera_that_jumps_is_not_at_rest_between_two_jumps() -> None:
+    refinement, now = Refinement(0.0), 0.0
+    for _ in range(20):
+        now += 0.3
+        refinement.changed(now)
+        shown(refinement, Level(0.25, exact=False), 0.01, now)
+    assert refinement.due(now + 0.5) is None
+    assert refinement.due(now + SETTLE[1]) == Level(1.0, exact=True)
+    for _ in range(20):
+        now += 0.02
+        refinement.changed(now)
+        shown(refinement, Level(0.25, exact=False), 0.01, now)
+    assert refinement.due(now + SETTLE[0]) == Level(1.0, exact=True)
+
+
+def test_the_first_exact_picture_leaves_the_browser_some_time() -> None:
+    refinement = Refinement(0.0)
+    shown(refinement, Level(0.25, exact=False), 0.01, 0.0)
+    assert refinement.due(START - 0.01) is None
+    assert refinement.due(START) == Level(1.0, exact=True)
 
 
 def test_what_changes_while_a_picture_is_made_is_shown_next() -> None:

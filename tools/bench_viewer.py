@@ -16,7 +16,6 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,7 +30,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.runs import model_file
 
 WINDOW = {"width": 1280, "height": 720}
-DRAG = 3.0
+TURN = 3.0
 """Seconds that the camera moves."""
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 WATCH = """
@@ -112,16 +111,14 @@ def visit(browser: Any, url: str, server: int) -> dict[str, float]:
     drawn = page.evaluate("window.drawn")
     page.wait_for_timeout(2500)  # the exact one, and the page's own beginnings
     widths = [width for _, width, _ in page.evaluate("window.pictures")]
-    page.mouse.move(300, 300)
-    page.mouse.down()
+    page.mouse.click(300, 300)
+    server_before, before_all = processor_seconds(server), processor_seconds(os.getpid())
     before, start = page.evaluate("[window.pictures.length, performance.now()]")
-    begin, server_before, before_all = time.perf_counter(), processor_seconds(server), processor_seconds(os.getpid())
-    while (passed := time.perf_counter() - begin) < DRAG:
-        page.mouse.move(300 + 250 * passed / DRAG, 300 + 40 * np.sin(passed))
-        page.wait_for_timeout(15)
+    page.keyboard.down("ArrowLeft")  # turns with every frame of the page; a mouse waits for the page to take its moves
+    page.wait_for_timeout(1000 * TURN)
     end, moved = page.evaluate("[performance.now(), window.pictures]")
     served, used = processor_seconds(server) - server_before, processor_seconds(os.getpid()) - before_all
-    page.mouse.up()
+    page.keyboard.up("ArrowLeft")
     page.close()
     count = max(len(moved) - before, 1)
     sizes = [width for _, width, _ in moved[before:]]

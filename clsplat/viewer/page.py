@@ -42,22 +42,29 @@ class ViserPage:
         self.key: int = client.client_id
         self.recorder = Recorder()
         self._status: Any = None
+        self._shown = 0
         self._drawing, self._drawn = 0, threading.Lock()
 
     def show(self, image: Image, level: Level, text: str) -> None:
         """As `viewing.Page` has it."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
+        self._shown += 1
+        if self._shown == 2:  # controls keep a browser busy: they may not come before the first picture
+            self._build()
         if level.exact and self._status is not None:
             height, width = image.shape[:2]
             self._say(", ".join(filter(None, (f"{width} x {height}, exact", text))))
 
     def tell(self, message: str) -> None:
         """As `viewing.Page` has it."""
+        self._build()
         self.client.add_notification("clsplat", plain(message), auto_close_seconds=10.0)
         self._say(plain(message))
 
-    def build(self) -> None:
-        """Make the controls."""
+    def _build(self) -> None:
+        """Make the controls, if they are not there yet."""
+        if self._status is not None:
+            return
         gui, scene = self.client.gui, self.client.scene
         for name in ("/cameras", "/keys"):
             scene.add_frame(name, show_axes=False)

@@ -126,12 +126,10 @@ class Server:
         self._status: Any = None
         if training:
             self._add_training()
-        pages: dict[int, ViserPage] = {}
 
         async def came(client: Any) -> None:
             key = client.client_id
-            page = pages[key] = ViserPage(client, viewing, world, address.paths)
-            viewing.join(key, page)
+            viewing.join(key, ViserPage(client, viewing, world, address.paths))
 
             async def moved(camera: Any) -> None:
                 size = (camera.image_width, camera.image_height)
@@ -141,11 +139,9 @@ class Server:
 
             client.camera.on_update(moved)
             await moved(client.camera)
-            page.build()
 
         async def left(client: Any) -> None:
             viewing.leave(client.client_id)
-            pages.pop(client.client_id, None)
 
         server.on_client_connect(came)
         server.on_client_disconnect(left)

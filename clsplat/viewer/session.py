@@ -20,8 +20,12 @@ from clsplat.trajectory import focus_point, look_at, up_axis
 
 Float64 = NDArray[np.float64]
 
-SETTLE = 0.2
-"""Seconds without a change after which a picture is refined."""
+SETTLE = (0.2, 1.0)
+"""Seconds without a change after which a picture is refined: at least; at most, where a slow browser's camera jumps."""
+START = 0.5
+"""The same for the first picture of all, which the browser has to get ready to show."""
+JUMPS = 3.0
+"""A camera that has not changed for so many times as long as it usually takes is at rest."""
 TARGET = 0.04
 """Seconds that a picture in motion may take, with its encoding: what the browser needs comes on top."""
 PATIENCE = 0.6
@@ -194,6 +198,7 @@ class Refinement:
         self.pace = pace or Pace()
         self.served = -math.inf
         self._changed, self._at = 1, now
+        self._settle = START
         self._shown = 0
         self._model = 0
         self._level = Level(0.0, exact=False)
@@ -205,6 +210,10 @@ class Refinement:
 
     def changed(self, now: float) -> None:
         """The camera, or how the model is looked at."""
+        apart = now - self._at
+        usual = JUMPS * apart if self._changed > 1 and apart < SETTLE[1] else 0.0
+        before = self._settle if self._changed > 1 else 0.0
+        self._settle = min(max(0.7 * before + 0.3 * usual, SETTLE[0]), SETTLE[1])
         self._changed += 1
         self._at = now
 
@@ -212,7 +221,7 @@ class Refinement:
         """The next picture, if its time has come; model: counts its changes, while it is trained."""
         if self.moving:
             return Level(self.pace.scale, exact=False)
-        if now < self._at + SETTLE or (self._level.exact and self._model == model):
+        if now < self._at + self._settle or (self._level.exact and self._model == model):
             return None
         if self._level.exact or self.pace.patient or self._level.scale >= 0.5:
             return Level(1.0, exact=True)
@@ -224,7 +233,7 @@ class Refinement:
             return 0.0
         if self._level.exact and self._model == model:
             return None
-        return max(0.0, self._at + SETTLE - now)
+        return max(0.0, self._at + self._settle - now)
 
     def begun(self) -> int:
         """Before a picture is made: what `shown` wants to know of it."""

@@ -82,8 +82,11 @@ class Viewing:
         with self._news:
             watcher = self._watchers.get(key)
             if watcher is not None and not pose.same(watcher.pose):
-                watcher.pose = pose
-                self._changed(watcher)
+                first, watcher.pose = watcher.pose is None, pose
+                if first:
+                    self._wake()
+                else:
+                    self._changed(watcher)
 
     def looks(self, key: int, look: Look) -> None:
         """They look at it in another way."""
