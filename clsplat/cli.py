@@ -382,9 +382,11 @@ def parse(arguments: Sequence[str]) -> Verb:
     elif isinstance(verb, Bench) and verb.preset != "default":
         bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False)
         verb = _tyro(Bench, arguments[1:], prog="clsplat bench", default=bench)
-    elif isinstance(verb, Render) and (verb.preset is not None or verb.model.is_dir()):
-        from clsplat.runs import Run
+    elif isinstance(verb, Render):
+        from clsplat.runs import Run, is_run
 
+        if verb.preset is None and not is_run(verb.model):
+            return verb
         bundle = PRESETS[verb.preset] if verb.preset else Run.open(verb.model).config.rasterizer
         if bundle != RasterizerConfig():
             unset: dict[str, Any] = dict.fromkeys(

@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
@@ -22,6 +21,8 @@ from clsplat.reference.sh import sh_basis
 
 FAR = 64.0
 """A model that is moved farther from the origin than so many of its own sizes counts from there (decision 0017)."""
+SCALES = (1e-12, 1e12)
+"""Between these scales lie; beyond them float32's means would be 0 or infinite."""
 _SIMILAR = 1e-6
 """Most that Q^T Q may differ from 1: matrices are typed with six digits, or float32's."""
 
@@ -65,6 +66,8 @@ def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
 
 def merge(models: Sequence[Gaussians]) -> Gaussians:
     """One after the other, SH of lower degree padded with zeros; the means count from the first one's origin."""
+    if len(models) == 1:
+        return models[0]
     coefficients, origin = max(model.sh.shape[1] for model in models), models[0].origin
 
     def means(model: Gaussians) -> Float32:
@@ -84,16 +87,17 @@ def merge(models: Sequence[Gaussians]) -> Gaussians:
     )
 
 
-def decompose(matrix: Float64) -> tuple[float, Float64, Float64]:
-    """s, Q (3, 3), t (3,) of a similarity (4, 4). Raises InputError for a matrix that is none."""
+def decompose(matrix: Float64, slack: float = _SIMILAR) -> tuple[float, Float64, Float64]:
+    """s, Q (3, 3), t (3,) of a similarity (4, 4). Raises InputError for a matrix that is none; `slack`: the most that
+    Q^T Q may differ from 1."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"a transform of {matrix.shape}, expected 4 x 4 finite numbers")
     linear = matrix[:3, :3]
     scale = float(np.abs(np.linalg.det(linear)) ** (1 / 3))
-    if scale == 0 or not np.array_equal(matrix[3], (0, 0, 0, 1)):
-        raise InputError("a transform that cannot be undone, or whose last row is not 0 0 0 1")
+    if not SCALES[0] < scale < SCALES[1] or not np.array_equal(matrix[3], (0, 0, 0, 1)):
+        raise InputError(f"a transform that cannot be undone (of scale {scale:g}) or whose last row is not 0 0 0 1")
     turn = linear / scale
-    if (off := float(np.abs(turn.T @ turn - np.eye(3)).max())) > _SIMILAR:
+    if (off := float(np.abs(turn.T @ turn - np.eye(3)).max())) > slack:
         raise InputError(
             f"a transform that is no similarity (its axes are {off:.2g} off right angles or equal lengths), expected "
             "rotation, one scale and translation"
@@ -102,9 +106,11 @@ def decompose(matrix: Float64) -> tuple[float, Float64, Float64]:
     return scale, u @ vt, matrix[:3, 3]
 
 
-def transform(gaussians: Gaussians, matrix: Float64) -> Gaussians:
-    """The model moved by a similarity (4, 4) of the world. Raises InputError as `decompose`."""
-    scale, turn, shift = decompose(matrix)
+def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILAR) -> Gaussians:
+    """The model moved by a similarity (4, 4) of the world; a translation alone leaves rotations and SH their bits.
+    Raises InputError as `decompose`."""
+    scale, turn, shift = decompose(matrix, slack)
+    upright = np.allclose(turn, np.eye(3), rtol=0, atol=1e-12)  # what float64 makes of no rotation
     linear = scale * turn
     origin = linear @ gaussians.origin + shift
     means = gaussians.means.astype(np.float64) @ linear.T
@@ -112,10 +118,10 @@ def transform(gaussians: Gaussians, matrix: Float64) -> Gaussians:
         means, origin = means + origin, np.zeros(3)
     return Gaussians(
         means.astype(np.float32),
-        _turned(gaussians.quaternions, turn),
+        gaussians.quaternions if upright else _turned(gaussians.quaternions, turn),
         (gaussians.log_scales + np.log(scale)).astype(np.float32),
         gaussians.opacity_logits,
-        rotate_sh(gaussians.sh, turn),
+        gaussians.sh if upright else rotate_sh(gaussians.sh, turn),
         origin,
     )
 
@@ -135,6 +141,8 @@ def transform_camera(camera: Camera, matrix: Float64) -> Camera:
 
 def _turned(quaternions: Float32, turn: Float64) -> Float32:
     """w x y z of Q R, of the same length; of a mirror -Q, as R S S R^T knows no sign."""
+    from scipy.spatial.transform import Rotation
+
     proper = turn if np.linalg.det(turn) > 0 else -turn
     x, y, z, w = Rotation.from_matrix(proper).as_quat()
     # Hamilton's product of (w, x, y, z) and each quaternion

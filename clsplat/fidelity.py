@@ -14,7 +14,7 @@ from clsplat.gaussians import Float64, Gaussians
 UNITS = {
     "position": "world units",
     "position_relative": "of the extent",
-    "scale": "relative",
+    "scale": "of the Gaussian's largest",
     "rotation": "degrees",
     "opacity": "of 1",
     "colour": "of 1",
@@ -25,7 +25,9 @@ _BLOCK = 1 << 16
 
 def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
     """The largest and the mean error of each attribute of UNITS, over the Gaussians; of several numbers the largest
-    counts, of positions the distance. sh: as if coefficients that one of them lacks were 0.
+    counts, of positions the distance. scale: of standard deviations, as a part of the Gaussian's largest: the thickness
+    of a disc may be far below anything that is seen, and be cut to what a format holds. sh: as if coefficients that one
+    of them lacks were 0.
 
     Raises ValueError for models of different sizes.
     """
@@ -41,9 +43,7 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
         distance = np.linalg.norm(moved, axis=1)
         found["position"].append(distance)
         found["position_relative"].append(distance / extent if extent else distance * 0)
-        log_scales = read.log_scales[rows].astype(np.float64) - original.log_scales[rows]
-        with np.errstate(over="ignore"):
-            found["scale"].append(np.abs(np.expm1(log_scales)).max(axis=1))
+        found["scale"].append(_scale_errors(original.log_scales[rows], read.log_scales[rows]))
         found["rotation"].append(_angles(original.quaternions[rows], read.quaternions[rows]))
         logits = original.opacity_logits[rows], read.opacity_logits[rows]
         found["opacity"].append(np.abs(packing.opacities(logits[1]) - packing.opacities(logits[0])))
@@ -54,9 +54,17 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
     return {name: {"largest": float(all_.max()), "mean": float(all_.mean())} for name, all_ in whole.items()}
 
 
+def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
+    """(n,), from logs (n, 3): against the largest of each a, so that nothing but their differences overflows."""
+    largest = a.max(axis=1, keepdims=True).astype(np.float64)
+    with np.errstate(over="ignore"):
+        p, q = np.exp(a - largest), np.exp(b - largest)
+    return np.asarray(np.abs(q - p).max(axis=1))
+
+
 def _angles(a: NDArray[Any], b: NDArray[Any]) -> Float64:
     """Degrees between the rotations, (n,): by the chord, which is exact for small angles."""
-    p, q = packing.unit(a), packing.unit(b)
+    p, q = packing.unit_quaternions(a), packing.unit_quaternions(b)
     q *= np.where((p * q).sum(axis=1) < 0, -1, 1)[:, None]
     chord = np.linalg.norm(p - q, axis=1)
     return np.asarray(np.degrees(4 * np.arcsin(np.minimum(chord / 2, 1))))

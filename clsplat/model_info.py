@@ -54,7 +54,7 @@ def _blocks(model: Gaussians) -> Iterator[Gaussians]:
     for start in range(0, len(model), _BLOCK):
         rows = slice(start, start + _BLOCK)
         yield Gaussians(
-            packing.world_means(model, rows),
+            packing.world_means(model, rows).astype(np.float32),
             model.quaternions[rows],
             model.log_scales[rows],
             model.opacity_logits[rows],

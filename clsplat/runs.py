@@ -294,9 +294,14 @@ def _array(data: bytes, name: str) -> NDArray[Any]:
 
 
 def model_file(path: Path) -> Path:
-    """The model file that a run's folder, or the path of a file, means. Raises InputError for a run without one."""
+    """The model file that a run's folder, a folder of a format that is one, or the path of a file means. Raises
+    InputError for a run without one."""
+    from clsplat.formats import model_path
+
     if not path.is_dir():
         return path
+    if not is_run(path) and (found := model_path(path)) != path:
+        return found
     trained = Run.open(path)
     if not trained.model_path.exists():
         raise InputError(f"{trained.model_path}: no such file, the run has not written its model yet")

@@ -201,6 +201,7 @@ def _train_verb(scene: Scene, run: Run, device: Device, between: Between | None 
 
 def evaluate(verb: Eval) -> int:
     """Model and scene to numbers."""
+    from clsplat import report
     from clsplat.config import TrainConfig
     from clsplat.device.context import open_device
     from clsplat.evaluate import background_colour
@@ -213,9 +214,10 @@ def evaluate(verb: Eval) -> int:
     from clsplat.trust import require
 
     limit = parse_bytes(verb.max_device_mem)
-    given_run = Run.open(verb.model) if verb.model.is_dir() else None
+    file = model_file(verb.model)
+    given_run = Run.open(verb.model) if is_run(verb.model) else None
     trained = given_run or (Run.open(verb.model.parent) if is_run(verb.model.parent) else None)
-    gaussians = Gaussians.load(model_file(verb.model))
+    gaussians = Gaussians.load(file)
     config = trained.config if trained else TrainConfig()
     source = verb.scene or (trained.scene if trained else None)
     if source is None:
@@ -243,6 +245,8 @@ def evaluate(verb: Eval) -> int:
     )
     if given_run:
         given_run.write_eval(result)
+        if (given_run.path / report.NAME).exists():
+            report.write_last(given_run, scene, gaussians)
     if verb.json:
         print(json.dumps(result, indent=2))
         return 0

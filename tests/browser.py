@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium for tests of pages: the system's own, driven by Playwright. Skips with the reason without one."""
+"""A headless Chromium for tests of pages: the system's own, driven by Playwright. Skips with the reason without one.
+
+`browser` is a fixture (conftest.py). Screenshots go to the folder that CLSPLAT_ARTEFACTS names, or the test's own.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,11 @@ from typing import Any
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-ARGUMENTS = ("--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-"""Of root in a container, with little shared memory, and without a GPU."""
+ARGUMENTS = (
+    *("--no-sandbox", "--disable-dev-shm-usage"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+)
+"""Of root in a container, with little shared memory; WebGL without a GPU."""
 
 
 def chromium_path() -> str | None:
@@ -22,7 +28,7 @@ def chromium_path() -> str | None:
     return next((found for name in ([named] if named else NAMES) if (found := shutil.which(name))), None)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # while it is open there is an event loop in this thread, which other tests may mind
 def browser() -> Iterator[Any]:
     """A Playwright browser. Make a page of it with `browser.new_page()`, and close that."""
     playwright = pytest.importorskip("playwright.sync_api", reason="the extra `test` brings playwright")
@@ -44,9 +50,8 @@ def watched_page(browser: Any, **options: Any) -> tuple[Any, list[str]]:
     return page, trouble
 
 
-def keep_screenshot(page: Any, name: str, folder: Path) -> Path:
-    """A picture of the whole page, in CLSPLAT_ARTEFACTS if that is set, else in the test's own folder."""
-    kept = Path(os.environ.get("CLSPLAT_ARTEFACTS") or folder)
-    kept.mkdir(parents=True, exist_ok=True)
-    page.screenshot(path=kept / f"{name}.png", full_page=True)
-    return kept / f"{name}.png"
+def kept(folder: Path, name: str) -> Path:
+    """Where a screenshot goes; `folder` is the test's own."""
+    place = Path(os.environ.get("CLSPLAT_ARTEFACTS") or folder)
+    place.mkdir(parents=True, exist_ok=True)
+    return place / name

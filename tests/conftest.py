@@ -16,6 +16,7 @@ from opencl_drivers import use_every_driver
 use_every_driver()
 os.environ.setdefault("CLSPLAT_TRUST_DRIVER", "1")  # the test at a driver's first use has tests of its own
 
+from browser import browser  # noqa: F401  # a fixture
 from calls import train
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from pipeline import shaped

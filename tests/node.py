@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Independent readers and writers of model files, from npm; tests that need one skip where it is not to be had."""
+"""Independent readers and writers of model files, from npm; tests that need one skip where it is not to be had.
+
+CLSPLAT_NODE_MODULES names a folder of installed packages. Without it they are installed once, into .pytest_cache.
+As a script: installs them, and says where they are or why not.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -28,52 +33,67 @@ require("gltf-validator").validateBytes(new Uint8Array(fs.readFileSync(file)), {
 
 
 @functools.cache
-def _folder() -> Path | str:
-    """Where node_modules is, or why there is none. CLSPLAT_NODE names a folder that has it."""
-    if given := os.environ.get("CLSPLAT_NODE"):
-        return Path(given)
+def modules() -> Path | str:
+    """The folder node_modules, or why there is none."""
+    if shutil.which("node") is None:
+        return "there is no node to run readers from npm with"
+    if given := os.environ.get("CLSPLAT_NODE_MODULES"):
+        return Path(given).resolve()
     if (CACHE / "node_modules").is_dir():
-        return CACHE
-    if not (shutil.which("node") and shutil.which("npm")):
-        return "Node.js and npm are not there"
+        return CACHE / "node_modules"
+    if shutil.which("npm") is None:
+        return "there is no npm; install it, or set CLSPLAT_NODE_MODULES"
     CACHE.parent.mkdir(exist_ok=True)
     folder = Path(tempfile.mkdtemp(dir=CACHE.parent))
     command = ["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", "--prefix", str(folder), *PACKAGES]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
     except subprocess.TimeoutExpired:
+        shutil.rmtree(folder)
         return "npm does not answer"
     if done.returncode:
+        shutil.rmtree(folder)
         return f"npm cannot install {' '.join(PACKAGES)}: {done.stderr.strip()[-200:]}"
     try:
         folder.rename(CACHE)
     except OSError:  # another process was first
         shutil.rmtree(folder)
-    return CACHE
+    return CACHE / "node_modules"
 
 
-def _node(*arguments: str) -> str:
-    folder = _folder()
+def _node(package: str, *arguments: str) -> str:
+    """What node prints; skips the test where the package is not there."""
+    folder = modules()
     if isinstance(folder, str):
         pytest.skip(folder)
-    environment = os.environ | {"NODE_PATH": str(folder / "node_modules")}
+    if not (folder / package).is_dir():
+        pytest.skip(f"CLSPLAT_NODE_MODULES has no {package}: npm install --ignore-scripts {' '.join(PACKAGES)}")
     done = subprocess.run(
-        ["node", *arguments], capture_output=True, text=True, check=False, env=environment, timeout=120
+        ["node", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"NODE_PATH": str(folder)},
+        cwd=folder,
+        timeout=120,
     )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 def splat_transform(source: Path, target: Path, *options: str) -> None:
     """Convert a file by the tool of PlayCanvas's."""
-    folder = _folder()
-    if isinstance(folder, str):
-        pytest.skip(folder)
-    tool = folder / "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
-    _node(str(tool), "-q", "-w", "-g", "cpu", *options, str(source), str(target))
+    package = "@playcanvas/splat-transform"
+    said = _node(package, f"{package}/bin/cli.mjs", "-q", "-w", "-g", "cpu", *options, str(source), str(target))
+    assert target.exists(), said
 
 
 def validate_gltf(path: Path) -> list[dict[str, Any]]:
     """What Khronos's validator finds."""
-    found: list[dict[str, Any]] = json.loads(_node("-e", VALIDATE, str(path)))
+    found: list[dict[str, Any]] = json.loads(_node("gltf-validator", "-e", VALIDATE, str(path)))
     return found
+
+
+if __name__ == "__main__":
+    where = modules()
+    sys.exit(where if isinstance(where, str) else print(where))

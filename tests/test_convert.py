@@ -207,3 +207,23 @@ def test_eval_and_render_take_any_format(trained: Path, scene: Path, tmp_path: P
     assert main(["eval", str(target), "--scene", str(scene), "--json"]) == 0
     assert main(["render", str(target), "--cameras", str(scene), "-o", str(tmp_path / "{name}.png")]) == 0
     assert len(list(tmp_path.glob("*.png"))) == len(cameras())
+
+
+def test_a_folder_of_pictures_is_a_model(trained: Path, scene: Path, tmp_path: Path, capsys: Capture) -> None:
+    """An unpacked SOG, to every verb that takes a model."""
+    folder = tmp_path / "sog"
+    folder.mkdir()
+    assert convert(trained, folder / "meta.json") == 0
+    assert convert(folder, tmp_path / "a.ply") == 0
+    capsys.readouterr()
+    assert main(["info", str(folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["path"] == str(folder / "meta.json")
+    for given in (folder, tmp_path / "a.ply"):
+        assert main(["eval", str(given), "--scene", str(scene), "--json"]) == 0
+    found = capsys.readouterr().out.split("\n}\n")
+    assert json.loads(found[0] + "}")["mean"] == json.loads(found[1] + "}")["mean"]
+    assert main(["render", str(folder), "--cameras", str(scene), "-o", str(tmp_path / "{name}.png")]) == 0
+    assert len(list(tmp_path.glob("*.png"))) == len(cameras())
+    (folder / "meta.json").unlink()
+    assert main(["render", str(folder), "--cameras", str(scene), "-o", str(tmp_path / "{name}.png")]) == 2
+    assert "not a run" in capsys.readouterr().err

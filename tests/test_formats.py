@@ -6,6 +6,7 @@ from __future__ import annotations
 import random
 import tracemalloc
 import warnings
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -190,6 +191,17 @@ def test_the_loss_is_small_in_every_attribute(name: str, tmp_path: Path) -> None
     }
     for attribute, (for_floats, else_) in limits.items():
         assert found[attribute]["largest"] <= (for_floats if exact else else_), attribute
+
+
+def test_scales_count_as_a_part_of_the_gaussians_largest(tmp_path: Path) -> None:
+    """A disc's thickness that is cut to what a format holds is no loss that could be seen, a wrong diameter is."""
+    disc = edit.take(asymmetric(), np.arange(3))
+    disc.log_scales[:] = ((-3, -4, -30), (-30, -3, -3), (-3, -3, -3))  # SPZ ends at -10
+    formats.save(tmp_path / "a.spz", disc)
+    found = fidelity.errors(disc, formats.load(tmp_path / "a.spz"))["scale"]["largest"]
+    assert found == pytest.approx(np.exp(-7), rel=0.01)  # exp(-10) of exp(-3); that of whole sixteenths is 0
+    wider = replace(disc, log_scales=disc.log_scales + np.float32([[0, 0, 0], [0, 0, 0.5], [0, 0, 0]]))
+    assert fidelity.errors(disc, wider)["scale"]["largest"] == pytest.approx(np.expm1(0.5), rel=1e-5)
 
 
 @pytest.mark.parametrize("name", WRITTEN)

@@ -17,7 +17,7 @@ from node import splat_transform
 from splats import assert_refused_or_sound, assert_within, damaged, lopsided, losses, opacity, read_plainly, with_origin
 
 from clsplat.errors import InputError
-from clsplat.formats import sog
+from clsplat.formats import packing, sog
 from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.gaussians import Gaussians
 
@@ -74,7 +74,7 @@ def test_sorted_it_is_the_same_model_and_smaller(tmp_path: Path) -> None:
     for sort in (False, True):
         sog.write(tmp_path / f"{sort}.sog", model, sort=sort)
     plain, ordered = sog.read(tmp_path / "False.sog"), sog.read(tmp_path / "True.sog")
-    order = sog.morton_order(model.means)
+    order = packing.morton_order(model.means)
     np.testing.assert_array_equal(ordered.means, plain.means[order])
     np.testing.assert_array_equal(ordered.quaternions, plain.quaternions[order])
     assert (tmp_path / "True.sog").stat().st_size < (

@@ -120,7 +120,7 @@ def test_positions_take_the_bits_that_the_model_needs(tmp_path: Path) -> None:
 def test_values_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
     model = lopsided(5)
     model.sh[3, 2, 1] = np.nan
-    with pytest.raises(InputError, match="sh of Gaussian 3"):
+    with pytest.raises(InputError, match="Gaussian 3 has a colour"):
         spz.write(tmp_path / "model.spz", model)
     assert not list(tmp_path.iterdir())
 

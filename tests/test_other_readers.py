@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from models import random_gaussians
-from node_tools import splat_transform
+from node import splat_transform
 from test_packed_formats import ksplat
 
 from clsplat import formats
@@ -31,7 +31,7 @@ def assert_alike(ours: Gaussians, theirs: Gaussians, rotation: float = 1e-4) -> 
     lengths = [np.linalg.norm(each, axis=1, keepdims=True) for each in (a, b)]
     np.testing.assert_allclose(a / lengths[0], b / lengths[1], atol=rotation)
     opacity = [1 / (1 + np.exp(-each.opacity_logits.astype(float))) for each in (ours, theirs)]
-    np.testing.assert_allclose(*opacity, atol=1e-5)  # 0 and 1 are kept off by less than that
+    np.testing.assert_allclose(*opacity, atol=0.26 / 255)  # 0 and 255 are read a quarter of a step from the end
 
 
 def model(degree: int = 3) -> Gaussians:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import zipfile
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -73,3 +75,15 @@ def test_scripts_can_be_run():
         path = ROOT / name
         assert path.stat().st_mode & 0o111, f"{name} is not executable"
         assert path.read_text().startswith("#!/usr/bin/env ")
+
+
+def test_the_architecture_names_every_module_and_tool() -> None:
+    text = (ROOT / "docs/architecture.md").read_text()
+    layers = text.partition("| layer | modules |")[2].partition("\n\n")[0]
+    named = set(re.findall(r"`([\w/*]+)`", layers))
+    paths = [path.relative_to(ROOT / "clsplat").with_suffix("").as_posix() for path in (ROOT / "clsplat").rglob("*.py")]
+    modules = {path for path in paths if not Path(path).name.startswith("__")}
+    assert {path for path in modules if not any(fnmatch(path, name) for name in named)} == set()
+    (row,) = (line for line in text.splitlines() if line.startswith("| `tools/` |"))
+    tools = {path.stem for path in (ROOT / "tools").iterdir() if path.is_file()}
+    assert tools <= {Path(name).stem for name in re.findall(r"`([\w.]+)`", row)}

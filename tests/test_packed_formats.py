@@ -60,7 +60,7 @@ def test_a_compressed_ply_by_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.log_scales, [[-6, -5, -4], [-1, -5, -3]])
     rgb = np.array([[1.0, 0.25, 1.5], [0.0, 0.25, 0.5]])
     np.testing.assert_allclose(read.sh[:, 0], (rgb - 0.5) / C0, rtol=1e-6)
-    np.testing.assert_allclose(packing.opacities(read.opacity_logits), [128 / 255, 1e-6], rtol=1e-5)
+    np.testing.assert_allclose(packing.opacities(read.opacity_logits), [128 / 255, 0.25 / 255], rtol=1e-5)
     tiny = np.sqrt(2) * (512 / 1023 - 0.5)
     half = np.sqrt(0.5)
     np.testing.assert_allclose(read.quaternions[0], [1, tiny, tiny, tiny], atol=2e-6)

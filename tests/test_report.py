@@ -69,6 +69,17 @@ def test_figures_are_those_of_the_files(reported: Path) -> None:
     assert notes(html) == ""
 
 
+def test_another_evaluation_is_in_it(copied: Path, capfd: Capture) -> None:
+    """`clsplat eval RUN` writes eval.json anew, here of every second view; a run without a report gets none."""
+    assert main(["eval", str(copied), "--test-every", "2"]) == 0
+    evaluation = json.loads((copied / "eval.json").read_text())
+    assert figures_of(parse((copied / "report.html").read_text("utf-8")))["evaluation"] == evaluation
+    assert len(evaluation["views"]) > 2
+    (copied / "report.html").unlink()
+    assert main(["eval", str(copied)]) == 0
+    assert not (copied / "report.html").exists()
+
+
 def test_curves_are_drawn_by_those_figures(reported: Path) -> None:
     charts = charts_of(parse((reported / "report.html").read_text("utf-8")))
     records = Run.open(reported).read_metrics()

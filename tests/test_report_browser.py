@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import browser, keep_screenshot, watched_page  # noqa: F401  # a fixture
+from browser import kept, watched_page
 from test_report import SCRIPT
 
 from clsplat.cli import main
@@ -31,7 +31,7 @@ def pages(reported: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
 
 
 @pytest.fixture
-def opened(browser: Any, pages: dict[str, Path]) -> Iterator[Any]:  # noqa: F811
+def opened(browser: Any, pages: dict[str, Path]) -> Iterator[Any]:
     """Opens a page by its kind; at the end nothing has gone wrong in it, and nothing been asked of a network."""
     made: list[tuple[Any, list[str], list[str]]] = []
 
@@ -66,7 +66,9 @@ def test_it_fits_and_is_coloured_as_asked(opened: Any, kind: str, size: Any, sch
     charts = page.locator(".chart svg")
     assert charts.count() >= 6
     assert charts.first.bounding_box()["width"] > 250
-    assert keep_screenshot(page, f"{kind}-{size['width']}", tmp_path).stat().st_size > 10_000
+    picture = kept(tmp_path, f"{kind}-{size['width']}.png")
+    page.screenshot(path=picture, full_page=True)
+    assert picture.stat().st_size > 10_000
 
 
 def cut(page: Any) -> float:

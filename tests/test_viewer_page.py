@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import kept
 from tiny import CONFIG
-from viewer_browser import SLOW, choose, chromium, clsplat, kept
+from viewer_browser import SLOW, choose, clsplat
 
 from clsplat.cli import main
 from clsplat.device.context import open_device
@@ -25,12 +26,6 @@ from clsplat.rendering import Renderer
 PAGE = {"width": 900, "height": 600}
 CLEAR = (slice(250, 580), slice(20, 560))
 """Rows and columns of the page where no panel is, nor the frame of a key that was recorded here."""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

@@ -77,7 +77,8 @@ def read(path: Path) -> Gaussians:
                 steps = np.where(columns == 0, 0, np.where(columns == 255, 256, columns + np.float32(0.5)))
                 values = (steps / 256 - 0.5) * 8
                 found.sh[start : start + count, 1:] = values.reshape(count, 3, -1).transpose(0, 2, 1)
-    return packing.check_finite(found, path)
+    packing.require_finite(path, found)
+    return found
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -90,6 +91,7 @@ def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> 
     """Write it, atomically, the Gaussians in the order of `order`. comments: lines of the header, in ASCII."""
     ply.check_comments(comments)
     gaussians.check()
+    packing.require_finite(path, gaussians, writing=True)
     rows, count = order(gaussians), len(gaussians)
     rest = 3 * (gaussians.sh.shape[1] - 1)
     lines = ["ply", "format binary_little_endian 1.0", "comment clsplat"]
@@ -200,7 +202,7 @@ def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], found: Gaussians, 
     found.log_scales[rows] = between(words["packed_scale"], _111011, 1)
     with np.errstate(over="ignore"):  # refused below
         found.sh[rows, 0] = packing.coefficients(between(words["packed_color"], _8888, 2))
-    found.opacity_logits[rows] = packing.logits((words["packed_color"] & 255) / 255)
+    found.opacity_logits[rows] = packing.byte_logits()[words["packed_color"] & 255]
     others = (_fields(words["packed_rotation"], _ROTATION) - np.float32(0.5)) * np.float32(np.sqrt(2))
     largest = np.sqrt(np.maximum(1 - np.square(others).sum(axis=1), 0))
     which = words["packed_rotation"] >> 30
@@ -214,7 +216,7 @@ def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], found: Gaussians, 
 def _values(gaussians: Gaussians, rows: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
     """Position, log scale and colour, float64 (n, 3) each."""
     return (
-        packing.world_means(gaussians, rows).astype(np.float64),
+        packing.world_means(gaussians, rows),
         np.clip(gaussians.log_scales[rows].astype(np.float64), -MAX_LOG_SCALE, MAX_LOG_SCALE),
         packing.colours(gaussians.sh[rows, 0]),
     )
@@ -248,7 +250,7 @@ def _pack(gaussians: Gaussians, rows: NDArray[np.int64], ranges: NDArray[np.floa
     words[:, 2] = fields(part(scales, 1), _111011)
     opacity = packing.to_bytes(packing.opacities(gaussians.opacity_logits[rows]))
     words[:, 3] = fields(part(rgb, 2), _8888) | opacity
-    q = packing.unit(gaussians.quaternions[rows])
+    q = packing.unit_quaternions(gaussians.quaternions[rows])
     which = np.abs(q).argmax(axis=1)
     n = np.arange(len(q))
     q *= np.where(q[n, which] < 0, -1, 1)[:, None]

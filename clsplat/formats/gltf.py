@@ -30,13 +30,13 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from clsplat.colour import srgb_to_linear
+from clsplat.edit import merge
 from clsplat.errors import InputError
 from clsplat.files import atomic_writer
-from clsplat.formats import conventions, spz
+from clsplat.formats import conventions, packing, spz
 from clsplat.formats.conventions import LEFT_UP
 from clsplat.formats.gltf_asset import (
     BIN_CHUNK,
-    BLOCK_ROWS,
     COLOR_SPACES,
     EXTENSION,
     JSON_CHUNK,
@@ -46,6 +46,7 @@ from clsplat.formats.gltf_asset import (
     Asset,
     as_object,
 )
+from clsplat.formats.packing import BLOCK_ROWS
 from clsplat.gaussians import Gaussians
 from clsplat.reference.sh import C0
 
@@ -82,12 +83,11 @@ def read(path: Path) -> Gaussians:
         part = asset.gaussians(name, primitive)
         # the node's matrix is in glTF's frame, the Gaussians are in ours already
         turn = np.diag([*LEFT_UP, 1.0])
-        conventions.place(part, turn @ matrix @ turn, f"{path}: {name}")
-        parts.append(part)
+        parts.append(conventions.place(part, turn @ matrix @ turn, f"{path}: {name}"))
     if not parts:
         raise InputError(f"{path}: has no primitive with {EXTENSION} in its scene, expected at least one")
-    model = conventions.concatenated(parts)
-    conventions.require_finite(path, model)
+    model = merge(parts)
+    packing.require_finite(path, model)
     return model
 
 
@@ -102,7 +102,7 @@ def write(
     if color_space not in COLOR_SPACES:
         raise ValueError(f"color_space {color_space!r}: expected {' or '.join(COLOR_SPACES)}")
     gaussians.check()
-    conventions.require_finite(path, gaussians, writing=True)
+    packing.require_finite(path, gaussians, writing=True)
     if not len(gaussians):
         raise InputError(f"{path}: cannot be written: the model has no Gaussians")
     document, buffer = _document(path, gaussians, spz_compression, color_space)
@@ -170,17 +170,17 @@ def _block(name: str, gaussians: Gaussians, rows: slice, color_space: str) -> Ar
         case "POSITION":
             block = (gaussians.means[rows] * np.array(LEFT_UP, np.float32)).astype("<f4")
         case "ROTATION":
-            unit = conventions.unit_quaternions(gaussians.quaternions[rows])
+            unit = packing.unit_quaternions(gaussians.quaternions[rows])
             block = (unit * conventions.quaternion_signs(LEFT_UP))[:, [1, 2, 3, 0]].astype("<f4")
         case "SCALE":
             block = np.exp(np.clip(gaussians.log_scales[rows], -103.0, 88.0)).astype("<f4")
         case "OPACITY":
-            block = conventions.opacities(gaussians.opacity_logits[rows]).astype("<f4")
+            block = packing.opacities(gaussians.opacity_logits[rows]).astype("<f4")
         case "COLOR_0":
             colors = np.clip(gaussians.sh[rows, 0] * np.float32(C0) + np.float32(0.5), 0, 1)
             if color_space == COLOR_SPACES[0]:
                 colors = srgb_to_linear(colors)
-            opacity = conventions.opacities(gaussians.opacity_logits[rows])
+            opacity = packing.opacities(gaussians.opacity_logits[rows])
             block = np.rint(np.column_stack([colors, opacity]) * 65535).astype("<u2")
         case coefficient:
             _, _, degree, _, index = coefficient.split("_")

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from clsplat.errors import InputError, plain
 from clsplat.files import MAX_DOCUMENT, open_input, parse_json, read_document
-from clsplat.formats import conventions, spz
-from clsplat.formats.conventions import LEFT_UP
+from clsplat.formats import packing, spz
+from clsplat.formats.conventions import LEFT_UP, flip
+from clsplat.formats.packing import BLOCK_ROWS
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -41,7 +42,6 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MAX_NODES, MAX_PRIMITIVES = 100_000, 4096
 """Of a scene; the second of those that have Gaussians: more are a bomb, which may be one mesh in many nodes."""
-BLOCK_ROWS = 1 << 15
 
 Array = NDArray[Any]
 
@@ -182,7 +182,7 @@ class Asset:
         count = len(position)
         self.total += count
         size = self.size + sum(len(buffer) for buffer in self.buffers.values())
-        conventions.require_count(self.path, self.total if count else 0, size)
+        packing.require_count(self.path, self.total if count else 0, size)
         names = [
             [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
             for degree in range(MAX_SH_DEGREE + 1)
@@ -198,28 +198,20 @@ class Asset:
         for each in (*sources.values(), *coefficients):
             if len(each) != count:
                 raise InputError(f"{self.path}: {name} has {len(each)} values of an attribute, expected {count}")
-        result = Gaussians(
-            np.empty((count, 3), np.float32),
-            np.empty((count, 4), np.float32),
-            np.empty((count, 3), np.float32),
-            np.empty(count, np.float32),
-            np.empty((count, len(coefficients), 3), np.float32),
-        )
+        result = packing.empty(count, degree)
         for first in range(0, count, BLOCK_ROWS):
             rows = slice(first, min(first + BLOCK_ROWS, count))
             result.means[rows] = _real(position[rows])
             result.quaternions[rows] = _real(sources["quaternions"][rows])[:, [3, 0, 1, 2]]
             scales = _real(sources["log_scales"][rows])
-            if not (scales >= 0).all():
-                raise InputError(f"{self.path}: {name} has a scale below 0 or that is no number")
-            result.log_scales[rows] = np.log(np.maximum(scales, 2.0**-149))
+            result.log_scales[rows] = packing.log_scales(scales, f"{self.path}: {name}", first)
             opacity = _real(sources["opacities"][rows])[:, 0]
             if not ((opacity >= 0) & (opacity <= 1)).all():
                 raise InputError(f"{self.path}: {name} has an opacity outside [0, 1]")
-            result.opacity_logits[rows] = conventions.logits(opacity)
+            result.opacity_logits[rows] = packing.logits(opacity)
             for index, coefficient in enumerate(coefficients):
                 result.sh[rows, index] = _real(coefficient[rows])
-        conventions.flip(result, LEFT_UP)
+        flip(result, LEFT_UP)
         return result
 
     def accessor(self, index: object, width: int, semantic: str) -> Array:

@@ -111,9 +111,10 @@ def read(path: Path) -> Gaussians:
                     _higher_sh(gaussians, rows, section.degree, block["sh"], (low, high))
                 gaussians.quaternions[rows] = block["quaternions"]
                 gaussians.sh[rows, 0] = packing.coefficients(block["rgba"][:, :3] / 255)
-                gaussians.opacity_logits[rows] = packing.logits(block["rgba"][:, 3] / 255)
+                gaussians.opacity_logits[rows] = packing.byte_logits()[block["rgba"][:, 3]]
             first += section.count
-    return packing.check_finite(gaussians, path)
+    packing.require_finite(path, gaussians)
+    return gaussians
 
 
 def describe(path: Path) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What several formats share: bytes of colour and opacity, reading rows, an order in space, the check of what was read.
+"""What several formats share: values and their bytes, reading rows, an order in space, checks of what was read.
 
 Colours in formats of bytes are 0.5 + C0 times SH coefficient 0, opacities lie in 0 to 1 (Kerbl et al. 2023).
 """
@@ -20,10 +20,11 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 BLOCK_ROWS = 1 << 15
-LEAST_OPACITY = 1e-6
-"""What 0 is read as, and 1 less this what 1 is: their logits have to be finite."""
-LEAST_SCALE = 1e-10
-"""What a scale of 0 is read as, likewise."""
+LEAST_SCALE = 2.0**-149
+"""What a scale of 0 is read as, whose log has to be finite: float32's least."""
+FREE_COUNT = 1 << 20
+"""A compressed file may have so many Gaussians whatever its length is, and beyond them one for each byte of it: more
+than any model of a scene, whose positions alone take several bytes each, and less than what a bomb would ask for."""
 MORTON_BITS = 21
 _SPREAD = (
     (32, 0x1F00000000FFFF),
@@ -43,10 +44,10 @@ def empty(count: int, degree: int) -> Gaussians:
     return Gaussians(room(count, 3), room(count, 4), room(count, 3), room(count), room(count, (degree + 1) ** 2, 3))
 
 
-def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) -> Float32:
-    """(n, 3) where they are in the world, added in float64 before they are rounded."""
-    means = gaussians.means[rows]
-    return (means + gaussians.origin).astype(np.float32) if gaussians.origin.any() else means
+def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) -> Float64:
+    """(n, 3) where they are in the world."""
+    means: Float64 = gaussians.means[rows] + gaussians.origin
+    return means
 
 
 def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
@@ -57,18 +58,26 @@ def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 def opacities(logits: Float32) -> Float64:
     """0 to 1 of logits."""
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore"):  # exp of a large number: the opacity is 0 then, as it should be
         found: Float64 = 1 / (1 + np.exp(-logits.astype(np.float64)))
     return found
 
 
-def logits(found: NDArray[Any]) -> Float64:
-    """Of opacities, kept off 0 and 1 by LEAST_OPACITY."""
-    o: Float64 = np.clip(found, LEAST_OPACITY, 1 - LEAST_OPACITY, dtype=np.float64)
-    return np.asarray(np.log(o) - np.log1p(-o))
+def logits(opacity: NDArray[Any]) -> Float32:
+    """Of opacities from 0 to 1, whose own logits are infinite: they count as float32's nearest others, halved."""
+    p = np.clip(opacity.astype(np.float64), 2.0**-150, 1 - 2.0**-25)
+    return (np.log(p) - np.log1p(-p)).astype(np.float32)
 
 
-def log_scales(linear: NDArray[Any], path: Path, first: int) -> Float64:
+def byte_logits() -> Float32:
+    """(256,): of opacities in steps of 1/255. The first and the last step are half as wide as others, and count as
+    their middle, where the logit is finite and rounds to the same byte."""
+    steps = np.arange(256, dtype=np.float64)
+    steps[0], steps[-1] = 0.25, 254.75
+    return logits(steps / 255)
+
+
+def log_scales(linear: NDArray[Any], path: Path | str, first: int) -> Float64:
     """(n, 3) of standard deviations, those of the Gaussians from `first` on. Raises InputError for negative ones."""
     with np.errstate(invalid="ignore"):
         bad = ~(linear >= 0).all(axis=1)
@@ -89,8 +98,8 @@ def coefficients(rgb: NDArray[Any]) -> Float64:
     return (np.asarray(rgb, np.float64) - 0.5) / C0
 
 
-def unit(quaternions: NDArray[Any]) -> Float64:
-    """(n, 4) of length 1; of length 0 no rotation."""
+def unit_quaternions(quaternions: NDArray[Any]) -> Float64:
+    """(n, 4), w x y z, of length 1; of length 0 no rotation."""
     q = quaternions.astype(np.float64)
     length = np.linalg.norm(q, axis=1, keepdims=True)
     return np.where(length > 0, q / np.where(length > 0, length, 1), (1.0, 0.0, 0.0, 0.0))
@@ -104,8 +113,8 @@ def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> ND
     return np.frombuffer(data, kind)
 
 
-def check_finite(gaussians: Gaussians, path: Path) -> Gaussians:
-    """The same. Raises InputError for a value that is not finite, naming the first of the attribute."""
+def require_finite(path: Path, gaussians: Gaussians, *, writing: bool = False) -> None:
+    """Raise InputError naming the first value that is not finite."""
     named = {
         "a position": gaussians.means,
         "a rotation": gaussians.quaternions,
@@ -114,12 +123,20 @@ def check_finite(gaussians: Gaussians, path: Path) -> Gaussians:
         "a colour": gaussians.sh,
     }
     for name, array in named.items():
-        flat = array.reshape(len(array), -1)
-        for start in range(0, len(flat), BLOCK_ROWS):
-            bad = ~np.isfinite(flat[start : start + BLOCK_ROWS]).all(axis=1)
-            if bad.any():
-                raise InputError(f"{path}: Gaussian {start + int(bad.argmax())} has {name} that is not finite")
-    return gaussians
+        with np.errstate(invalid="ignore"):  # of infinities of both signs
+            total = array.sum(dtype=np.float64)  # a single pass; that of finite float32 is finite
+        if not np.isfinite(total):
+            row = int((~np.isfinite(array.reshape(len(array), -1)).all(axis=1)).argmax())
+            verb = "cannot be written: " if writing else ""
+            raise InputError(f"{path}: {verb}Gaussian {row} has {name} that is not finite")
+
+
+def require_count(path: Path, count: int, size: int) -> None:
+    """Raise InputError for a count that a compressed file of `size` bytes does not have."""
+    if count < 1:
+        raise InputError(f"{path}: has {count} Gaussians, expected at least one")
+    if count > max(FREE_COUNT, size):
+        raise InputError(f"{path}: says that it has {count} Gaussians in {size} bytes; is it damaged?")
 
 
 def morton_order(means: Float32) -> NDArray[np.int64]:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import InputError, plain
 from clsplat.files import MAX_DOCUMENT, atomic_writer, open_input, parse_json, read_document
-from clsplat.formats import conventions
+from clsplat.formats import packing
 from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images import error_of, open_image
@@ -46,6 +46,7 @@ FLOAT = False
 
 Bytes = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 META = "meta.json"
 MAX_PALETTE = 1 << 16
@@ -73,7 +74,7 @@ def read(path: Path) -> Gaussians:
     with _opened(path) as files:
         meta = _Meta(files, files.meta())
         model = meta.gaussians()
-    conventions.require_finite(path, model)
+    packing.require_finite(path, model)
     return model
 
 
@@ -226,7 +227,7 @@ class _Meta:
         scales = self.dequantised("scales", self.pixels("scales", 0, 3))
         bytes_ = self.pixels("sh0", 0, 4)
         if self.version == 2:
-            opacity_logits = conventions.byte_logits()[bytes_[:, 3]]
+            opacity_logits = packing.byte_logits()[bytes_[:, 3]]
         else:
             low, high = (self.numbers("sh0", key, 4, 4)[3] for key in ("mins", "maxs"))
             opacity_logits = (low + (high - low) * (bytes_[:, 3] / 255)).astype(np.float32)
@@ -291,12 +292,12 @@ def write(path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool 
     Gaussians give the same values. Raises InputError for values that are not finite.
     """
     gaussians.check()
-    conventions.require_finite(path, gaussians, writing=True)
+    packing.require_finite(path, gaussians, writing=True)
     if not len(gaussians):
         raise InputError(f"{path}: cannot be written: the model has no Gaussians")
     with tempfile.TemporaryDirectory(prefix="clsplat-sog-") as name:
         folder = Path(name)
-        order = morton_order(gaussians.means) if sort else slice(None)
+        order = packing.morton_order(gaussians.means) if sort else slice(None)
         meta = _pictures(folder, gaussians, order, iterations)
         text = json.dumps(meta, separators=(",", ":")).encode()
         files = sorted(folder.iterdir())
@@ -313,17 +314,6 @@ def write(path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool 
                 archive.writestr(zipfile.ZipInfo(each.name), each.read_bytes())
 
 
-def morton_order(means: Float32) -> NDArray[np.intp]:
-    """Indices along a Z-curve of 1024 steps for each axis, between the axis's hundredth and last but one."""
-    low, high = np.quantile(means, [0.01, 0.99], axis=0)
-    steps = np.clip((means - low) / np.maximum(high - low, 1e-30) * 1024, 0, 1023).astype(np.uint32)
-    code = np.zeros(len(means), np.uint32)
-    for bit in range(10):
-        for axis in range(3):
-            code |= (steps[:, axis] >> bit & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
-
-
 def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int) -> dict[str, Any]:
     """Write them, and give meta.json."""
     count = len(gaussians)
@@ -336,7 +326,7 @@ def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int) -
         _write_webp(folder / name, pixels.reshape(height, width, -1))
         return name
 
-    world = conventions.world_means(gaussians)[order]
+    world = packing.world_means(gaussians)[order]
     folded = np.sign(world) * np.log1p(np.abs(world))
     low, high = folded.min(axis=0), folded.max(axis=0)
     steps = np.rint((folded - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
@@ -345,8 +335,8 @@ def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int) -
     ]
     log_scales, sh0 = gaussians.log_scales[order], gaussians.sh[order, 0]
     scale_codes, colour_codes = codebook(log_scales), codebook(sh0)
-    opacity = np.rint(conventions.opacities(gaussians.opacity_logits[order]) * 255).astype(np.uint8)
-    quats = _packed_quaternions(conventions.unit_quaternions(gaussians.quaternions[order]))
+    opacity = packing.to_bytes(packing.opacities(gaussians.opacity_logits[order]))
+    quats = _packed_quaternions(packing.unit_quaternions(gaussians.quaternions[order]))
     scales = picture("scales.webp", [_indices(scale_codes, log_scales)])
     colours = picture("sh0.webp", [_indices(colour_codes, sh0), opacity[:, None]])
     meta: dict[str, Any] = {
@@ -383,7 +373,7 @@ def _indices(entries: Float32, values: Float32) -> Bytes:
     return nearest(entries, values).astype(np.uint8)
 
 
-def _packed_quaternions(unit: Float32) -> Bytes:
+def _packed_quaternions(unit: Float64) -> Bytes:
     largest = np.abs(unit).argmax(axis=1)
     sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1, 1)
     others = np.array([[each for each in range(4) if each != index] for index in range(4)])[largest]

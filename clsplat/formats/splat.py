@@ -48,9 +48,10 @@ def read(path: Path) -> Gaussians:
             found.means[rows] = block["means"]
             found.log_scales[rows] = packing.log_scales(block["scales"], path, start)
             found.sh[rows, 0] = packing.coefficients(block["rgba"][:, :3] / 255)
-            found.opacity_logits[rows] = packing.logits(block["rgba"][:, 3] / 255)
+            found.opacity_logits[rows] = packing.byte_logits()[block["rgba"][:, 3]]
             found.quaternions[rows] = block["quaternions"].astype(np.float32) / 128 - 1
-    return packing.check_finite(found, path)
+    packing.require_finite(path, found)
+    return found
 
 
 def _check_first(block: Any, path: Path) -> None:
@@ -63,6 +64,7 @@ def _check_first(block: Any, path: Path) -> None:
 def write(path: Path, gaussians: Gaussians) -> None:
     """Write it, atomically."""
     gaussians.check()
+    packing.require_finite(path, gaussians, writing=True)
     with atomic_writer(path) as file:
         for start in range(0, len(gaussians), BLOCK_ROWS):
             rows = slice(start, start + BLOCK_ROWS)
@@ -73,6 +75,6 @@ def write(path: Path, gaussians: Gaussians) -> None:
             block["scales"] = np.minimum(scales, np.finfo(np.float32).max)
             block["rgba"][:, :3] = packing.to_bytes(packing.colours(gaussians.sh[rows, 0]))
             block["rgba"][:, 3] = packing.to_bytes(packing.opacities(gaussians.opacity_logits[rows]))
-            unit = packing.unit(gaussians.quaternions[rows])
+            unit = packing.unit_quaternions(gaussians.quaternions[rows])
             block["quaternions"] = np.clip(np.rint(unit * 128 + 128), 0, 255)
             file.write(block.tobytes())

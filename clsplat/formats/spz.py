@@ -33,26 +33,15 @@ from numpy.typing import NDArray
 
 from clsplat.errors import InputError, plain
 from clsplat.files import atomic_writer, open_input
-from clsplat.formats.conventions import (
-    UP_BACK,
-    Signs,
-    byte_logits,
-    opacities,
-    quaternion_signs,
-    require_count,
-    require_finite,
-    sh_signs,
-    unit_quaternions,
-    world_means,
-)
+from clsplat.formats import packing, spz_bytes
+from clsplat.formats.conventions import UP_BACK, Signs, flip, quaternion_signs, sh_signs
+from clsplat.formats.packing import BLOCK_ROWS
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
 NAME = "SPZ"
 SUFFIXES = (".spz",)
 LOSES = "positions to 24 bits fixed point, the rest to 8 or 10 bits, spherical harmonics to 6"
 FLOAT = False
-
-Bytes = NDArray[np.uint8]
 
 MAGIC = b"NGSP"
 VERSIONS = (2, 3, 4)
@@ -71,9 +60,7 @@ FRAMES: tuple[Signs, ...] = (
 MAX_EXTENSIONS = 1 << 20
 MAX_WINDOW = 1 << 27
 """Bytes that a Zstandard frame may have the decoder keep: the library's own limit."""
-BLOCK_ROWS = 1 << 15
 COLOUR_SCALE = 0.15 * 255
-ROOT_HALF = 0.5**0.5
 
 
 class Stream(Protocol):
@@ -125,21 +112,14 @@ def read(path: Path) -> Gaussians:
 def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     """Read what an SPZ file of `size` bytes has from the beginning of `file`; `path` is for messages."""
     header, stream = _open(file, size, path)
-    require_count(path, header.count, size)
+    packing.require_count(path, header.count, size)
     if header.degree > MAX_SH_DEGREE:
         warnings.warn(
             plain(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out"), stacklevel=3
         )
     if header.flags & ANTIALIASED:
         warnings.warn(plain(f"{path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=3)
-    count, coefficients = header.count, (min(header.degree, MAX_SH_DEGREE) + 1) ** 2
-    result = Gaussians(
-        np.empty((count, 3), np.float32),
-        np.empty((count, 4), np.float32),
-        np.empty((count, 3), np.float32),
-        np.empty(count, np.float32),
-        np.empty((count, coefficients, 3), np.float32),
-    )
+    result = packing.empty(header.count, min(header.degree, MAX_SH_DEGREE))
     if header.version == 4:
         signs = _frame(_records(file.read(header.table - 32), path), path) if header.flags & HAS_EXTENSIONS else UP_BACK
         _unpack(_zstd_streams(file, header, size, path), header, signs, result, path)
@@ -148,8 +128,6 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     _unpack(((name, stream) for name, width in header.widths.items() if width), header, UP_BACK, result, path)
     behind = _rest(stream, path)
     if header.flags & HAS_EXTENSIONS and (signs := _frame(_records(behind, path), path)) != UP_BACK:
-        from clsplat.formats.conventions import flip
-
         flip(result, (signs[0] * UP_BACK[0], signs[1] * UP_BACK[1], signs[2] * UP_BACK[2]))
     elif behind and not header.flags & HAS_EXTENSIONS:
         warnings.warn(plain(f"{path}: bytes after the last Gaussian ignored"), stacklevel=3)
@@ -284,7 +262,7 @@ def _rest(stream: Any, path: Path) -> bytes:
 
 def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs, result: Gaussians, path: Path) -> None:
     buffer = bytearray(BLOCK_ROWS * max(header.widths.values()))
-    alpha_logits = byte_logits()
+    alpha_logits = packing.byte_logits()
     # as wide as the array: NumPy is several times slower where the last axis is short
     sh_factor = np.repeat(sh_signs(signs)[1 : result.sh.shape[1], None] / np.float32(128), 3, axis=1)
     for name, stream in streams:
@@ -296,7 +274,7 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
             block = np.frombuffer(view, np.uint8).reshape(-1, width)
             match name:
                 case "positions":
-                    result.means[rows] = _fixed(block) * _means_factor(header, signs)
+                    result.means[rows] = spz_bytes.fixed(block) * _means_factor(header, signs)
                 case "alphas":
                     result.opacity_logits[rows] = alpha_logits[block[:, 0]]
                 case "colours":
@@ -304,7 +282,7 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
                 case "scales":
                     result.log_scales[rows] = block * np.float32(1 / 16) - np.float32(10)
                 case "rotations":
-                    unpack = _first_three if width == 3 else _smallest_three
+                    unpack = spz_bytes.first_three if width == 3 else spz_bytes.smallest_three
                     result.quaternions[rows] = unpack(block) * quaternion_signs(signs)
                 case _:
                     kept = result.sh.shape[1]
@@ -315,35 +293,6 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
 
 def _means_factor(header: Header, signs: Signs) -> NDArray[np.float32]:
     return np.array(signs, np.float32) * np.float32(0.5**header.fractional_bits)
-
-
-def _fixed(block: Bytes) -> NDArray[np.float32]:
-    """Signed integers of 24 bits, (n, 9) -> (n, 3)."""
-    wide = np.zeros((len(block), 3, 4), np.uint8)
-    wide[:, :, 1:] = block.reshape(-1, 3, 3)
-    return (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32)
-
-
-def _first_three(block: Bytes) -> NDArray[np.float32]:
-    result = np.empty((len(block), 4), np.float32)
-    result[:, 1:] = block * np.float32(1 / 127.5) - np.float32(1)
-    result[:, 0] = np.sqrt(np.maximum(0, 1 - np.square(result[:, 1:]).sum(axis=1)))
-    return result
-
-
-def _smallest_three(block: Bytes) -> NDArray[np.float32]:
-    packed = np.ascontiguousarray(block).view("<u4")[:, 0]
-    fields = packed[:, None] >> np.array([20, 10, 0], np.uint32)
-    three = (fields & 511).astype(np.float32) * np.float32(ROOT_HALF / 511)
-    three = np.where(fields & 512, -three, three)
-    largest = np.sqrt(np.maximum(0, 1 - np.square(three).sum(axis=1)))
-    result = np.empty((len(block), 4), np.float32)
-    for index in range(4):  # of x y z w
-        chosen = (packed >> 30) == index
-        others = [place for place in range(4) if place != index]
-        result[np.ix_(chosen, [(place + 1) % 4 for place in others])] = three[chosen]
-        result[chosen, (index + 1) % 4] = largest[chosen]
-    return result
 
 
 def write(
@@ -365,7 +314,7 @@ def write(
     if version not in VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
     gaussians.check()
-    require_finite(path, gaussians, writing=True)
+    packing.require_finite(path, gaussians, writing=True)
     header = header_for(path, gaussians, version, fractional_bits, ANTIALIASED if antialiased else 0)
     with atomic_writer(path) as file:
         write_to(file, gaussians, header, sh_bits)
@@ -413,7 +362,8 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
 def _fractional_bits(path: Path, gaussians: Gaussians, wanted: int | None) -> int:
     """As many as asked for, if the positions fit; or by the model's size, without its farthest hundredth."""
     low, high = (
-        world_means(gaussians, rows) for rows in (gaussians.means.argmin(axis=0), gaussians.means.argmax(axis=0))
+        packing.world_means(gaussians, rows)
+        for rows in (gaussians.means.argmin(axis=0), gaussians.means.argmax(axis=0))
     )
     largest = max(float(np.abs(low).max()), float(np.abs(high).max()))
     fits = 23 - max(0, int(np.ceil(np.log2(largest + 1e-30)))) if largest > 1 else 23
@@ -440,53 +390,18 @@ def _pack(
         rows = slice(first, first + BLOCK_ROWS)
         match name:
             case "positions":
-                data = _to_fixed(world_means(gaussians, rows) * UP_BACK * 2.0**header.fractional_bits)
+                data = spz_bytes.to_fixed(packing.world_means(gaussians, rows) * UP_BACK * 2.0**header.fractional_bits)
             case "alphas":
-                data = _to_byte(opacities(gaussians.opacity_logits[rows]) * np.float32(255))
+                data = packing.to_bytes(packing.opacities(gaussians.opacity_logits[rows]))
             case "colours":
-                data = _to_byte(gaussians.sh[rows, 0] * np.float32(COLOUR_SCALE) + np.float32(127.5))
+                data = spz_bytes.to_byte(gaussians.sh[rows, 0] * np.float32(COLOUR_SCALE) + np.float32(127.5))
             case "scales":
-                data = _to_byte((gaussians.log_scales[rows] + np.float32(10)) * np.float32(16))
+                data = spz_bytes.to_byte((gaussians.log_scales[rows] + np.float32(10)) * np.float32(16))
             case "rotations":
-                unit = unit_quaternions(gaussians.quaternions[rows]) * quaternion_signs(UP_BACK)
-                data = _to_first_three(unit) if header.version == 2 else _to_smallest_three(unit)
+                unit = packing.unit_quaternions(gaussians.quaternions[rows]).astype(np.float32) * quaternion_signs(
+                    UP_BACK
+                )
+                data = spz_bytes.to_first_three(unit) if header.version == 2 else spz_bytes.to_smallest_three(unit)
             case _:
-                data = _to_sh(gaussians.sh[rows, 1:], sh_bits)
+                data = spz_bytes.to_sh(gaussians.sh[rows, 1:], sh_bits)
         write(data.tobytes())
-
-
-def _to_byte(values: NDArray[np.float32]) -> Bytes:
-    rounded: Bytes = np.clip(np.floor(values + np.float32(0.5)), 0, 255).astype(np.uint8)
-    return rounded
-
-
-def _to_fixed(values: NDArray[np.float64]) -> Bytes:
-    fixed: Bytes = np.rint(values).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
-    return fixed
-
-
-def _to_first_three(unit: NDArray[np.float32]) -> Bytes:
-    unit = np.where(unit[:, :1] < 0, -unit, unit)
-    return _to_byte(unit[:, 1:] * np.float32(127.5) + np.float32(127.5))
-
-
-def _to_smallest_three(unit: NDArray[np.float32]) -> Bytes:
-    q = unit[:, [1, 2, 3, 0]]
-    largest = np.abs(q).argmax(axis=1)
-    negate = np.take_along_axis(q, largest[:, None], axis=1) < 0
-    magnitude = np.minimum(np.floor(np.abs(q) * np.float32(511 / ROOT_HALF) + np.float32(0.5)), 511).astype(np.uint32)
-    fields = magnitude | (((q < 0) ^ negate).astype(np.uint32) << 9)
-    others = np.array([[place for place in range(4) if place != index] for index in range(4)])[largest]
-    three = np.take_along_axis(fields, others, axis=1)
-    packed = largest.astype(np.uint32) << 30 | three[:, 0] << 20 | three[:, 1] << 10 | three[:, 2]
-    as_bytes: Bytes = packed.astype("<u4").view(np.uint8)
-    return as_bytes
-
-
-def _to_sh(rest: NDArray[np.float32], sh_bits: tuple[int, int]) -> Bytes:
-    coefficients = rest.shape[1]
-    steps = np.array([1 << (8 - sh_bits[0 if index < 3 else 1]) for index in range(coefficients)], np.int16)[:, None]
-    signs = sh_signs(UP_BACK)[1 : coefficients + 1, None]
-    values = np.clip(rest * (signs * np.float32(128)) + np.float32(128.5), 0, 256).astype(np.int16)
-    rounded: Bytes = np.minimum((values + steps // 2) & -steps, 255).astype(np.uint8)  # steps are powers of two
-    return rounded

@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.edit import merge
 from clsplat.errors import InputError, plain
 from clsplat.files import atomic_writer, open_input
-from clsplat.formats import conventions
+from clsplat.formats import conventions, packing
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
 NAME = "OpenUSD"
@@ -101,15 +102,15 @@ def read(path: Path) -> Gaussians:
             where = f"{path}: {prim.GetPath()}"
             part = _gaussians(where, prim, time)
             # USD's vectors are rows, so its matrices are the transposes of ours
-            conventions.place(part, np.array(transforms.GetLocalToWorldTransform(prim), np.float64).T, where)
-            parts.append(part)
+            matrix = np.array(transforms.GetLocalToWorldTransform(prim), np.float64).T
+            parts.append(conventions.place(part, matrix, where))
     except (Tf.ErrorException, UnicodeDecodeError, TypeError, ValueError, RuntimeError):
         # what its bindings raise for the names and values of a damaged file
         raise InputError(f"{path}: has values that USD cannot read; is it damaged?") from None
     if not parts:
         raise InputError(f"{path}: has no {TYPE} in it, expected at least one")
-    model = conventions.concatenated(parts)
-    conventions.require_finite(path, model)
+    model = merge(parts)
+    packing.require_finite(path, model)
     return model
 
 
@@ -149,8 +150,6 @@ def _gaussians(where: str, prim: Any, time: Any) -> Gaussians:
     quaternions = _array(where, prim, "orientations", time, 4, count)
     scales = _array(where, prim, "scales", time, 3, count)
     opacity = _array(where, prim, "opacities", time, 1, count)
-    if scales is not None and not (scales >= 0).all():
-        raise InputError(f"{where}: has a scale below 0 or that is no number")
     if opacity is not None and not ((opacity >= 0) & (opacity <= 1)).all():
         raise InputError(f"{where}: has an opacity outside [0, 1]")
     return Gaussians(
@@ -158,8 +157,8 @@ def _gaussians(where: str, prim: Any, time: Any) -> Gaussians:
         np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
         if quaternions is None
         else quaternions[:, [3, 0, 1, 2]],
-        np.zeros((count, 3), np.float32) if scales is None else np.log(np.maximum(scales, np.float32(2.0**-149))),
-        conventions.logits(np.ones(count, np.float32) if opacity is None else opacity[:, 0]),
+        np.zeros((count, 3), np.float32) if scales is None else packing.log_scales(scales, where, 0).astype(np.float32),
+        packing.logits(np.ones(count, np.float32) if opacity is None else opacity[:, 0]),
         sh,
     )
 
@@ -173,7 +172,7 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     if up_axis not in ("Y", "Z") or not meters_per_unit > 0:
         raise ValueError(f"up_axis {up_axis!r}, meters_per_unit {meters_per_unit}: expected Y or Z, and more than 0")
     gaussians.check()
-    conventions.require_finite(path, gaussians, writing=True)
+    packing.require_finite(path, gaussians, writing=True)
     if not len(gaussians):
         raise InputError(f"{path}: cannot be written: the model has no Gaussians")
     _pxr(path)
@@ -207,7 +206,7 @@ def _author(stage: Any, gaussians: Gaussians, up_axis: str, meters_per_unit: flo
     prim = stage.DefinePrim(PRIM, TYPE)
     types = Sdf.ValueTypeNames
     scales = np.exp(np.clip(gaussians.log_scales, -103.0, 88.0))
-    unit = conventions.unit_quaternions(gaussians.quaternions)
+    unit = packing.unit_quaternions(gaussians.quaternions).astype(np.float32)
     reach = 3 * scales.max(axis=1, keepdims=True)
     extent = np.stack([(gaussians.means - reach).min(axis=0), (gaussians.means + reach).max(axis=0)])
     vectors, floats = Vt.Vec3fArray, Vt.FloatArray
@@ -215,7 +214,7 @@ def _author(stage: Any, gaussians: Gaussians, up_axis: str, meters_per_unit: flo
         ("positions", types.Point3fArray, vectors, gaussians.means),
         ("orientations", types.QuatfArray, Vt.QuatfArray, unit[:, [1, 2, 3, 0]]),
         ("scales", types.Float3Array, vectors, scales),
-        ("opacities", types.FloatArray, floats, conventions.opacities(gaussians.opacity_logits)),
+        ("opacities", types.FloatArray, floats, packing.opacities(gaussians.opacity_logits).astype(np.float32)),
         (COEFFICIENTS, types.Float3Array, vectors, gaussians.sh.reshape(-1, 3)),
         ("extent", types.Float3Array, vectors, extent.astype(np.float32)),
     ):
