@@ -18,7 +18,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.rendering import Renderer
 from clsplat.scene import load_scene
-from clsplat.shading import RenderOptions, Task, shade
+from clsplat.shading import FrameShader, RenderOptions, Task
 from clsplat.training import train
 
 Array = NDArray[np.float32]
@@ -64,16 +64,16 @@ BOUNDS = np.array([2.0, 3.5, 6.0], np.float32)
 
 
 def pictures_of(device: Device) -> dict[str, dict[str, str]]:
-    """Checksums by kind of camera and channel, in the device's own shape; motion is defined for a pinhole alone."""
+    """Checksums by kind of camera and channel, in the device's own shape."""
     gaussians, camera = SCENES["cloud"]()
     found = {}
     for kind in ("perspective", "equirectangular", "fisheye"):
         focal = {"equirectangular": camera.width / (2 * np.pi), "fisheye": 0.3 * camera.width}.get(kind)
         view = camera if focal is None else replace(camera, fx=focal, fy=focal, projection=kind)  # type: ignore[arg-type]
         after = replace(view, translation=view.translation + np.array([-0.0625, 0.03125, 0.125]))
-        wanted = [name for name in CHANNELS[:-1] if kind == "perspective" or name != "motion"]
         renderer = Renderer(device)
-        layers = shade(renderer, gaussians, Task(1, "1", view, Path(), after), RenderOptions(channels=tuple(wanted)))
+        shader = FrameShader(renderer, gaussians, RenderOptions(channels=CHANNELS[:-1]))
+        layers = shader(Task(1, "1", view, Path(), after)).layers
         layers["deep"] = renderer.render_deep(gaussians, view, BOUNDS)
         found[kind] = {name: checksum([np.ascontiguousarray(values)]) for name, values in layers.items()}
     return found

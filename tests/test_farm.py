@@ -113,7 +113,7 @@ def test_a_worker_is_killed_half_way(shot: list[str], whole: dict[str, bytes], t
 def test_ctrl_c_of_a_terminal(shot: list[str], tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="the extra `farm` brings it")
     line = [sys.executable, "-m", "clsplat", "render", *shot, "-o", str(tmp_path / "a.####.exr"), "--workers", "2"]
-    line += ["--progress", "json", "--width", "480"]
+    line += ["--progress", "json", "--width", "1600"]  # large enough that there are frames left
     process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stdout is not None
     process.stdout.readline()
