@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.colour import recorded_space
-from clsplat.files import open_input
+from clsplat.files import is_file, open_input
 from clsplat.formats import format_of, model_path, packing, ply
 from clsplat.gaussians import Float32, Gaussians
 
@@ -37,9 +37,10 @@ def model_info(path: Path) -> dict[str, Any]:
 
 
 def size(path: Path) -> int:
-    """Bytes of the file, with those beside it that a meta.json names."""
-    beside = [path] if path.name != "meta.json" else [path, *path.parent.glob("*.webp")]
-    return sum(each.stat().st_size for each in beside)
+    """Bytes of the file, with the pictures beside a meta.json and the .bin beside a .gltf."""
+    beside = path.parent.glob("*.webp") if path.name == "meta.json" else ()
+    binary = [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
+    return sum(each.stat().st_size for each in (path, *beside, *binary) if is_file(each))
 
 
 def _ply_blocks(path: Path) -> tuple[NDArray[np.float64], Iterator[Gaussians]]:

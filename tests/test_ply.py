@@ -2,6 +2,7 @@
 """Model files: what we write is what every tool reads, what they write we read, what is broken is named."""
 
 import errno
+import time
 import tracemalloc
 import warnings
 from pathlib import Path
@@ -282,3 +283,12 @@ def test_reading_makes_no_second_copy_of_the_file(tmp_path: Path) -> None:
         tracemalloc.stop()
     # three blocks of rows, of 8 MB each: the last, the next, and what reading it has joined. The file has 50 MB.
     assert peak < own + 3 * ply.BLOCK_ROWS * 248 + (2 << 20)
+
+
+@pytest.mark.slow
+def test_a_million_in_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "model.ply"
+    random_gaussians(1_000_000).save(path)
+    start = time.process_time()  # other work on the machine does not count
+    Gaussians.load(path)
+    assert time.process_time() - start < 1

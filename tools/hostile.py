@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -75,9 +76,9 @@ def make_cloud(folder: Path, form: str) -> None:
     (folder / "cloud.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + body)
 
 
-def make_model(folder: Path, name: str) -> None:
-    """A model file of another format."""
-    formats.save(folder / name, _gaussians())
+def make_model(folder: Path, name: str, **options: Any) -> None:
+    """A model file of another format; options of its writer."""
+    formats.save(folder / name, _gaussians(), **options)
 
 
 def make_ksplat(folder: Path) -> None:
@@ -471,7 +472,37 @@ _ALL += tuple(
     for name, kinds in (
         ("model.splat", (*BYTES, *PLACES)),
         ("model.compressed.ply", (*BYTES, *LINES, *PLACES)),
+        ("model.spz", (*BYTES, *PLACES)),
+        ("model.sog", (*BYTES, *PLACES)),
+        ("model.glb", (*BYTES, *PLACES)),
+        *((f"model.{each}", (*BYTES, *LINES, *PLACES)) for each in ("usda", "usdc") if find_spec("pxr")),
     )
+)
+_ALL += (
+    Reader(
+        "model-spz-2",
+        partial(make_model, name="model.spz", version=2),
+        lambda f: read_model(f / "model.spz"),
+        ("model.spz",),
+        (*BYTES, *PLACES),
+        2,
+    ),
+    Reader(
+        "gltf",
+        partial(make_model, name="model.gltf"),
+        lambda f: read_model(f / "model.gltf"),
+        ("model.gltf", "model.bin"),
+        (*BYTES, *LINES, "json", *PLACES),
+        3,
+    ),
+    Reader(
+        "sog-folder",
+        partial(make_model, name="meta.json"),
+        lambda f: read_model(f / "meta.json"),
+        ("meta.json", "means_l.webp", "quats.webp", "sh0.webp", "shN_centroids.webp"),
+        (*BYTES, *LINES, "json", *PLACES),
+        3,
+    ),
 )
 _ALL += (
     Reader("ksplat", make_ksplat, lambda f: read_model(f / "model.ksplat"), ("model.ksplat",), (*BYTES, *PLACES), 2),

@@ -97,7 +97,7 @@ class Asset:
 
     def integer(self, holder: dict[str, Any], key: str, default: int | None = None) -> int:
         value = holder.get(key, default)
-        if not isinstance(value, int) or not 0 <= value < 1 << 62:
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 62:
             raise InputError(f"{self.path}: {key} is {str(value)[:40]!r}, expected a number from 0 on")
         return value
 
@@ -300,7 +300,10 @@ def _real(values: Array) -> NDArray[np.float32]:
 def _map(path: Path, start: int, size: int) -> NDArray[np.uint8]:
     if size == 0:
         return np.empty(0, np.uint8)
-    return np.memmap(path, np.uint8, "r", start, (size,))
+    try:
+        return np.memmap(path, np.uint8, "r", start, (size,))
+    except OSError as error:  # more than there is room for in addresses
+        raise InputError(f"{path}: {size} bytes cannot be read ({error.strerror})") from None
 
 
 def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, int] | None]:

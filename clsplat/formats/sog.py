@@ -33,7 +33,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError, plain
-from clsplat.files import MAX_DOCUMENT, atomic_writer, open_input, parse_json, read_document
+from clsplat.files import MAX_DOCUMENT, atomic_writer, is_file, open_input, parse_json, read_document
 from clsplat.formats import packing
 from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
@@ -105,7 +105,7 @@ class _Files:
             found = folder
         if found.parent != folder:
             raise InputError(f"{self.path}: has a picture {name[:80]!r}, expected one beside it")
-        if not found.is_file():
+        if not is_file(found):
             raise InputError(f"{self.path}: its picture {name} is missing")
         self.size += found.stat().st_size
         return found
