@@ -382,12 +382,15 @@ def parse(arguments: Sequence[str]) -> Verb:
     elif isinstance(verb, Bench) and verb.preset != "default":
         bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False)
         verb = _tyro(Bench, arguments[1:], prog="clsplat bench", default=bench)
-    elif isinstance(verb, Render):
+    elif isinstance(verb, Render) and (verb.preset is not None or verb.model.is_dir()):
+        from clsplat.formats import model_path
         from clsplat.runs import Run, is_run
 
-        if verb.preset is None and not is_run(verb.model):
-            return verb
-        bundle = PRESETS[verb.preset] if verb.preset else Run.open(verb.model).config.rasterizer
+        bundle = RasterizerConfig()
+        if verb.preset is not None:
+            bundle = PRESETS[verb.preset]
+        elif is_run(verb.model) or model_path(verb.model) == verb.model:  # refused, if it is neither
+            bundle = Run.open(verb.model).config.rasterizer
         if bundle != RasterizerConfig():
             unset: dict[str, Any] = dict.fromkeys(
                 ("alpha", "deep", "json", "skip_existing", "dry_run", "profile"), False

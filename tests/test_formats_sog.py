@@ -20,6 +20,7 @@ from clsplat.errors import InputError
 from clsplat.formats import packing, sog
 from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.gaussians import Gaussians
+from clsplat.model_info import size
 
 SAME = {"means": 2e-6, "rotations": 2e-6, "log_scales": 0, "sh0": 0, "sh": 0, "opacities": 0.0011}
 """float32's rounding; opacities of 0 and 255 count as a quarter of a step from the end here, as the end there."""
@@ -216,6 +217,16 @@ def test_lies(tmp_path: Path, lie: str) -> None:
     (tmp_path / "quats.webp").write_bytes((folder / "quats.webp").read_bytes())
     change(folder, LIES[lie])
     assert assert_refused_or_sound(sog.read, folder / "meta.json")
+
+
+def test_a_picture_that_is_a_link_to_itself(tmp_path: Path) -> None:
+    path = tmp_path / "meta.json"
+    sog.write(path, lopsided(20, degree=0))
+    (tmp_path / "quats.webp").unlink()
+    (tmp_path / "quats.webp").symlink_to("quats.webp")
+    with pytest.raises(InputError, match=r"its picture quats\.webp is missing"):
+        sog.read(path)
+    assert size(path) > 0
 
 
 def test_an_archive_cannot_unpack_to_more_than_its_gaussians(tmp_path: Path) -> None:
