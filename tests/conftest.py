@@ -33,6 +33,15 @@ def _label(index: int) -> str:
     return f"{INFOS[index].platform.split()[0]}-{number}"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """With `-n 2 --dist loadgroup`: a driver's tests in one process, so that its kernels are built once, which is what
+    most of the time goes to; else a file's."""
+    for item in items:
+        parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
+        driver = parameters.get("device")
+        item.add_marker(pytest.mark.xdist_group(item.path.stem if driver is None else f"driver {driver}"))
+
+
 @pytest.fixture(scope="session", params=range(len(INFOS)), ids=_label)
 def device(request: pytest.FixtureRequest) -> Device:
     """Each driver in turn, in its own shape."""
