@@ -19,7 +19,7 @@ os.environ.setdefault("CLSPLAT_TRUST_DRIVER", "1")  # the test at a driver's fir
 from browser import browser  # noqa: F401  # a fixture
 from calls import train
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
-from pipeline import shaped
+from pipeline import shaped, shapes_of
 from tiny import CONFIG, short, write_scene
 
 from clsplat.device.context import Device, list_devices, open_device
@@ -38,7 +38,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     most of the time goes to; else a file's."""
     for item in items:
         parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
-        driver = parameters.get("device")
+        driver = parameters["shaped_device"][0] if "shaped_device" in parameters else parameters.get("device")
         item.add_marker(pytest.mark.xdist_group(item.path.stem if driver is None else f"driver {driver}"))
 
 
@@ -54,16 +54,14 @@ def default_device() -> Device:
     return open_device()
 
 
-SHAPES = ((1, 1), (1, 64), (8, 1), (8, 16))
-"""(lanes, items): the scalar loop, a GPU's shape, a CPU's, and a mixture. With 16 lanes and with
-1x256 every driver runs in tools/digests.py."""
+SHAPED = [(index, shape) for index in range(len(INFOS)) for shape in shapes_of(open_device(str(index)))]
 
 
-@pytest.fixture(scope="session", params=SHAPES, ids=lambda shape: f"{shape[0]}x{shape[1]}")
-def shaped_device(device: Device, request: pytest.FixtureRequest) -> Device:
-    """Each driver in each kernel shape."""
-    lanes, items = request.param
-    return shaped(device, lanes, items)
+@pytest.fixture(scope="session", params=SHAPED, ids=lambda of: f"{of[1][0]}x{of[1][1]}-{_label(of[0])}")
+def shaped_device(request: pytest.FixtureRequest) -> Device:
+    """Each driver in kernel shapes."""
+    index, (lanes, items) = request.param
+    return shaped(open_device(str(index)), lanes, items)
 
 
 @pytest.fixture(scope="session")

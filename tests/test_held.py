@@ -101,15 +101,15 @@ def test_tolerance(default_device: Device, tolerance: float) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_halves(device: Device, degree: int) -> None:
+def test_halves(default_device: Device, degree: int) -> None:
     gaussians, camera = scenes.random_cloud(1000, 8, 100, 70, degree=degree)
     rounded = gaussians.sh.copy()
     rounded[:, 1:] = rounded[:, 1:].astype(np.float16)
-    renderer = Renderer(device, config=RasterizerConfig(sh_storage="half"))
+    renderer = Renderer(default_device, config=RasterizerConfig(sh_storage="half"))
     got = renderer.render(gaussians, camera).image
-    assert_same_bits(got, whole(device, with_sh(gaussians, rounded), camera))
+    assert_same_bits(got, whole(default_device, with_sh(gaussians, rounded), camera))
     assert held(renderer)["sh_rest"].nbytes == 2 * gaussians.sh[:, 1:].size
-    wanted = whole(device, gaussians, camera)
+    wanted = whole(default_device, gaussians, camera)
     # half a unit of a half's last digit, up to 2^-12 of each coefficient, which |Y| < 1.5 times 15 of them, 0.5 large
     assert np.abs(got - wanted).max() <= 2**-12 * 0.5 * 15 * 1.5
     assert degree == 0 or not np.array_equal(got, wanted)

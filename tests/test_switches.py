@@ -163,11 +163,19 @@ def test_exact_switches_change_no_bit(default_device: Device, switch: str, name:
 
 @pytest.mark.parametrize("extent", ["opacity", "constant", "3sigma"])
 @pytest.mark.parametrize("name", ["off_frustum", "sheaf", "cloud"])
-def test_culling_that_is_off_lists_more_gaussians(device: Device, name: str, extent: Any) -> None:
-    config = RasterizerConfig(extent=extent)
+def test_culling_that_is_off_lists_more_gaussians(default_device: Device, name: str, extent: Any) -> None:
+    check_culling(default_device, name, RasterizerConfig(extent=extent), ((False, True), (True, False), (False, False)))
+
+
+def test_culling_that_is_off_on_every_device(device: Device) -> None:
+    check_culling(device, "sheaf", RasterizerConfig(), ((False, False),))
+
+
+def check_culling(device: Device, name: str, config: RasterizerConfig, ways: tuple[tuple[bool, bool], ...]) -> None:
+    """ways: whether those beside the frustum are culled, and those that are too faint; the last is neither."""
     default = run(device, name, config)
     in_front = default.frame.part.counted.visible
-    for frustum, opacity in ((False, True), (True, False), (False, False)):
+    for frustum, opacity in ways:
         got = run(device, name, replace(config, frustum_cull=frustum, opacity_cull=opacity))
         assert_same_bits(got.frame.blended.image.get(), default.frame.blended.image.get())
         projected, counted = got.frame.projected, got.frame.part.counted

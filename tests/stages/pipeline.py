@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import upload
-from clsplat.device.context import Device
+from clsplat.device.context import Device, open_device
 from clsplat.device.layout import SPLAT, TILE, SlotFields
 from clsplat.gaussians import Gaussians
 from clsplat.rendering import Frame, Rasterizer
@@ -26,6 +26,13 @@ from clsplat.stages.project import (
 )
 
 BACKGROUND = (0.1, 0.2, 0.3)
+
+
+def shapes_of(device: Device, *more: tuple[int, int]) -> tuple[tuple[int, int], ...]:
+    """(lanes, items) that a driver is tested in: a CPU's shape, a GPU's; the default driver also in the scalar loop, in
+    a mixture, and in `more`. Building takes most of the time. Each driver in each shape: tools/digests.py."""
+    both = (8, 1), (1, 64)
+    return (*both, (1, 1), (8, 16), *more) if device is open_device() else both
 
 
 @cache
