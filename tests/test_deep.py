@@ -13,7 +13,7 @@ import pytest
 import scenes
 from compare import assert_close, assert_same_bits
 from numpy.typing import NDArray
-from pipeline import shaped
+from pipeline import shaped, shapes_of
 
 from clsplat.camera import Camera, Window
 from clsplat.colour import LINEAR, Colours
@@ -81,8 +81,8 @@ def test_against_the_twin(shaped_device: Device, name: str) -> None:
 def test_the_same_bits_in_every_shape(device: Device) -> None:
     gaussians, camera = scenes.random_cloud(2000, 8, 150, 100)
     bounds = bin_bounds(gaussians, camera, DeepConfig(bins=7))
-    shapes = ((8, 1), (1, 1), (1, 64), (4, 1), (8, 16))
-    first, *others = (render_deep(Renderer(shaped(device, *shape)), gaussians, camera, bounds) for shape in shapes)
+    renderers = (Renderer(shaped(device, *shape)) for shape in shapes_of(device, (4, 1)))
+    first, *others = (render_deep(renderer, gaussians, camera, bounds) for renderer in renderers)
     for other in others:
         assert_same_bits(other, first)
 
