@@ -118,6 +118,9 @@ class Server:
         server.request_share_url = lambda *_, **__: None  # a page may not ask for a tunnel out of this machine
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
         server.scene.set_up_direction(world.start.up)
+        # nothing in the scene is lit: filtering a sky and drawing shadows would hold up a browser without a GPU
+        server.scene.configure_environment_map(hdri=None)
+        server.scene.configure_default_lights(cast_shadow=False)
         begin, start = server.initial_camera, world.start
         begin.position, begin.look_at = start.position - world.origin, start.target - world.origin
         begin.up, begin.fov = start.up, start.fov
