@@ -183,6 +183,23 @@ def test_pictures(extension: str, bits: int, tmp_path: Path) -> None:
         np.testing.assert_allclose(pixels[:, :, 3], 0.5, atol=tolerance)
 
 
+@pytest.mark.parametrize("bits", [8, 16])
+def test_every_step_of_a_picture(bits: int, tmp_path: Path) -> None:
+    """What lies nearest a step becomes it; what is no colour the least or the largest."""
+    most, count = 2**bits - 1, 16
+    steps = np.linspace(0, most, count * count).round().reshape(count, count)
+    rgb = np.stack([steps, np.maximum(steps - 0.49, 0), np.minimum(steps + 0.49, most)], axis=2) / most
+    rgb[0, :4, 0] = (np.nan, -np.inf, -1e38, -0.0)
+    rgb[1, :3, 0] = (np.inf, 3.4e38, 1.0)
+    wanted = np.repeat(steps[:, :, None], 3, axis=2)
+    wanted[0, :4, 0], wanted[1, :3, 0] = 0, most
+    planes = np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32)  # as they come from a device
+    for layer in (planes.transpose(1, 2, 0), np.ascontiguousarray(planes.transpose(1, 2, 0))):
+        write_layers(tmp_path / "a.png", {"rgb": layer}, Encoding(bits=bits))
+        found = oiio.ImageInput.open(str(tmp_path / "a.png")).read_image(oiio.UINT8 if bits == 8 else oiio.UINT16)
+        np.testing.assert_array_equal(found, wanted)
+
+
 def test_channels_by_name() -> None:
     assert parse_channels("depth, rgb") == ("rgb", "depth")
     for text, message in (("rgb,colour", "has 'colour', expected some of rgb, alpha"), (" ,", "is empty")):
