@@ -67,8 +67,10 @@ def pictures_of(device: Device) -> dict[str, dict[str, str]]:
     """Checksums by kind of camera and channel, in the device's own shape."""
     gaussians, camera = SCENES["cloud"]()
     found = {}
-    for kind in ("perspective", "equirectangular", "fisheye"):
-        focal = {"equirectangular": camera.width / (2 * np.pi), "fisheye": 0.3 * camera.width}.get(kind)
+    width = camera.width
+    focals = {"orthographic": 0.2 * width, "equirectangular": width / (2 * np.pi), "fisheye": 0.3 * width}
+    for kind in ("perspective", *focals):
+        focal = focals.get(kind)
         view = camera if focal is None else replace(camera, fx=focal, fy=focal, projection=kind)  # type: ignore[arg-type]
         after = replace(view, translation=view.translation + np.array([-0.0625, 0.03125, 0.125]))
         renderer = Renderer(device)

@@ -82,7 +82,7 @@ def test_a_child(tmp_path: Path) -> None:
     told = json.loads(done.stdout.splitlines()[-1])
     assert set(told) == {"frame", "gradient", "pictures"}
     channels = {"deep", *LAYERS}
-    kinds = ("perspective", "equirectangular", "fisheye")
+    kinds = ("perspective", "orthographic", "equirectangular", "fisheye")
     assert {kind: set(each) for kind, each in told["pictures"].items()} == dict.fromkeys(kinds, channels)
     assert (tmp_path / "arrays.npz").exists()
 

@@ -33,10 +33,12 @@ WINDOW = {"width": 1280, "height": 720}
 TURN = 3.0
 """Seconds that the camera moves."""
 FLAGS = {
-    "swiftshader": ("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     "mesa": ("--use-angle=gl-egl", "--ignore-gpu-blocklist"),
+    "swiftshader": ("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 }
-"""What draws WebGL on processors: the library that comes with Chromium, or the system's llvmpipe."""
+"""What draws WebGL on processors: the system's llvmpipe, or the library that comes with Chromium."""
+PLAIN = "--webgl-antialiasing-mode=none"
+"""Without it each pixel of a page is four, which processors feel."""
 WATCH = """
 window.pictures = [];
 for (const kind of [WebGL2RenderingContext, WebGLRenderingContext])
@@ -137,16 +139,14 @@ def visit(browser: Any, url: str, server: int) -> dict[str, float]:
     }
 
 
-def bench(model: Path, device: str | None, repeat: int, webgl: str) -> list[dict[str, float]]:
+def bench(model: Path, device: str | None, repeat: int, flags: tuple[str, ...]) -> list[dict[str, float]]:
     """As many pages."""
     from playwright.sync_api import sync_playwright
 
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     measuring.require(path is not None, "no chromium on the path, expected Debian's: apt install chromium")
     with serving(model, device) as (url, server), sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=path, args=["--no-sandbox", "--use-gl=angle", *FLAGS[webgl]]
-        )
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--use-gl=angle", *flags])
         visit(browser, url, server)  # the browser's own first time
         found = [visit(browser, url, server) for _ in range(repeat)]
         browser.close()
@@ -158,28 +158,30 @@ def main() -> int:
     parser = measuring.options_parser(__doc__)
     parser.add_argument("model", metavar="RUN|MODEL.ply", type=Path, nargs="?")
     parser.add_argument("--gaussians", type=measuring.number, default=100_000)
-    parser.add_argument("--webgl", choices=FLAGS, default="swiftshader", help="what draws the page without a GPU")
+    parser.add_argument("--webgl", choices=FLAGS, default="mesa", help="what draws the page without a GPU")
+    parser.add_argument("--antialiasing", action="store_true", help="as browsers are by default")
     options = parser.parse_args()
     measuring.require(options.repeat >= 1, f"--repeat {options.repeat}: expected at least 1")
+    flags = FLAGS[options.webgl] if options.antialiasing else (*FLAGS[options.webgl], PLAIN)
     with tempfile.TemporaryDirectory() as folder:
         model = options.model
         if model is None:
             model = Path(folder) / "model.ply"
             made_up(options.gaussians).save(model)
         count = len(Gaussians.load(model_file(model)))
-        visits = bench(model, options.device, options.repeat, options.webgl)
+        visits = bench(model, options.device, options.repeat, flags)
     medians = {name: statistics.median(each[name] for each in visits) for name in visits[0]}
     device = open_device(options.device)
     result = {
         **measuring.machine(device, options.repeat),
         "gaussians": count,
-        "webgl": options.webgl,
+        "flags": flags,
         "visits": visits,
         **medians,
     }
     first, moving = (", ".join(f"{each[name]:.2f}" for each in visits) for name in ("first_s", "moving_per_s"))
     lines = [
-        f"{count:,} Gaussians on a page of {WINDOW['width']} x {WINDOW['height']}, WebGL by {options.webgl}",
+        f"{count:,} Gaussians on a page of {WINDOW['width']} x {WINDOW['height']}, Chromium {' '.join(flags)}",
         f"page has a canvas  {medians['canvas_s']:6.2f} s after it was asked for",
         f"first picture      {medians['first_s']:6.2f} s ({first})",
         f"moving             {medians['moving_per_s']:6.2f} pictures a second ({moving})",
