@@ -7,6 +7,8 @@ The models and their formulas are COLMAP's, evaluated by pycolmap (`Camera.img_f
 from __future__ import annotations
 
 import math
+import signal
+import threading
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -23,6 +25,9 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 REFUSED = {"EQUIRECTANGULAR": "a panorama has no pinhole camera; cut it into perspective views first"}
+if threading.current_thread() is threading.main_thread() and (_handler := signal.getsignal(signal.SIGTERM)) is not None:
+    signal.signal(signal.SIGTERM, _handler)  # importing pycolmap has put one there that prints its stack
+
 MAX_SIZE = 1 << 20
 """Pixels a side; larger is a damaged file. Also keeps width times height far from overflow."""
 

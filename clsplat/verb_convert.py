@@ -43,6 +43,8 @@ def convert(verb: Convert) -> int:
     check(verb)
     matrix = similarity(verb)
     written_by = format_of_name(verb.target, writable=True)
+    if not verb.target.parent.is_dir():
+        raise InputError(f"{verb.target.parent}: no such folder, expected one for {verb.target.name}")
     original = load(source)
     edited = original if not verb.merge else edit.merge([original, *(load(_file(path)) for path in verb.merge)])
     edited = _thinned(verb, edited)

@@ -147,6 +147,13 @@ def test_wrong_calls_are_one_line_and_write_nothing(
     assert not target.exists()
 
 
+def test_a_folder_that_is_not_there(model: Path, capsys: Capture) -> None:
+    target = model.parent / "none" / "out.ply"
+    assert convert(model, target) == 2
+    assert capsys.readouterr().err == f"clsplat: error: {target.parent}: no such folder, expected one for out.ply\n"
+    assert not target.parent.exists()
+
+
 def test_the_colour_space_goes_along_or_is_told(model: Path, capsys: Capture) -> None:
     Gaussians.load(model).save(model, comments=[colour.comment("lin_rec709")])
     for suffix in (".b.ply", ".compressed.ply"):

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -120,3 +123,15 @@ def test_a_fisheye_beyond_180_degrees_is_cut_to_a_pinhole() -> None:
     assert np.isfinite(image).all()
     middle = np.s_[camera.height // 4 : -camera.height // 4, camera.width // 4 : -camera.width // 4]
     assert np.abs(image - pattern(*rays(camera)))[middle].mean() < 0.02
+
+
+def test_reading_cameras_leaves_the_handler_of_sigterm() -> None:
+    """pycolmap puts one there that prints its stack, which a job that is stopped while it begins would show."""
+    code = """
+import os, signal
+signal.signal(signal.SIGTERM, lambda *_: print("taken"))
+import clsplat.undistort
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "taken\n", "")
