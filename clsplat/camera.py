@@ -14,6 +14,8 @@ Float64 = NDArray[np.float64]
 Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
 
 FRAME_CLAMP = 0.3
+LARGEST_FOCAL = 1e12
+"""Pixels: float32 has no digits left of a position long before."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,8 @@ def focal_length(fov: float, size: float, projection: Projection = "perspective"
     """
     if projection == "orthographic":
         raise ValueError("an orthographic camera has no angle of view")
+    if 0 < fov < size / LARGEST_FOCAL:
+        raise ValueError(f"angle of view {math.degrees(fov):g} degrees, for a focal length of over {LARGEST_FOCAL:g}")
     if projection == "perspective":
         if not 0 < fov < math.pi:
             raise ValueError(f"angle of view {math.degrees(fov):g} degrees, expected more than 0 and less than 180")

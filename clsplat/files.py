@@ -8,9 +8,12 @@ import json
 import os
 import re
 import secrets
+import socket
 import stat
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,7 +22,32 @@ from clsplat.errors import InputError
 TEMPORARY_SUFFIX = ".clsplat-tmp"
 MAX_DOCUMENT = 32 << 20
 """Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
-_TEMPORARY = re.compile(rf"\.(.+)\.[0-9a-f]{{12}}{re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
+ABANDONED = 600.0
+"""Seconds without a write after which a temporary file of another machine is nobody's any more."""
+_TEMPORARY = re.compile(rf"\.(.+)\.([0-9a-f]{{20}}){re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
+
+
+@cache
+def _machine() -> str:
+    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:4]
+
+
+def temporary_name(target: Path) -> Path:
+    """A new name beside a file, which says what machine and process writes there."""
+    token = f"{_machine()}{os.getpid():08x}{secrets.token_hex(4)}"
+    return target.with_name(f".{target.name}.{token}{TEMPORARY_SUFFIX}")
+
+
+def _is_abandoned(path: Path, token: str) -> bool:
+    if token[:4] == _machine() and os.name == "posix":
+        try:
+            os.kill(int(token[4:12], 16), 0)
+        except (ProcessLookupError, OverflowError):
+            return True
+        except PermissionError:
+            pass
+        return False
+    return time.time() - path.stat().st_mtime > ABANDONED
 
 
 @contextmanager
@@ -31,7 +59,7 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     `write` do, with the name `path`; the temporary file is removed on any exception, KeyboardInterrupt included.
     """
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+    temporary = temporary_name(target)
     try:
         # "x" and no mkstemp: the file gets the permissions that the user's umask gives any new file.
         with open(temporary, "xb") as file:
@@ -55,8 +83,9 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
         file.write(data)
 
 
-def temporaries(targets: Iterable[Path]) -> list[Path]:
-    """The temporary files that writers of these files have left, or are writing still."""
+def abandoned(targets: Iterable[Path]) -> list[Path]:
+    """The temporary files that writers of these files have left: their process has ended, or they are of another
+    machine and have not been written to for ABANDONED seconds."""
     names: dict[Path, set[str]] = {}
     for target in targets:
         real = Path(os.path.realpath(target))
@@ -66,8 +95,8 @@ def temporaries(targets: Iterable[Path]) -> list[Path]:
         with suppress(OSError):
             for entry in os.scandir(folder):
                 match = _TEMPORARY.fullmatch(entry.name)
-                if match and match[1] in wanted:
-                    found.append(Path(entry.path))
+                if match and match[1] in wanted and _is_abandoned(path := Path(entry.path), match[2]):
+                    found.append(path)
     return sorted(found)
 
 

@@ -9,7 +9,6 @@ unassociated in PNG, associated (premultiplied) in EXR.
 from __future__ import annotations
 
 import os
-import secrets
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import TEMPORARY_SUFFIX, is_file, open_input
+from clsplat.files import is_file, open_input, temporary_name
 
 Float32 = NDArray[np.float32]
 Metadata = Mapping[str, str | int | float]
@@ -340,7 +339,7 @@ def atomic_output(path: Path, specs: Sequence[Any], kind: str) -> Iterator[Outpu
     specs: of its parts; raises ClsplatError if writing fails."""
     # Not through files.atomic_writer: OpenImageIO writes to a name, not to an open file.
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+    temporary = temporary_name(target)
     output = Output(oiio.ImageOutput.create(kind), str(temporary), path)
     try:
         # several parts have to be announced together

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from clsplat import layers
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.files import temporaries
+from clsplat.files import abandoned
 from clsplat.frames import output_paths
 from clsplat.paths import Shot
 from clsplat.picture_config import DEEP_STRIP_FLOATS, STRIP_PIXELS, SamplingConfig, VideoConfig
@@ -122,8 +122,8 @@ def make_folders(tasks: Sequence[Task]) -> None:
 
 
 def remove_temporaries(tasks: Sequence[Task]) -> None:
-    """Remove what a killed job has left of these files, and nothing else's."""
-    for path in temporaries(task.path for task in tasks):
+    """Remove what a killed job has left of these files, and nothing that somebody still writes."""
+    for path in abandoned(task.path for task in tasks):
         with suppress(OSError):
             path.unlink()
 

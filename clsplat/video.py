@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Iterable
 from contextlib import suppress
 from fractions import Fraction
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import TEMPORARY_SUFFIX
+from clsplat.files import temporary_name
 from clsplat.layers import VIDEO
 from clsplat.picture_config import VideoConfig
 
@@ -83,7 +82,7 @@ class VideoWriter:
         check_video(path)
         self._path = path
         self._target = Path(os.path.realpath(path))
-        self._temporary = self._target.with_name(f".{self._target.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+        self._temporary = temporary_name(self._target)
         self._container: Any = None
         self._stream: Any = None
         self._size = (0, 0)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import fields, is_dataclass
@@ -12,6 +13,7 @@ import pytest
 
 from clsplat.cli import main
 from clsplat.config import TrainConfig
+from clsplat.files import temporary_name
 
 Capture = pytest.CaptureFixture[str]
 
@@ -57,3 +59,12 @@ def one_error(capfd: Capture) -> str:
     assert captured.err.startswith("clsplat: error: "), captured.err
     assert captured.err.count("\n") == 1, captured.err
     return captured.err
+
+
+def left_behind(target: Path) -> str:
+    """Write what one who was killed while writing this file leaves beside it; its name."""
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    name = temporary_name(target).name.replace(f"{os.getpid():08x}", f"{ended.pid:08x}")
+    target.with_name(name).write_bytes(b"half")
+    return name

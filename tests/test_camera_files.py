@@ -88,6 +88,10 @@ def test_camera_path_of_other_cameras(tmp_path: Path) -> None:
         ({"camera_path": [{"camera_to_world": POSE}]}, "key 0: has no 'fov'"),
         ({"camera_path": [{"camera_to_world": POSE, "fov": 180}]}, "key 0: 'fov' is 180, expected the vertical angle"),
         ({"camera_path": [{"camera_to_world": POSE, "fov": 10**400}]}, "'fov' is 1000"),
+        (
+            {"camera_path": [{"camera_to_world": POSE, "fov": 1e-320}]},
+            "key 0: 'fov': angle of view 9.90602e-321 degrees",
+        ),
     ],
 )
 def test_camera_paths_that_cannot_be(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -233,6 +237,9 @@ def test_lenses_of_own_format(tmp_path: Path) -> None:
         ({"fov_x": 180}, "key 0: 'fov_x': angle of view 180 degrees, expected more than 0 and less than 180"),
         ({"fov_x": 361, "projection": "fisheye"}, "'fov_x': angle of view 361 degrees, expected more than 0 and at"),
         ({"fov_x": -5}, "key 0: has 'fov_x' -5, expected more than 0"),
+        ({"fov_x": 1e-320}, "key 0: 'fov_x': angle of view 9.90602e-321 degrees, for a focal length of over 1e+12"),
+        ({"fov_x": None, "fx": 1e13}, "key 0: a focal length of 1e+13, expected at most 1e+12"),
+        ({"projection": "equirectangular", "fov_x": 1e-320}, "key 0: a focal length of inf, expected at most 1e+12"),
         ({"projection": "orthographic"}, "key 0: has 'fov_x' 90, expected one of 'fx' (with 'fy' if that differs), 'p"),
         ({"projection": "equirectangular", "fov_x": 400}, "expected of an equirectangular camera at most 'fov_x' up"),
         ({"projection": "equirectangular", "fov_x": 0}, "expected of an equirectangular camera at most 'fov_x' up"),

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from calls import Capture, error_line
+from calls import Capture, error_line, left_behind
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
 from clsplat import farm
@@ -135,7 +135,7 @@ def cluster() -> Iterator[Any]:
 
 
 def test_an_existing_cluster(shot: list[str], whole: dict[str, bytes], cluster: Any, tmp_path: Path) -> None:
-    (tmp_path / ".a.0005.exr.0123456789ab.clsplat-tmp").write_bytes(b"")
+    left_behind(tmp_path / "a.0005.exr")
     assert render(shot, tmp_path, "--scheduler", cluster.scheduler_address, "--frames", "1-9") == 0
     (tmp_path / "a.0004.exr").unlink()
     assert render(shot, tmp_path, "--scheduler", cluster.scheduler_address, "--frames", "1-9", "--skip-existing") == 0

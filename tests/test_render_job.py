@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from calls import left_behind
 from scenes import tilted_camera
 
 from clsplat import render_job
 from clsplat.camera import Camera
 from clsplat.errors import ClsplatError, InputError
+from clsplat.files import temporary_name
 from clsplat.framing import Layers
 from clsplat.layers import LAYERS, Encoding
 from clsplat.paths.shot import Frame, Shot, numbered
@@ -299,9 +301,15 @@ def test_a_file_is_complete_or_not(extension: str, parts: Any, tmp_path: Path, c
 
 def test_stale_temporaries_of_the_shot_alone_go(tmp_path: Path) -> None:
     tasks = tasks_in(tmp_path, 3)
-    others = [".a.0004.exr.0123456789ab.clsplat-tmp", ".a.0002.exr.clsplat-tmp", "a.0002.exr", ".a.0002.exr.swp"]
-    for name in [*others, ".a.0002.exr.0123456789ab.clsplat-tmp", ".a.0003.exr.ba9876543210.clsplat-tmp"]:
+    mine = temporary_name(tmp_path / "a.0002.exr").name  # somebody still writes it
+    elsewhere, old = (f".a.0002.exr.{token * 5}.clsplat-tmp" for token in ("0123", "fedc"))  # of other machines
+    others = [mine, elsewhere, ".a.0002.exr.clsplat-tmp", "a.0002.exr", ".a.0002.exr.swp"]
+    for name in [*others, old]:
         (tmp_path / name).write_bytes(b"x")
+    os.utime(tmp_path / old, (0, 0))
+    left_behind(tmp_path / "a.0002.exr")
+    left_behind(tmp_path / "a.0003.exr")
+    others.append(left_behind(tmp_path / "a.0004.exr"))
     render_job.remove_temporaries(tasks)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
     render_job.remove_temporaries(tasks_in(tmp_path / "none", 3))

@@ -18,6 +18,8 @@ import os
 import shutil
 import tempfile
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +61,22 @@ def recognises(head: bytes) -> bool:
 
 def describe(path: Path) -> dict[str, Any]:
     """What the stage says of its axes and units, which move nothing here."""
+    stage = _open(path)
     from pxr import UsdGeom
 
-    stage = _open(path)
-    return {"up_axis": str(UsdGeom.GetStageUpAxis(stage)), "meters_per_unit": UsdGeom.GetStageMetersPerUnit(stage)}
+    with readable(path):
+        return {"up_axis": str(UsdGeom.GetStageUpAxis(stage)), "meters_per_unit": UsdGeom.GetStageMetersPerUnit(stage)}
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Raises InputError for what USD's bindings raise for the names and values of a damaged file."""
+    from pxr import Tf
+
+    try:
+        yield
+    except (Tf.ErrorException, UnicodeDecodeError, TypeError, ValueError, RuntimeError):
+        raise InputError(f"{path}: has values that USD cannot read; is it damaged?") from None
 
 
 def _open(path: Path) -> Any:
@@ -90,12 +104,12 @@ def _open(path: Path) -> Any:
 def read(path: Path) -> Gaussians:
     """Read every prim of Gaussians of a stage, at its first time, as one model. Raises InputError."""
     stage = _open(path)
-    from pxr import Tf, Usd, UsdGeom
+    from pxr import Usd, UsdGeom
 
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
     parts = []
-    try:
+    with readable(path):
         for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
             if prim.GetTypeName() not in TYPES:
                 continue
@@ -104,9 +118,6 @@ def read(path: Path) -> Gaussians:
             # USD's vectors are rows, so its matrices are the transposes of ours
             matrix = np.array(transforms.GetLocalToWorldTransform(prim), np.float64).T
             parts.append(conventions.place(part, matrix, where))
-    except (Tf.ErrorException, UnicodeDecodeError, TypeError, ValueError, RuntimeError):
-        # what its bindings raise for the names and values of a damaged file
-        raise InputError(f"{path}: has values that USD cannot read; is it damaged?") from None
     if not parts:
         raise InputError(f"{path}: has no {TYPE} in it, expected at least one")
     model = merge(parts)

@@ -11,7 +11,7 @@ from typing import Any, cast, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera, Projection, focal_length
+from clsplat.camera import LARGEST_FOCAL, Camera, Projection, focal_length
 from clsplat.colmap import rotation_from_quaternion
 from clsplat.errors import InputError
 from clsplat.paths.keys import Key, interpolate
@@ -115,6 +115,8 @@ def _camera(keys: Keys) -> Camera:
     if not 0 < near < far:
         raise InputError(f"{keys.path}: 'near' is {near:g} and 'far' {far:g}, expected 0 < near < far")
     fx, fy = _focal(keys, projection, width, height)
+    if not max(fx, fy) <= LARGEST_FOCAL:
+        raise InputError(f"{keys.where}: a focal length of {max(fx, fy):g}, expected at most {LARGEST_FOCAL:g}")
     cx, cy = _principal(keys, width, height)
     rotation = _rotation(keys).T
     position = _vector(keys, "position", 3)

@@ -67,5 +67,8 @@ def _camera(keys: Keys, projection: Projection, width: int, height: int) -> Came
         if degrees is None or not 0 < degrees < 180:
             found = "has no 'fov'" if degrees is None else f"'fov' is {degrees:g}"
             raise InputError(f"{keys.where}: {found}, expected the vertical angle of view, 0 to 180 degrees")
-        fx = fy = focal_length(math.radians(degrees), height)
+        try:
+            fx = fy = focal_length(math.radians(degrees), height)
+        except ValueError as error:
+            raise InputError(f"{keys.where}: 'fov': {error}") from None
     return Camera(width, height, fx, fy, width / 2, height / 2, rotation, translation, projection=projection)

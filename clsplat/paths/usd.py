@@ -15,6 +15,7 @@ import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
+from clsplat.formats.usd import readable
 from clsplat.paths.shot import MOST_FRAMES, Frame, Shot
 from clsplat.transforms import opengl_pose
 
@@ -45,16 +46,17 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
         raise InputError(
             f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more"
         ) from None
-    camera = _find(path, [UsdGeom.Camera(each) for each in stage.Traverse() if each.IsA(UsdGeom.Camera)], prim)
-    where = f"{path}: {camera.GetPath()}"
-    codes = _time_codes(where, stage, camera)
-    horizontal, vertical = _aperture(where, camera, codes[0])
-    width, height = _size(path, stage, size, horizontal / vertical)
-    start, per_second = codes[0], float(stage.GetTimeCodesPerSecond())
-    frames = []
-    for code in codes:
-        time = None if len(codes) == 1 or per_second <= 0 else (code - start) / per_second
-        frames.append(Frame(code, _camera(f"{where} at {code}", camera, code, width, height), f"{code:04d}", time))
+    with readable(path):
+        camera = _find(path, [UsdGeom.Camera(each) for each in stage.Traverse() if each.IsA(UsdGeom.Camera)], prim)
+        where = f"{path}: {camera.GetPath()}"
+        codes = _time_codes(where, stage, camera)
+        horizontal, vertical = _aperture(where, camera, codes[0])
+        width, height = _size(path, stage, size, horizontal / vertical)
+        start, per_second = codes[0], float(stage.GetTimeCodesPerSecond())
+        frames = []
+        for code in codes:
+            time = None if len(codes) == 1 or per_second <= 0 else (code - start) / per_second
+            frames.append(Frame(code, _camera(f"{where} at {code}", camera, code, width, height), f"{code:04d}", time))
     # without the end of the line, where USD has the stage's address in memory
     told = [each.commentary.split(" (instantiating")[0] for each in diagnostics.TakeUncoalescedDiagnostics()]
     return Shot(tuple(frames), tuple(f"{path}: USD says: {' '.join(line.split())}" for line in told[:3]))
