@@ -26,7 +26,7 @@ from clsplat.device.program import BREAK
 from clsplat.device.shapes import Shape, saved_path, shape_of
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import DeviceError
-from clsplat.files import atomic_write
+from clsplat.files import atomic_write, parse_json
 from clsplat.selftest_result import FORWARD, MARK, STAGES, TRAINING, Result
 
 PATIENCE = 300.0
@@ -160,12 +160,13 @@ def memory_path() -> Path:
 
 
 def _remembered() -> dict[str, list[str]]:
-    """By device, driver, shape and kernels: the stages that passed. A file that is none of ours counts as empty."""
+    """By device, driver, shape and kernels: the stages that passed. What is none of ours counts as not there."""
     try:
-        saved = json.loads(memory_path().read_text())
+        saved = parse_json(memory_path().read_bytes())
     except (OSError, ValueError):
         return {}
-    return saved if isinstance(saved, dict) else {}
+    entries = saved.items() if isinstance(saved, dict) else ()
+    return {key: names for key, names in entries if isinstance(names, list) and set(map(type, names)) <= {str}}
 
 
 def _key(device: Any, shape: Shape) -> str:

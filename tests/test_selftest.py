@@ -310,6 +310,26 @@ def test_a_memory_that_is_broken_or_read_only(
         trust.require(default_device, FORWARD)
 
 
+@pytest.mark.parametrize("names", [1, None, "blend", [1], [["blend"]], {"blend": 1}])
+def test_a_memory_with_an_entry_of_another_kind(
+    names: object, untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = counted(monkeypatch)
+    trust.require(default_device, FORWARD)
+    (key,) = whole = json.loads(untrusting.read_text())
+    untrusting.write_text(json.dumps({key: names}))
+    trust.require(default_device, FORWARD)
+    assert len(made) == 2
+    assert json.loads(untrusting.read_text()) == whole
+
+
+@pytest.mark.parametrize("text", [b"\xff", b"[" * 100_000, b"1" * 5000, b"null"])
+def test_a_memory_that_does_not_parse(text: bytes, untrusting: Path) -> None:
+    untrusting.parent.mkdir(parents=True)
+    untrusting.write_bytes(text)
+    assert trust._remembered() == {}
+
+
 def test_other_bits_are_a_warning(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BREAK, "arithmetic: x / y => (x / y) * 1.00000012f")
     with pytest.warns(UserWarning, match=r"its bits are not those of other devices in arithmetic: .* division"):
