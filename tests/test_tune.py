@@ -72,6 +72,15 @@ def test_a_shape_that_makes_no_sense(text: str, monkeypatch: pytest.MonkeyPatch,
     assert f"CLSPLAT_SHAPE={text}: expected LANESxITEMS" in capsys.readouterr().err
 
 
+def test_a_shape_that_is_too_large_for_the_device(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = default_device.cl_device
+    save_shape(device, replace(default_shape(device), items=1 << 20))
+    assert shape_of(device) == default_shape(device)
+    monkeypatch.setenv("CLSPLAT_SHAPE", "1x1048576")
+    with pytest.raises(DeviceError, match=r"CLSPLAT_SHAPE=1x1048576: .* has at most [0-9]+ items in a work-group"):
+        shape_of(device)
+
+
 @pytest.mark.parametrize("content", ["no JSON", "[]", '{"a": 1}'])
 def test_a_broken_file_is_passed_over(content: str, default_device: Device) -> None:
     saved_path().parent.mkdir(parents=True)

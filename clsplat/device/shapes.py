@@ -81,10 +81,13 @@ def shape_of(device: cl.Device) -> Shape:
     text = os.environ.get("CLSPLAT_SHAPE")
     if not text:
         text = saved_shapes().get(_key(device), "")
-        return _parsed(text, default) or default
+        shape = _parsed(text, default)
+        return default if shape is None or shape.items > device.max_work_group_size else shape
     shape = _parsed(text, default)
     if shape is None:
         raise DeviceError(f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16")
+    if shape.items > (most := device.max_work_group_size):
+        raise DeviceError(f"CLSPLAT_SHAPE={text}: {device.name.strip()} has at most {most} items in a work-group")
     return shape
 
 
