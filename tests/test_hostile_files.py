@@ -33,6 +33,7 @@ from hostile import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from spoilers import SPOILERS
 from stress_files import stress, verdict
 
 from clsplat import colmap, images, runs, sfm, transforms
@@ -129,6 +130,15 @@ def test_a_crash_and_a_loop_are_failures(tmp_path: Path, monkeypatch: pytest.Mon
     troubles = " ".join(trouble for _, trouble in tally.failures)
     assert "the process ended, status -6" in troubles
     assert "not done after 0.5 s" in troubles
+
+
+def test_a_bomb_is_not_repeated_two_hundred_times() -> None:
+    """It was: 12 GB, made by the tool itself."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a", bytes(60_000_000))
+    for seed in (11, 86):
+        assert len(SPOILERS["archive"](buffer.getvalue(), random.Random(seed))) < 1 << 28
 
 
 def test_a_case_can_be_repeated(tmp_path: Path) -> None:

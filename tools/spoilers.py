@@ -299,7 +299,8 @@ def _archive(data: bytes, rng: random.Random) -> bytes:
     elif kind == 7:
         content = _numbers(content, rng)
     else:
-        members = members * rng.choice((2, 200))
+        times, size = rng.choice((2, 200)), sum(len(body) for _, body in members)
+        members = members * (times if times * size <= 8 * MOST_BYTES else 2)
     if members:
         members[min(at, len(members) - 1)] = (name, content)
     if kind == 5:
