@@ -417,7 +417,11 @@ class Renderer:
         return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
 
     def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:
-        self._background.set(np.asarray(background, np.float32))
+        with np.errstate(over="ignore"):
+            colour = np.asarray(background, np.float32)
+        if colour.shape != (3,) or not np.isfinite(colour).all():
+            raise InputError(f"background {background}: expected three finite numbers")
+        self._background.set(colour)
         return self._rasterizer.forward(gaussians, camera, self._background, backward=False)
 
     def _result(self, frame: Frame, *, contiguous: bool) -> RenderResult:

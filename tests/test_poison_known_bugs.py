@@ -14,8 +14,10 @@ from scenes import make_gaussians, overlap, straight_camera
 from clsplat.config import DensityConfig, RasterizerConfig
 from clsplat.density import split_halves
 from clsplat.device.context import Device
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.reference.render import render
+from clsplat.rendering import Renderer
 
 FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
@@ -172,3 +174,9 @@ def test_a_colour_that_no_picture_has_but_that_is_finite_is_drawn(device: Device
     assert run.visible[7]
     assert run.image.max() > 1e3
     assert np.isfinite(run.image).all()
+
+
+@pytest.mark.parametrize("background", [(np.nan, 0.0, 0.0), (0.0, np.inf, 0.0), (0.0, 0.0, 1e39), (0.5, 0.5)])
+def test_a_background_that_is_no_colour(model: Gaussians, background: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match=r"background \(.*\): expected three finite numbers"):
+        Renderer().render(model, overlap()[1], background)
