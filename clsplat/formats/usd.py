@@ -16,10 +16,13 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +62,34 @@ def recognises(head: bytes) -> bool:
     return head.startswith((b"#usda", b"PXR-USDC", b"PK\x03\x04"))
 
 
+def _survive(path: Path) -> None:
+    """Raise InputError where a process that reads the file does not live to its end: USD's library follows what a
+    damaged binary file says to anywhere."""
+    real = Path(os.path.realpath(path))
+    found = real.stat()
+    if not _lives(real, found.st_mtime_ns, found.st_size):
+        raise InputError(f"{path}: USD's library crashes when it reads it; is it damaged?")
+
+
+@lru_cache(maxsize=32)
+def _lives(path: Path, *_: int) -> bool:
+    with open(path, "rb") as file:
+        if file.read(5) == b"#usda":
+            return True
+    code = (
+        f"import sys; sys.path[:] = {sys.path!r}; from pathlib import Path; from clsplat.formats import usd; "
+        "usd.read_here(Path(sys.argv[1]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, check=False)
+    return done.returncode in (0, 1)  # 1: an error, which this process will find itself
+
+
 def describe(path: Path) -> dict[str, Any]:
     """What the stage says of its axes and units, which move nothing here."""
+    _pxr(path)
+    with open_input(path, "a USD stage"):
+        pass
+    _survive(path)
     stage = _open(path)
     from pxr import UsdGeom
 
@@ -103,6 +132,15 @@ def _open(path: Path) -> Any:
 
 def read(path: Path) -> Gaussians:
     """Read every prim of Gaussians of a stage, at its first time, as one model. Raises InputError."""
+    _pxr(path)
+    with open_input(path, "a USD stage"):
+        pass
+    _survive(path)
+    return read_here(path)
+
+
+def read_here(path: Path) -> Gaussians:
+    """`read` of a file that is known not to end the process."""
     stage = _open(path)
     from pxr import Usd, UsdGeom
 
