@@ -195,7 +195,8 @@ class Render:
     quality: int = 95
     """Of JPEG, from 1 to 100."""
     width: Annotated[int | None, arg(metavar="INT")] = None
-    """Width in pixels; follows from the height, or from the camera, if not given."""
+    """Width in pixels; follows from the height, or from the camera, if not given. With a height of another shape than
+    the camera's the vertical angle of view is kept."""
     height: Annotated[int | None, arg(metavar="INT")] = None
     """Height in pixels; follows from the width, or from the camera, if not given."""
     scale: float = 1.0

@@ -220,9 +220,22 @@ def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Ca
             down = round(camera.height * (across / camera.width if width else scale))
         if (across, down) == (camera.width, camera.height):
             return camera
+        if width and height and camera.projection != "equirectangular":
+            return reshaped(camera, width, height)
         return camera.resized(max(1, across), max(1, down))
 
     return resize
+
+
+def reshaped(camera: Camera, width: int, height: int) -> Camera:
+    """The camera in another size. Where that has another shape, the vertical angle of view stays and so do the pixels'
+    proportions: the picture shows more or less to the left and right."""
+    scale = height / camera.height
+    if abs(width - camera.width * scale) <= 1:  # but for rounding the same shape
+        return camera.resized(width, height)
+    middle = 0.5 * width + (camera.cx - 0.5 * camera.width) * scale
+    fx, fy, cy = camera.fx * scale, camera.fy * scale, camera.cy * scale
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=middle, cy=cy)
 
 
 def warn(text: str) -> None:

@@ -13,6 +13,7 @@ from fakes import Pipeline, camera
 
 from clsplat.cli import Render, main, parse
 from clsplat.config import PRESETS, RasterizerConfig, TrainConfig
+from clsplat.render_request import resizer
 from clsplat.runs import Run
 
 
@@ -170,3 +171,14 @@ def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_
         assert main(["render", model, "--cameras", folder, "-o", out]) == 2
         assert message in error_line(capsys)
     assert not pipeline.written
+
+
+def test_a_size_of_another_shape_keeps_the_pixels_square() -> None:
+    """And the vertical angle of view; where the shape is but rounded, the angles of both axes."""
+    before = replace(camera(40, 80), fx=50.0, fy=51.0, cx=22.0, cy=30.0)
+    wide = resizer(160, 40, 1.0)(before)
+    assert (wide.width, wide.height, wide.fx, wide.fy, wide.cx, wide.cy) == (160, 40, 25.0, 25.5, 81.0, 15.0)
+    near = resizer(21, 40, 1.0)(before)
+    assert (near.fx, near.fy) == (pytest.approx(50 * 21 / 40), 25.5)
+    panorama = replace(before, projection="equirectangular")
+    assert resizer(160, 40, 1.0)(panorama).fx == pytest.approx(200), "that shows all around"
