@@ -63,32 +63,27 @@ def recognises(head: bytes) -> bool:
 
 
 def _survive(path: Path) -> None:
-    """Raise InputError where a process that reads the file does not live to its end: USD's library follows what a
-    damaged binary file says to anywhere."""
-    real = Path(os.path.realpath(path))
-    found = real.stat()
-    if not _lives(real, found.st_mtime_ns, found.st_size):
+    """Raise InputError where there is no usd-core or no such file, and where a process that reads the file does not
+    live to its end: USD's library follows what a damaged binary file says to anywhere."""
+    _pxr(path)
+    with open_input(path, "a USD stage") as file:
+        text, found = file.read(5) == b"#usda", os.fstat(file.fileno())
+    if not (text or _lives(os.path.realpath(path), found.st_mtime_ns, found.st_size)):
         raise InputError(f"{path}: USD's library crashes when it reads it; is it damaged?")
 
 
 @lru_cache(maxsize=32)
-def _lives(path: Path, *_: int) -> bool:
-    with open(path, "rb") as file:
-        if file.read(5) == b"#usda":
-            return True
+def _lives(path: str, *_: int) -> bool:
     code = (
         f"import sys; sys.path[:] = {sys.path!r}; from pathlib import Path; from clsplat.formats import usd; "
         "usd.read_here(Path(sys.argv[1]))"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, check=False)
     return done.returncode in (0, 1)  # 1: an error, which this process will find itself
 
 
 def describe(path: Path) -> dict[str, Any]:
     """What the stage says of its axes and units, which move nothing here."""
-    _pxr(path)
-    with open_input(path, "a USD stage"):
-        pass
     _survive(path)
     stage = _open(path)
     from pxr import UsdGeom
@@ -110,11 +105,8 @@ def readable(path: Path) -> Iterator[None]:
 
 def _open(path: Path) -> Any:
     """The stage, without payloads, all of whose layers are in the file's folder or below it."""
-    _pxr(path)
     from pxr import Tf, Usd, UsdUtils
 
-    with open_input(path, "a USD stage"):
-        pass
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
     try:
         stage = Usd.Stage.Open(os.path.realpath(path), Usd.Stage.LoadNone)
@@ -132,9 +124,6 @@ def _open(path: Path) -> Any:
 
 def read(path: Path) -> Gaussians:
     """Read every prim of Gaussians of a stage, at its first time, as one model. Raises InputError."""
-    _pxr(path)
-    with open_input(path, "a USD stage"):
-        pass
     _survive(path)
     return read_here(path)
 
