@@ -94,7 +94,7 @@ def make_tasks(
             raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
         after = None
         if motion:
-            after = resize(camera_after(whole, at[frame.number]))
+            after = resize(camera_after(whole, at[frame.number])).resized(camera.width, camera.height)
         tasks.append(Task(frame.number, frame.name, camera, path, after, stretch(frame.number)))
     return tasks
 
