@@ -158,7 +158,7 @@ def write_image(
     if pixels.shape[2] == 4 and (alpha == "straight") != is_png:
         pixels = unassociate(pixels) if is_png else associate(pixels)
     if is_png:
-        pixels = np.rint(np.clip(np.nan_to_num(pixels), 0, 1) * 255).astype(np.uint8)
+        pixels = steps_of([pixels], 8)
     height, width, channels = pixels.shape
     kind = oiio.UINT8 if is_png else oiio.HALF if half else oiio.FLOAT
     spec = oiio.ImageSpec(width, height, channels, kind)
@@ -198,6 +198,21 @@ def unassociate(image: Float32) -> Float32:
     """(H, W, 4) with premultiplied alpha to straight. Colour without any alpha is kept as it is."""
     alpha = image[:, :, 3:]
     return np.concatenate([image[:, :, :3] / np.where(alpha > 0, alpha, np.float32(1)), alpha], axis=2)
+
+
+def steps_of(planes: Sequence[NDArray[Any]], bits: int) -> NDArray[Any]:
+    """Channels side by side as whole numbers, 0 to 1 as 0 to the largest; NaN as 0. A channel at a time, as they come
+    from the device as planes, and a pass over interleaved ones takes several times as long."""
+    height, width = planes[0].shape[:2]
+    whole = np.empty((height, width, sum(plane.shape[2] for plane in planes)), np.uint8 if bits == 8 else np.uint16)
+    scratch = np.empty((height, width), np.float32 if bits == 8 else np.float64)  # a float32 rounds 16 bits twice
+    most = scratch.dtype.type(2**bits - 1)
+    channels = (plane[:, :, channel] for plane in planes for channel in range(plane.shape[2]))
+    for at, channel in enumerate(channels):
+        np.fmin(np.fmax(channel, 0, out=scratch), 1, out=scratch)
+        np.multiply(scratch, most, out=scratch)
+        whole[:, :, at] = np.rint(scratch, out=scratch)
+    return whole
 
 
 def _open(path: Path) -> Any:

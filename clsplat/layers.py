@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera, Window
 from clsplat.config import Compression, ExrDepth, Parts
 from clsplat.errors import InputError
-from clsplat.images import image_size, unassociate, write_spec
+from clsplat.images import image_size, steps_of, unassociate, write_spec
 
 Float64 = NDArray[np.float64]
 
@@ -273,7 +273,7 @@ def _picture(
     if extension == ".png" and "alpha" in layers:
         planes = [unassociate(np.concatenate(planes, axis=2))]
     bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
-    whole = _steps(planes, bits)
+    whole = steps_of(planes, bits)
     spec = _spec(whole, oiio.UINT8 if bits == 8 else oiio.UINT16, header)
     spec.channelnames = ("R", "G", "B", "A")[: whole.shape[2]]
     if extension == ".png":
@@ -283,21 +283,6 @@ def _picture(
     if extension in (".jpg", ".jpeg"):
         spec.attribute("Compression", f"jpeg:{encoding.quality}")
     return whole, spec
-
-
-def _steps(planes: Sequence[NDArray[Any]], bits: int) -> NDArray[Any]:
-    """Channels side by side as whole numbers, 0 to 1 as 0 to the largest; NaN as 0. A channel at a time, as they come
-    from the device as planes, and a pass over interleaved ones takes several times as long."""
-    height, width = planes[0].shape[:2]
-    whole = np.empty((height, width, sum(plane.shape[2] for plane in planes)), np.uint8 if bits == 8 else np.uint16)
-    scratch = np.empty((height, width), np.float32 if bits == 8 else np.float64)  # a float32 rounds 16 bits twice
-    most = scratch.dtype.type(2**bits - 1)
-    channels = (plane[:, :, channel] for plane in planes for channel in range(plane.shape[2]))
-    for at, channel in enumerate(channels):
-        np.fmin(np.fmax(channel, 0, out=scratch), 1, out=scratch)
-        np.multiply(scratch, most, out=scratch)
-        whole[:, :, at] = np.rint(scratch, out=scratch)
-    return whole
 
 
 def _planes(plane: NDArray[Any]) -> NDArray[Any]:
