@@ -42,5 +42,9 @@ class KernelBuildError(ClsplatError):
         return f"{self.args[0]}\n{self.log}\n{self.source}" if os.environ.get("CLSPLAT_DEBUG") else str(self.args[0])
 
 
+class DriverError(ClsplatError):
+    """A driver aborted, hung, or gave what is no kernel. The message has the driver, the shape and the kernel."""
+
+
 class CapacityError(ClsplatError):
     """A buffer would be larger than the device allows, or all of them together than --max-device-mem does."""

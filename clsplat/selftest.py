@@ -16,10 +16,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from clsplat.device.child import tell
 from clsplat.device.context import Device, all_devices
 from clsplat.device.source import kernel_root
 from clsplat.selftest_bench import Bench, Outcome, digest_of
-from clsplat.selftest_result import BOUNDS, INDICES, MARK, STAGES, Result
+from clsplat.selftest_result import BOUNDS, INDICES, STAGES, Result
 from clsplat.selftest_scenes import scenes
 from clsplat.selftest_stages import RUN
 from clsplat.stages.blend import tile_items
@@ -105,10 +106,6 @@ def _result(name: str, benches: list[Bench], outcomes: list[Outcome]) -> Result:
 
 def _child(index: int, shape: tuple[int, int], stages: Sequence[str], *, quick: bool) -> None:
     """Build and run on the `index`-th device; a line of JSON for what begins, another for what came of it."""
-
-    def tell(**values: object) -> None:
-        print(MARK + json.dumps(values), flush=True)
-
     tell(begins="opening the device")
     device = Device(all_devices()[index]).with_shape(lanes=shape[0], items=shape[1])
     if not quick:
@@ -119,7 +116,7 @@ def _child(index: int, shape: tuple[int, int], stages: Sequence[str], *, quick: 
         tell(built=time.perf_counter() - start)
     for result in run(device, quick=quick, stages=stages, say=lambda name: tell(begins=name)):
         tell(result=asdict(result))
-    tell(done=True)
+    tell(done=sorted(device.rehearsal.done))
 
 
 if __name__ == "__main__":

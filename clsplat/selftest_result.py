@@ -40,9 +40,6 @@ BOUNDS: dict[str, tuple[float, str]] = {
 """Ulp that a stage may be off, and why: what is found where every operation is rounded as IEEE 754 has it, with room
 for a GPU whose divisions and roots are not. A wrong operation is off by thousands."""
 
-MARK = "clsplat-selftest "
-"""What a line that is meant for the parent begins with; drivers print lines of their own."""
-
 
 @dataclass(frozen=True)
 class Result:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from clsplat.camera import Camera
 from clsplat.colour import INTEROP
 from clsplat.config import RasterizerConfig
-from clsplat.errors import InputError
+from clsplat.errors import DriverError, InputError
 from clsplat.framing import COLOUR, Layers, framed
 from clsplat.layers import VIDEO, Encoding, Header, camera_matrices
 from clsplat.picture_config import DeepConfig, PictureConfig
@@ -164,7 +164,11 @@ class FrameShader:
         from clsplat.selftest_result import RAYS
         from clsplat.trust import require
 
-        require(self._renderer.device, RAYS)
+        device = self._renderer.device
+        if require(device, RAYS) is not device:  # too late to draw in another shape
+            raise DriverError(
+                f"{device.name}: the driver failed in the shape {device.shape.label}; another works, call again"
+            )
         self._rays_tested = True
 
     def _in_strips(self, task: Task) -> bool:
@@ -192,7 +196,7 @@ def open_shader(
 
     opened: Any = _profiled(device, memory_limit) if profile else open_device(device, memory_limit)
     beside = DEEP if options.deep is not None else CHANNELS if set(options.channels) - set(COLOUR) else ()
-    require(opened, (*FORWARD, *beside))
+    opened = require(opened, (*FORWARD, *beside))
     shader = FrameShader(Renderer(opened, config=rasterizer), gaussians, options)
     return _Recorded(shader, opened) if profile else shader
 

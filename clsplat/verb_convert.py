@@ -170,8 +170,7 @@ def _contributions(verb: Convert, gaussians: Gaussians) -> Float32:
     shot = choose_shot(verb.cameras)
     for warning in shot.warnings:
         _warn(warning)
-    device = open_device(verb.device, parse_bytes(verb.max_device_mem))
-    require(device)
+    device = require(open_device(verb.device, parse_bytes(verb.max_device_mem)))
     return largest_contributions(gaussians, shot.cameras, device)
 
 
@@ -190,8 +189,7 @@ def _measure(verb: Convert, original: Gaussians, read: Gaussians, matrix: Float6
 
     device = open_device(verb.device, parse_bytes(verb.max_device_mem))
     views = _views(verb)
-    require(device, FORWARD)
-    renderer = Renderer(device)
+    renderer = Renderer(require(device, FORWARD))
     before = [_render(renderer, original, verb, view, None) for view in views]
     after = [_render(renderer, read, verb, view, matrix) for view in views]
     return compared(verb.background, views, before, after)

@@ -152,7 +152,7 @@ def train(verb: Train) -> int:
             f"clsplat: warning: {source}: has a single point, training starts from one Gaussian of next to no size",
             file=sys.stderr,
         )
-    require(device)
+    device = require(device)
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
     print(
         f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
@@ -229,7 +229,7 @@ def evaluate(verb: Eval) -> int:
     views = [view for view in scene.views if view.split == "test"]
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {test_every}")
-    require(device, FORWARD)
+    device = require(device, FORWARD)
     renderer = Renderer(device, config=config.rasterizer)
 
     background = background_colour(verb.background or config.background)
@@ -265,6 +265,7 @@ def bench(verb: Bench) -> int:
     from clsplat.device.context import Device, select
     from clsplat.plots import check_plot, plot_settings
     from clsplat.progress import StageProgress
+    from clsplat.trust import require
 
     size, limit = parse_size(verb.size), parse_bytes(verb.max_device_mem)
     if verb.gaussians < 1:
@@ -277,7 +278,7 @@ def bench(verb: Bench) -> int:
     if verb.source is not None and not verb.source.exists():
         raise InputError(f"{verb.source}: no such file or folder, expected a scene, a run or a model file")
     progress = StageProgress()
-    device = Device(select(verb.device), profile=True)
+    device = require(Device(select(verb.device), profile=True))
     device.memory.limit = limit
     if verb.source is None:
         subject = measure.synthetic(verb.gaussians, *(size or (1024, 768)))

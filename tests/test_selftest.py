@@ -16,6 +16,8 @@ from pipeline import shaped
 
 from clsplat import trust
 from clsplat.cli import main
+from clsplat.device import known
+from clsplat.device.child import MARK, REGARDLESS, TIMEOUT
 from clsplat.device.context import Device, all_devices, list_devices
 from clsplat.device.program import BREAK
 from clsplat.device.shapes import shape_of
@@ -138,7 +140,7 @@ def test_rounding_otherwise_is_told_and_forgiven(
 def test_a_change_that_makes_no_sense(change: str, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BREAK, change)
     with pytest.raises(InputError, match="expected STEM: WORDS => WORDS"):
-        default_device.with_shape()
+        default_device.with_shape().kernels("blend")
 
 
 def test_a_change_of_words_that_are_not_there(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,16 +224,17 @@ def test_no_such_device(capsys: Capture) -> None:
 
 def child(monkeypatch: pytest.MonkeyPatch, code: str) -> Report:
     monkeypatch.setattr(trust, "command", lambda *_, **__: [sys.executable, "-c", code])
-    return examine(0, shape_of(all_devices()[0]), patience=2.0)
+    monkeypatch.setenv(TIMEOUT, "2")
+    return examine(0, shape_of(all_devices()[0]))
 
 
 def test_a_driver_that_aborts(monkeypatch: pytest.MonkeyPatch) -> None:
-    code = f'import os; print({trust.MARK!r} + \'{{"begins": "building blend.cl"}}\', flush=True); os.abort()'
+    code = f'import os; print({MARK!r} + \'{{"begins": "building blend.cl"}}\', flush=True); os.abort()'
     assert child(monkeypatch, code).failure == "the process was ended by signal 6 in building blend.cl"
 
 
 def test_a_driver_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    code = f'import time; print({trust.MARK!r} + \'{{"begins": "blend"}}\', flush=True); time.sleep(60)'
+    code = f'import time; print({MARK!r} + \'{{"begins": "blend"}}\', flush=True); time.sleep(60)'
     report = child(monkeypatch, code)
     assert report.failure == "the driver did not come back within 2 s from blend"
 
@@ -246,9 +249,9 @@ def test_a_child_that_ends_early(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def untrusting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    monkeypatch.delenv(trust.REGARDLESS)
+    monkeypatch.delenv(REGARDLESS)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return trust.memory_path()
+    return known.memory_path()
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
@@ -264,6 +267,12 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     return made
 
 
+def saved_stages(path: Path, device: Device) -> list[str]:
+    (shapes,) = json.loads(path.read_text()).values()
+    stages: list[str] = shapes[device.shape.label]["stages"]
+    return stages
+
+
 def test_it_is_tested_once(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     made = counted(monkeypatch)
     for stages in (FORWARD, FORWARD, TRAINING, TRAINING, FORWARD):
@@ -273,7 +282,7 @@ def test_it_is_tested_once(untrusting: Path, default_device: Device, monkeypatch
         trust.require(default_device, stages)
     assert made[2:] == [(*FORWARD, *CHANNELS)], "what is not remembered yet, and what it stands on"
     remembered = [name for name in STAGES if name in (*TRAINING, *CHANNELS)]
-    assert list(json.loads(untrusting.read_text()).values()) == [remembered]
+    assert sorted(remembered) == saved_stages(untrusting, default_device)
     trust.require(shaped(default_device, 4, 1))
     assert made[3:] == [TRAINING], "another shape has other kernels"
     monkeypatch.setattr("clsplat.__version__", "0.0.0")
@@ -288,10 +297,10 @@ def test_a_failure_is_an_error_and_not_remembered(
     with pytest.raises(DeviceError, match=r"cannot be trusted: blend: image is off by .* clsplat selftest tells more"):
         trust.require(default_device, FORWARD)
     assert not untrusting.exists()
-    monkeypatch.setenv(trust.REGARDLESS, "1")
+    monkeypatch.setenv(REGARDLESS, "1")
     trust.require(default_device, FORWARD)
     monkeypatch.delenv(BREAK)
-    monkeypatch.setenv(trust.REGARDLESS, "0")
+    monkeypatch.setenv(REGARDLESS, "0")
     trust.require(default_device, FORWARD)
     assert untrusting.exists()
 
@@ -305,29 +314,37 @@ def test_a_memory_that_is_broken_or_read_only(
     trust.require(default_device, FORWARD)
     assert len(made) == 1
     assert len(json.loads(untrusting.read_text())) == 1
+    monkeypatch.setenv("POCL_CACHE_DIR", str(untrusting.parent))  # it has no device without a folder for its kernels
     monkeypatch.setenv("XDG_CACHE_HOME", str(untrusting))  # a file, where a folder would have to be
     with pytest.warns(UserWarning, match="cannot be written"):
         trust.require(default_device, FORWARD)
+    trust.require(default_device, FORWARD)
+    assert len(made) == 2, "this process remembers it"
 
 
-@pytest.mark.parametrize("names", [1, None, "blend", [1], [["blend"]], {"blend": 1}])
-def test_a_memory_with_an_entry_of_another_kind(
-    names: object, untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = counted(monkeypatch)
-    trust.require(default_device, FORWARD)
-    (key,) = whole = json.loads(untrusting.read_text())
-    untrusting.write_text(json.dumps({key: names}))
-    trust.require(default_device, FORWARD)
-    assert len(made) == 2
-    assert json.loads(untrusting.read_text()) == whole
+@pytest.mark.parametrize("names", [1, None, [1], [["blend"]], {"blend": 1}])
+def test_a_memory_with_an_entry_of_another_kind(names: object, untrusting: Path, default_device: Device) -> None:
+    device, label = default_device.cl_device, default_device.shape.label
+    known.remember(device, label, stages=["blend"], kernels={"a": ""})
+    (key,) = json.loads(untrusting.read_text())
+    for entry in (
+        names,
+        {label: names},
+        {label: {"stages": names}},
+        {label: {"kernels": names}},
+        {label: {"failed": names}},
+    ):
+        untrusting.write_text(json.dumps({key: entry, "another": names}))
+        assert known.entries(device).get(label, known.Entry()) == known.Entry()
+        known.remember(device, label, stages=["blend"])
+        assert known.entries(device)[label].stages == {"blend"}
 
 
 @pytest.mark.parametrize("text", [b"\xff", b"[" * 100_000, b"1" * 5000, b"null"])
 def test_a_memory_that_does_not_parse(text: bytes, untrusting: Path) -> None:
     untrusting.parent.mkdir(parents=True)
     untrusting.write_bytes(text)
-    assert trust._remembered() == {}
+    assert known.entries(all_devices()[0]) == {}
 
 
 def test_other_bits_are_a_warning(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

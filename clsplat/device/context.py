@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chooses a device, its queue and the shape of its kernels. The only place that knows vendors' names."""
+"""Chooses a device, its queue and the shape of its kernels."""
 
 from __future__ import annotations
 
@@ -17,9 +17,12 @@ os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 import numpy as np
 import pyopencl as cl
 
+from clsplat.device.buffers import allocate
+from clsplat.device.launch import launch_groups
 from clsplat.device.memory import Memory
 from clsplat.device.profile import Recorder
-from clsplat.device.program import Kernels, build
+from clsplat.device.program import Kernels, build, variant_of
+from clsplat.device.rehearsal import Rehearsal
 from clsplat.device.shapes import Shape, kind_of, shape_of
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError
@@ -84,6 +87,7 @@ class Device:
         self.kind = kind_of(device)
         self.shape = shape or shape_of(device)
         self.max_allocation = int(device.max_mem_alloc_size)
+        self.max_group = int(device.max_work_group_size)
         self.memory = Memory()
         self.context = cl.Context([device])
         self.profile = profile
@@ -95,7 +99,8 @@ class Device:
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
         self._switches: Mapping[str, object] = {}
         self.recorder = Recorder()
-        self._fma = self._probe_fma()
+        self.rehearsal = Rehearsal(device, all_devices().index(device), self.shape.label)
+        self._fma: list[dict[str, object]] = []
 
     def kernels(self, stem: str, **defines: object) -> Kernels:
         """The kernels of `stem`.cl in this device's shape, built at the first call."""
@@ -105,10 +110,16 @@ class Device:
         key = (stem, tuple(sorted(defines.items())))
         found = self._kernels.get(key)
         if found is None:
-            values = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, **self._fma, **defines}
-            found = Kernels(build(self.context, self.cl_device, stem, values, self._options))
-            self._kernels[key] = found
+            if not self._fma:
+                self._fma.append(self._probe_fma())  # in place: copies of a device share it
+            found = self._kernels[key] = self._built(stem, {**self._fma[0], **defines})
         return found
+
+    def _built(self, stem: str, defines: Mapping[str, object]) -> Kernels:
+        shape = {"LANES": self.shape.lanes, "ITEMS": self.shape.items}
+        variant = variant_of(stem, {**shape, **defines}, self._options)
+        program, _ = build(self.context, self.cl_device, self.rehearsal.build(variant))
+        return Kernels(variant, program)
 
     def with_shape(self, **changes: int) -> Device:
         """A device like this with another shape."""
@@ -159,17 +170,13 @@ class Device:
         """
         if self.shape.lanes == 1:
             return {}
-        values = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, "FMA_BY_CONTRACTION": True}
-        kernels = Kernels(build(self.context, self.cl_device, "probe", values, self._options))
-        out = np.zeros(2 * self.shape.lanes, np.float32)
-        buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, out.nbytes)
-        factor = np.float32(1 + 2.0**-12)
-        kernels.probe_fma(self.queue, (1,), (1,), buffer, factor, np.float32(-(1 + 2.0**-11)))
-        cl.enqueue_copy(self.queue, out, buffer, is_blocking=True)
-        return {"FMA_BY_CONTRACTION": True} if np.all(out == np.float32(2.0**-24)) else {}
+        kernels = self._built("probe", {"FMA_BY_CONTRACTION": True})
+        out = allocate(self, (2 * self.shape.lanes,), np.float32)
+        launch_groups(self, kernels.probe_fma, 1, 1, out, 1 + 2.0**-12, -(1 + 2.0**-11))
+        return {"FMA_BY_CONTRACTION": True} if np.all(out.get() == np.float32(2.0**-24)) else {}
 
     def __repr__(self) -> str:
-        return f"<Device {self.name} | {self.driver.split('  ')[0]} | {self.shape}>"
+        return f"<Device {self.name} | {self.driver.split('  ')[0].strip()} | {self.shape.label}>"
 
 
 def _matches(selector: str, info: DeviceInfo) -> bool:
@@ -204,8 +211,8 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 
 @lru_cache(maxsize=8)
-def _open(index: int) -> Device:
-    return Device(all_devices()[index])
+def _open(index: int, shape: Shape) -> Device:
+    return Device(all_devices()[index], shape)
 
 
 def open_device(selector: str | None = None, memory_limit: int | None = None) -> Device:
@@ -214,5 +221,5 @@ def open_device(selector: str | None = None, memory_limit: int | None = None) ->
     memory_limit: bytes that the buffers of this object's users may take together.
     """
     chosen: Any = select(selector)
-    device = _open(all_devices().index(chosen))
+    device = _open(all_devices().index(chosen), shape_of(chosen))
     return device if memory_limit is None else device.with_memory_limit(memory_limit)

@@ -3,29 +3,55 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from math import prod
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyopencl as cl
 
 from clsplat.device.buffers import DeviceArray
-from clsplat.device.context import Device
+from clsplat.device.program import Kernel
+from clsplat.errors import DriverError
+
+if TYPE_CHECKING:
+    from clsplat.device.context import Device
 
 _LOCAL = 64
 """Work-items a group where they do not co-operate: enough for a GPU's wave, short enough for a CPU's chunk."""
+_WORD = 0xFFFFFFFF
 
 
-def _arguments(arguments: tuple[Any, ...]) -> list[Any]:
-    values: list[Any] = []
-    for argument in arguments:
-        if isinstance(argument, DeviceArray):
-            values.append(argument.buffer)
-        elif isinstance(argument, bool | int):
-            values.append(np.uint32(argument) if argument >= 0 else np.int32(argument))
-        elif isinstance(argument, float):
-            values.append(np.float32(argument))
-        else:
-            values.append(argument)
-    return values
+def _value(argument: Any) -> Any:
+    """As the kernel gets it: whole numbers as the 32 bits that they have with or without a sign."""
+    if isinstance(argument, DeviceArray):
+        return argument.buffer
+    return argument & _WORD if isinstance(argument, int) else argument
+
+
+def _type(value: Any) -> Any:
+    """The type that OpenCL's wrapper is told of an argument; None for what is no scalar."""
+    if isinstance(value, int):
+        return np.uint32
+    if isinstance(value, float):
+        return np.float32
+    return value.dtype if isinstance(value, np.generic) else None
+
+
+def _first(
+    device: Device, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, values: Sequence[Any]
+) -> None:
+    """Tell the types of the kernel's arguments, and see that the driver can launch it. Raises DriverError."""
+    types = [_type(value) for value in values]
+    most = kernel.most_items(device.cl_device)
+    if local is not None and prod(local) > most:
+        raise device.rehearsal.fail(
+            kernel.variant.stem, kernel.name, f"has {prod(local)} items in a group, where the driver allows it {most}"
+        )
+    typed = [value if of is None else np.dtype(of).type(value) for of, value in zip(types, values, strict=True)]
+    device.rehearsal.launch(kernel, size, local, typed)
+    kernel.cl_kernel.set_scalar_arg_dtypes(types)
+    kernel.tried = True
 
 
 _UPDATED = {
@@ -39,31 +65,42 @@ _UPDATED = {
 
 
 def _enqueue(
-    device: Device, kernel: Any, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: tuple[Any, ...]
+    device: Device, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: tuple[Any, ...]
 ) -> None:
-    event = kernel(device.queue, size, local, *_arguments(arguments))
+    values = [_value(argument) for argument in arguments]
+    if not kernel.tried:
+        _first(device, kernel, size, local, values)
+    try:
+        event = kernel.cl_kernel(device.queue, size, local, *values)
+    except cl.Error as error:
+        text = " ".join(str(error).split())
+        raise DriverError(
+            f"{device.name}, {device.driver.split('  ')[0].strip()}, kernels in the shape {device.shape.label}: "
+            f"{kernel.variant.stem}.cl, {kernel.name}, cannot be launched: {text}"
+        ) from None
     if device.recorder.on:
-        name = kernel.function_name
+        name = kernel.name
         arrays = [argument for argument in arguments if isinstance(argument, DeviceArray)]
         updated = arrays[len(arrays) - _UPDATED.get(name, 0) :]
         once = {id(array.buffer): array.nbytes for array in arrays}
         device.recorder.add(name, event, sum(once.values()) + sum(array.nbytes for array in updated))
 
 
-def launch_items(device: Device, kernel: Any, items: int, *arguments: Any) -> None:
+def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) -> None:
     """One work-item for each of `items`; the kernel guards the rounding up. Nothing for 0 items."""
     if items > 0:
         size = -(-items // _LOCAL) * _LOCAL
-        _enqueue(device, kernel, (size,), (_LOCAL,), arguments)
+        local = (_LOCAL,) if device.max_group >= _LOCAL else None
+        _enqueue(device, kernel, (size,), local, arguments)
 
 
-def launch_groups(device: Device, kernel: Any, groups: int, items: int, *arguments: Any) -> None:
+def launch_groups(device: Device, kernel: Kernel, groups: int, items: int, *arguments: Any) -> None:
     """`groups` work-groups of `items`. Nothing for 0 groups."""
     if groups > 0:
         _enqueue(device, kernel, (groups * items,), (items,), arguments)
 
 
-def launch_grid(device: Device, kernel: Any, size: tuple[int, ...], *arguments: Any) -> None:
+def launch_grid(device: Device, kernel: Kernel, size: tuple[int, ...], *arguments: Any) -> None:
     """A grid of work-items: a row of it is a group's loop on a CPU, which the driver would else make one group of all.
 
     Nothing where a side is 0.

@@ -3,19 +3,46 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import secrets
 import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import pyopencl as cl
 
+from clsplat.device.known import BREAK
 from clsplat.device.source import kernel_source
-from clsplat.errors import InputError, KernelBuildError
+from clsplat.errors import DriverError, InputError, KernelBuildError
 
-BREAK = "CLSPLAT_BREAK_KERNEL"
-"""For the tests of `clsplat selftest` alone: STEM: WORDS => WORDS replaces words of one kernel's text, as a driver that
-miscompiles an operation would."""
+
+@dataclass(frozen=True)
+class Variant:
+    """The text of a kernel file and the options that it is built with."""
+
+    stem: str
+    source: str
+    options: tuple[str, ...]
+
+    @cached_property
+    def digest(self) -> str:
+        """A name that no other text or options have."""
+        text = "\0".join((self.stem, self.source, *self.options))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    def anew(self, salt: str) -> Variant:
+        """The same kernels, in a text that no driver's cache has: what it has may be of an aborted build. A comment
+        would not do, as PoCL looks for what the preprocessor leaves."""
+        return replace(self, source=f"{self.source}typedef int anew_{salt};\n") if salt else self
+
+
+def variant_of(stem: str, defines: Mapping[str, object], options: str) -> Variant:
+    """`stem`.cl with these defines. Raises InputError for a CLSPLAT_BREAK_KERNEL that makes no sense."""
+    flags = [f"-D{name}" if value is True else f"-D{name}={value}" for name, value in sorted(defines.items())]
+    return Variant(stem, _broken(stem, kernel_source(stem)), (*flags, *options.split()))
 
 
 def _broken(stem: str, source: str) -> str:
@@ -34,34 +61,62 @@ def _broken(stem: str, source: str) -> str:
     return source.replace(old, new)
 
 
-def build(context: cl.Context, device: cl.Device, stem: str, defines: Mapping[str, object], options: str) -> cl.Program:
-    """Compile `stem`.cl. Raises KernelBuildError with the device, the options, the log and the source."""
-    source = _broken(stem, kernel_source(stem))
-    flags = [f"-D{name}" if value is True else f"-D{name}={value}" for name, value in sorted(defines.items())]
-    all_options = [*flags, *options.split()]
+def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.Program, str]:
+    """Compile a kernel file; the program, and the salt of `Variant.anew` that it took, or nothing. Raises
+    KernelBuildError with the device, the options, the log and the source, and DriverError for a program without
+    kernels, as PoCL makes of what an aborted build left in its cache."""
+    program, salt = _compiled(context, device, variant), ""
+    if program.num_kernels == 0:
+        salt = secrets.token_hex(8)
+        program = _compiled(context, device, variant.anew(salt))
+    if program.num_kernels == 0:
+        raise DriverError(f"{device.name.strip()}: {variant.stem}.cl has no kernels when the driver has built it")
+    return program, salt
+
+
+def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Program:
+    source = variant.source
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)
-            return cl.Program(context, source).build(options=all_options)
+            return cl.Program(context, source).build(options=list(variant.options))
     except cl.Error as error:
         numbered = "\n".join(f"{number:4d}  {line}" for number, line in enumerate(source.splitlines(), 1))
         log = str(error)
         first = next((line.strip() for line in log.splitlines() if "error:" in line), log.splitlines()[0])
         raise KernelBuildError(
-            f"{stem}.cl does not build on {device.name.strip()} with {' '.join(all_options)}: {first} "
+            f"{variant.stem}.cl does not build on {device.name.strip()} with {' '.join(variant.options)}: {first} "
             "(CLSPLAT_DEBUG=1 shows the log and the source)",
             log,
             numbered,
         ) from None
 
 
+class Kernel:
+    """A kernel that has been built.
+
+    tried: it is known that the driver can launch it, and the types of its scalars have been told to OpenCL's wrapper,
+    as each would else cost 10 microseconds a launch.
+    """
+
+    def __init__(self, variant: Variant, kernel: Any) -> None:
+        self.variant = variant
+        self.name: str = kernel.function_name
+        self.cl_kernel = kernel
+        self.tried = False
+
+    def most_items(self, device: cl.Device) -> int:
+        """Work-items that the driver allows a group of this kernel."""
+        return int(self.cl_kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device))
+
+
 class Kernels:
     """The kernels of one source file with one set of defines, by name; each kernel object is made once."""
 
-    def __init__(self, program: cl.Program) -> None:
-        self._kernels: dict[str, Any] = {kernel.function_name: kernel for kernel in program.all_kernels()}
+    def __init__(self, variant: Variant, program: cl.Program) -> None:
+        self._kernels = {kernel.function_name: Kernel(variant, kernel) for kernel in program.all_kernels()}
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Kernel:
         try:
             return self._kernels[name]
         except KeyError:

@@ -8,10 +8,13 @@ import os
 import re
 import warnings
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import pyopencl as cl
 
+from clsplat.device import known
+from clsplat.device.child import regardless
 from clsplat.errors import DeviceError
 
 LANES = (1, 4, 8, 16)
@@ -32,9 +35,19 @@ class Shape:
     chunks: int
 
     @property
+    def label(self) -> str:
+        """As CLSPLAT_SHAPE has it."""
+        return f"{self.lanes}x{self.items}"
+
+    @property
     def digit_bits(self) -> int:
         """Radix sort digit: a counter per digit and item has to fit local memory."""
         return 11 if self.items == 1 else 4
+
+    @property
+    def local_bytes(self) -> int:
+        """Local memory that a group needs at most: the sort's counters, and 32 KiB, which every device has to have."""
+        return max(4 * self.items << self.digit_bits, 32 << 10) if self.items > 1 else 32 << 10
 
 
 def kind_of(device: cl.Device) -> str:
@@ -52,10 +65,15 @@ def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
     return int(digits[0]), int(digits[1])
 
 
+def caches_programs(device: cl.Device) -> bool:
+    """True for a driver that keeps what it builds on the disk, so that a second build takes no time."""
+    return _pocl_version(device) is not None
+
+
 def default_shape(device: cl.Device) -> Shape:
     """The shape by type and vector width; why there are several is in docs/decisions/0003-one-source-many-shapes.md."""
     if kind_of(device) != "cpu":
-        items = next((n for n in (256, 128, 64, 32, 16) if n <= device.max_work_group_size), 1)
+        items = next((n for n in (256, 128, 64, 32, 16) if n <= most_items(device)), 1)
         return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
     lanes = 16 if device.native_vector_width_float >= 16 else 8
     if _pocl_version(device) == (3, 0):
@@ -65,30 +83,69 @@ def default_shape(device: cl.Device) -> Shape:
     return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units)
 
 
+def most_items(device: cl.Device) -> int:
+    """Work-items that a group of our kernels can have: by the device's limit, and by its local memory."""
+    groups: int = device.max_work_group_size
+    by_memory: int = device.local_mem_size // (4 << Shape(1, 2, 1).digit_bits)
+    return min(groups, by_memory)
+
+
 def candidates(device: cl.Device) -> list[Shape]:
     """The shapes that are worth a trial, the default first."""
     default = default_shape(device)
     if kind_of(device) == "cpu":
         others = [replace(default, lanes=lanes) for lanes in (16, 8)]
     else:
-        others = [replace(default, items=items) for items in (256, 128, 64) if items <= device.max_work_group_size]
+        others = [replace(default, items=items) for items in (256, 128, 64) if items <= most_items(device)]
     return [default, *(shape for shape in others if shape != default)]
 
 
-def shape_of(device: cl.Device) -> Shape:
-    """What a device gets that is opened without another. Raises DeviceError for a CLSPLAT_SHAPE that makes no sense."""
+def wanted_shape(device: cl.Device) -> Shape:
+    """The shape that CLSPLAT_SHAPE asks for, or that was tuned, or the default. Raises DeviceError for a CLSPLAT_SHAPE
+    that makes no sense, or that the device has no room for."""
     default = default_shape(device)
     text = os.environ.get("CLSPLAT_SHAPE")
     if not text:
         text = saved_shapes().get(_key(device), "")
         shape = _parsed(text, default)
-        return default if shape is None or shape.items > device.max_work_group_size else shape
+        return default if shape is None or shape.items > most_items(device) else shape
     shape = _parsed(text, default)
     if shape is None:
         raise DeviceError(f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16")
-    if shape.items > (most := device.max_work_group_size):
-        raise DeviceError(f"CLSPLAT_SHAPE={text}: {device.name.strip()} has at most {most} items in a work-group")
+    name, most = device.name.strip(), device.max_work_group_size
+    if shape.items > most:
+        raise DeviceError(f"CLSPLAT_SHAPE={text}: {name} has at most {most} items in a work-group")
+    if shape.items > most_items(device):
+        raise DeviceError(
+            f"CLSPLAT_SHAPE={text}: {name} has {device.local_mem_size >> 10} KiB of local memory, and a group of "
+            f"{shape.items} items needs {shape.local_bytes >> 10} KiB; expected at most {most_items(device)} items"
+        )
     return shape
+
+
+def shape_of(device: cl.Device) -> Shape:
+    """The shape that a device gets which is opened without another: `wanted_shape`, or, with a warning, the first other
+    one where the driver has failed in that before. Raises DeviceError as `wanted_shape`."""
+    wanted = wanted_shape(device)
+    failed = {} if regardless() else {label: e.failed for label, e in known.entries(device).items() if e.failed}
+    if wanted.label not in failed:
+        return wanted
+    smaller = [replace(wanted, lanes=lanes, items=1) for lanes in (4, 1)] if wanted.items == 1 else []
+    smaller += [replace(wanted, items=items) for items in (128, 64, 32) if items < wanted.items]
+    other = next((shape for shape in (*candidates(device), *smaller) if shape.label not in failed), None)
+    if other is None:  # what fails is told when it fails again
+        return wanted
+    driver = device.platform.version.split("  ")[0].strip()
+    _tell_once(
+        f"{device.name.strip()}, {driver}: the shape {wanted.label} of the kernels failed ({failed[wanted.label]}), "
+        f"{other.label} is taken; clsplat selftest tries {wanted.label} anew"
+    )
+    return other
+
+
+@lru_cache(maxsize=8)
+def _tell_once(text: str) -> None:
+    warnings.warn(text, stacklevel=2)
 
 
 def _parsed(text: str, default: Shape) -> Shape | None:
@@ -103,8 +160,7 @@ def _parsed(text: str, default: Shape) -> Shape | None:
 
 def saved_path() -> Path:
     """Where `clsplat tune` keeps what it found."""
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(cache) / "clsplat" / "shapes.json"
+    return known.cache_folder() / "shapes.json"
 
 
 def saved_shapes() -> dict[str, str]:
@@ -131,7 +187,7 @@ def save_shape(device: cl.Device, shape: Shape | None) -> None:
         saved = saved_shapes()
     saved.pop(_key(device), None)
     if shape is not None:
-        saved[_key(device)] = f"{shape.lanes}x{shape.items}"
+        saved[_key(device)] = shape.label
     path = saved_path()
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, (json.dumps(saved, indent=2, sort_keys=True) + "\n").encode())

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Python processes of this package that a driver may abort or hang, and what their end was."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from clsplat.errors import InputError
+
+MARK = "clsplat-child "
+"""Beginning of a line that is meant for the parent; drivers print lines of their own."""
+PATIENCE = 120.0
+"""Seconds without a word after which a driver counts as hung: the slowest that works builds a kernel in 60."""
+TIMEOUT = "CLSPLAT_DRIVER_TIMEOUT"
+REGARDLESS = "CLSPLAT_TRUST_DRIVER"
+
+
+def patience() -> float:
+    """Seconds after which a driver counts as hung: CLSPLAT_DRIVER_TIMEOUT, else PATIENCE. Raises InputError."""
+    text = os.environ.get(TIMEOUT, "")
+    if not text:
+        return PATIENCE
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < 1e6:
+        raise InputError(f"{TIMEOUT}={text}: expected seconds, such as 300")
+    return seconds
+
+
+def regardless() -> bool:
+    """True if CLSPLAT_TRUST_DRIVER=1 leaves out every test and trial of a driver."""
+    return os.environ.get(REGARDLESS, "") not in ("", "0")
+
+
+def tell(**values: object) -> None:
+    """Send a message from the child to its parent."""
+    print(MARK + json.dumps(values), flush=True)
+
+
+class Child:
+    """A process that answers in lines of JSON. Ctrl-C does not reach it: it ends with its parent, or by `close`."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        root = str(Path(__file__).resolve().parents[2])
+        path = os.pathsep.join(part for part in (root, os.environ.get("PYTHONPATH", "")) if part)
+        self._process = subprocess.Popen(
+            list(command),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            env={**os.environ, "PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", REGARDLESS: "1"},
+            start_new_session=os.name == "posix",
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+        )
+        self._lines: queue.Queue[str | None] = queue.Queue()
+        self._errors: list[str] = []
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        self._readers = [
+            threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True),
+            threading.Thread(target=self._read_errors, args=(self._process.stderr,), daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def _read(self, stream: IO[str]) -> None:
+        for line in stream:
+            if line.startswith(MARK):
+                self._lines.put(line[len(MARK) :])
+        self._lines.put(None)
+
+    def _read_errors(self, stream: IO[str]) -> None:
+        for line in stream:
+            self._errors.append(line.strip())
+
+    def send(self, message: object) -> None:
+        """A line for the child; nothing where it has ended, which `receive` finds."""
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.write(json.dumps(message) + "\n")
+            self._process.stdin.flush()
+
+    def receive(self, seconds: float) -> dict[str, Any] | None:
+        """The next message; None where the process has ended. Raises TimeoutError after so many seconds without one,
+        and ends the process."""
+        try:
+            line = self._lines.get(timeout=seconds)
+        except queue.Empty:
+            self._process.kill()
+            raise TimeoutError(f"did not come back within {seconds:g} s") from None
+        if line is None:
+            return None
+        message: dict[str, Any] = json.loads(line)
+        return message
+
+    def ending(self, where: str = "") -> str:
+        """How the process ended, for a sentence that begins with it: where, if that is known, and its last words."""
+        status = self._process.wait()
+        self._readers[1].join(timeout=5)
+        words = [line for line in self._errors if line]
+        said = next((line for line in words if "ERROR" in line or "Assertion" in line), words[-1] if words else "")
+        how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
+        return how + (f" in {where}" if where else "") + (f" ({said[:300]})" if said else "")
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.wait()
+        for reader in self._readers:
+            reader.join(timeout=5)
+        assert self._process.stdin is not None
+        with suppress(OSError):  # closing writes what the process never read
+            self._process.stdin.close()
+
+    def __enter__(self) -> Child:  # noqa: PYI034  # Self came with Python 3.11
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def python_module(module: str, *words: str) -> list[str]:
+    """The command that runs a module of this package."""
+    return [sys.executable, "-m", module, *words]

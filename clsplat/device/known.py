@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The memory of drivers, in the user's cache: by driver and kernel shape what has passed, and what has failed.
+
+An entry counts for one device, driver and set of kernels, so that a new version of any of them is tried anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import pyopencl as cl
+
+from clsplat.device.source import kernel_root, kernel_source
+from clsplat.files import atomic_write, parse_json
+
+BREAK = "CLSPLAT_BREAK_KERNEL"
+"""For the tests of `clsplat selftest` alone: STEM: WORDS => WORDS replaces words of one kernel's text, as a driver that
+miscompiles an operation would."""
+MOST = 16
+"""Drivers and versions that are remembered, the latest: each takes a few KiB."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One driver in one shape. stages: those of the self-test that passed; kernels: what has been built and launched,
+    as `rehearsal` names it, with the salt that its text needs; failed: how the driver failed, or empty."""
+
+    stages: frozenset[str] = frozenset()
+    kernels: Mapping[str, str] = field(default_factory=dict)
+    failed: str = ""
+
+
+def cache_folder() -> Path:
+    """Our part of the user's cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
+
+
+def memory_path() -> Path:
+    """The file."""
+    return cache_folder() / "drivers.json"
+
+
+@lru_cache(maxsize=4)
+def _kernels_digest(broken: str) -> str:
+    texts = "".join(kernel_source(path.stem) for path in sorted(kernel_root().glob("*.cl")))
+    return f"{zlib.crc32((texts + broken).encode()):08x}"
+
+
+def driver_key(device: cl.Device) -> str:
+    """All that an answer hangs on beside the shape."""
+    from clsplat import __version__
+
+    driver = f"{device.platform.version.strip()} | {device.driver_version.strip()}"
+    kernels = _kernels_digest(os.environ.get(BREAK, ""))
+    return f"{device.name.strip()} | {driver} | clsplat {__version__} {kernels}"
+
+
+def _entry(value: object) -> Entry:
+    """An entry of the file. What is none of ours counts as not there."""
+    if not isinstance(value, dict):
+        return Entry()
+    stages, kernels, failed = value.get("stages", []), value.get("kernels", {}), value.get("failed", "")
+    if not (isinstance(stages, list) and isinstance(kernels, dict) and isinstance(failed, str)):
+        return Entry()
+    if not all(isinstance(each, str) for each in (*stages, *kernels.values())):
+        return Entry()
+    return Entry(frozenset(stages), kernels, failed)
+
+
+_unwritten: dict[Path, dict[str, Any]] = {}
+"""By file that cannot be written: what would be in it."""
+
+
+def _read() -> dict[str, Any]:
+    if memory_path() in _unwritten:
+        return _unwritten[memory_path()]
+    try:
+        saved = parse_json(memory_path().read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return saved if isinstance(saved, dict) else {}
+
+
+def entries(device: cl.Device) -> dict[str, Entry]:
+    """All of the driver, by LANESxITEMS."""
+    shapes = _read().get(driver_key(device))
+    return {name: _entry(value) for name, value in shapes.items()} if isinstance(shapes, dict) else {}
+
+
+def remember(
+    device: cl.Device,
+    shape: str,
+    *,
+    stages: Iterable[str] = (),
+    kernels: Mapping[str, str] | None = None,
+    failed: str | None = None,
+) -> None:
+    """Add to what is known of the driver in a shape, LANESxITEMS. failed: None leaves as it is what is said of it.
+
+    A folder that cannot be written is a warning: everything is tried anew by the next process.
+    """
+    saved, key = _read(), driver_key(device)
+    shapes = saved.get(key)
+    known = entries(device).get(shape, Entry())
+    entry: dict[str, object] = {
+        "stages": sorted(known.stages | set(stages)),
+        "kernels": {**known.kernels, **(kernels or {})},
+    }
+    failure = known.failed if failed is None else failed
+    if failure:
+        entry["failed"] = failure
+    saved.pop(key, None)
+    saved[key] = {**(shapes if isinstance(shapes, dict) else {}), shape: entry}
+    for oldest in list(saved)[:-MOST]:
+        del saved[oldest]
+    path = memory_path()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
+    except OSError as error:
+        _unwritten[path] = saved
+        _tell_once(f"{path}: cannot be written ({error.strerror}), drivers are tested anew each time")
+
+
+@lru_cache(maxsize=8)
+def _tell_once(text: str) -> None:
+    warnings.warn(text, stacklevel=2)

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first build and the first launch of every kernel, in a process of its own that a driver may take down.
+
+A driver's compiler may abort or hang, at the build or, as PoCL's code generator does, not before the launch. So the
+first time that a kernel's text and options meet a driver, another process builds it, and launches it on arrays of
+zeros of the same sizes. What came back is remembered (`known`), and never tried again with that driver.
+
+As a program it is that other process: it answers lines of JSON with lines of JSON.
+"""
+
+from __future__ import annotations
+
+import atexit
+import faulthandler
+import json
+import sys
+import threading
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from clsplat.device import known
+from clsplat.device.child import Child, patience, python_module, regardless, tell
+from clsplat.device.program import Kernel, Variant, build
+from clsplat.device.shapes import caches_programs
+from clsplat.errors import DriverError, KernelBuildError
+
+IDLE = 20.0
+"""Seconds after which the process is ended: its device memory is worth more than its start, which takes half of one."""
+MOST_BYTES = 2 << 30
+"""Of a launch's arrays: beyond that the kernel is built only, as there might not be room for them twice."""
+MOST_ITEMS = 1 << 17
+"""Of a launch along each axis: enough for PoCL to make of it what it makes of any number (it has other code for less
+than 65,536), and few enough to take no time."""
+
+
+class _Process:
+    """The other process of one device, started when it is needed and ended when it is not."""
+
+    def __init__(self, index: int) -> None:
+        self._index = index
+        self._lock = threading.Lock()
+        self._child: Child | None = None
+        self._timer: threading.Timer | None = None
+
+    def ask(self, message: dict[str, Any]) -> tuple[dict[str, Any], str]:
+        """The answer, or none and how the process ended."""
+        with self._lock:
+            if self._timer is not None:
+                self._timer.cancel()
+            if self._child is None:
+                self._child = Child(python_module("clsplat.device.rehearsal", str(self._index)))
+            seconds = patience()
+            self._child.send({**message, "seconds": seconds})
+            try:
+                answer = self._child.receive(seconds)
+                ending = self._child.ending() if answer is None else ""
+            except TimeoutError as error:
+                answer, ending = None, str(error)
+            except BaseException:
+                self._end()
+                raise
+            if answer is None:
+                self._end()
+                return {}, ending
+            self._timer = threading.Timer(IDLE, self.close)
+            self._timer.daemon = True
+            self._timer.start()
+            return answer, ""
+
+    def close(self) -> None:
+        """End it; the next question starts another."""
+        with self._lock:
+            self._end()
+
+    def _end(self) -> None:
+        if self._child is not None:
+            self._child.close()
+            self._child = None
+
+
+_processes: dict[int, _Process] = {}
+
+
+def _process(index: int) -> _Process:
+    if index not in _processes:
+        _processes[index] = _Process(index)
+        atexit.register(_processes[index].close)
+    return _processes[index]
+
+
+class Rehearsal:
+    """What a driver has shown that it can build and launch, in one shape of the kernels, LANESxITEMS.
+
+    done: names of what this process has built and launched itself, for `clsplat.trust`, whose process this may be.
+    """
+
+    def __init__(self, device: cl.Device, index: int, shape: str) -> None:
+        self._device, self._index, self._shape = device, index, shape
+        self.done: set[str] = set()
+
+    def build(self, variant: Variant) -> Variant:
+        """See that the kernel file can be built; the text that can. Raises DriverError."""
+        if regardless():
+            self.done.add(variant.digest)
+            return variant
+        if variant.digest not in self._known:
+            self._ask({"build": _text(variant)}, variant, "", variant.digest)
+        return variant.anew(self._known[variant.digest])
+
+    def launch(
+        self, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: Sequence[Any]
+    ) -> None:
+        """See that the kernel can be launched. Raises DriverError."""
+        name = f"{kernel.variant.digest} {kernel.name}"
+        if regardless():
+            self.done.add(name)
+        elif name not in self._known:
+            given = [_described(argument) for argument in arguments]
+            if sum(value for kind, value in given if kind == "buffer") <= MOST_BYTES:
+                launch = {"kernel": kernel.name, "size": _few(size, local), "local": local, "arguments": given}
+                text = _text(kernel.variant.anew(self._known.get(kernel.variant.digest, "")))
+                self._ask({"build": text, "launch": launch}, kernel.variant, kernel.name, name)
+
+    def fail(self, stem: str, name: str, trouble: str) -> DriverError:
+        """Remember that the driver cannot be used in this shape; what to raise."""
+        text = f"{stem}.cl{f', {name},' if name else ''} {trouble}"
+        if not regardless():
+            known.remember(self._device, self._shape, failed=text)
+        driver = self._device.platform.version.split("  ")[0].strip()
+        return DriverError(
+            f"{self._device.name.strip()}, {driver}, kernels in the shape {self._shape}: {text}; the next call takes "
+            "another shape where there is one, --device another device"
+        )
+
+    @cached_property
+    def _known(self) -> dict[str, str]:
+        """What is known to work, with the salt of `Variant.anew` that its text needs."""
+        return dict(known.entries(self._device).get(self._shape, known.Entry()).kernels)
+
+    def _ask(self, message: dict[str, Any], variant: Variant, kernel: str, name: str) -> None:
+        answer, ending = _process(self._index).ask(message)
+        if trouble := ending or str(answer.get("trouble", "")):
+            raise self.fail(variant.stem, kernel, f"the process that tried it {ending}" if ending else trouble)
+        self._known[name] = str(answer.get("salt", ""))
+        if not answer.get("refused"):  # what is refused, with a reason, is refused here as well
+            known.remember(self._device, self._shape, kernels={name: self._known[name]})
+
+
+def _text(variant: Variant) -> dict[str, Any]:
+    return {"stem": variant.stem, "source": variant.source, "options": variant.options}
+
+
+def _few(size: tuple[int, ...], local: tuple[int, ...] | None) -> list[int]:
+    """As many items as are launched, or MOST_ITEMS, in whole groups."""
+    groups = local or tuple(1 for _ in size)
+    return [min(n, max(MOST_ITEMS // group, 1) * group) for n, group in zip(size, groups, strict=True)]
+
+
+def _described(argument: Any) -> tuple[str, Any]:
+    """An argument of a launch as JSON: its kind, and its bytes or value."""
+    if isinstance(argument, cl.LocalMemory):
+        return "local", argument.size
+    if isinstance(argument, cl.MemoryObject):
+        return "buffer", argument.size
+    value = np.asarray(argument)
+    return value.dtype.str, value.item()
+
+
+def _given(context: cl.Context, queue: cl.CommandQueue, kind: str, value: Any) -> Any:
+    """The argument that `_described` told of, memory full of zeros."""
+    if kind == "local":
+        return cl.LocalMemory(value)
+    if kind != "buffer":
+        return np.dtype(kind).type(value)
+    buffer = cl.Buffer(context, cl.mem_flags.READ_WRITE, value)
+    cl.enqueue_fill_buffer(queue, buffer, np.uint8(0), 0, value)
+    return buffer
+
+
+class _Stage:
+    """Where the child tries kernels: a device with a queue, and what has been built on it."""
+
+    def __init__(self, device: cl.Device) -> None:
+        self._device, self._context = device, cl.Context([device])
+        self._queue = cl.CommandQueue(self._context)
+        self._kernels: dict[str, dict[str, Any]] = {}
+
+    def answer(self, message: dict[str, Any]) -> dict[str, str]:
+        """Build, and launch if asked for."""
+        text = message["build"]
+        variant = Variant(text["stem"], text["source"], tuple(text["options"]))
+        try:
+            salt = ""
+            if variant.digest not in self._kernels:
+                program, salt = build(self._context, self._device, variant)
+                self._kernels[variant.digest] = {kernel.function_name: kernel for kernel in program.all_kernels()}
+                if caches_programs(self._device) and build(self._context, self._device, variant.anew(salt))[1]:
+                    return {"trouble": "has no kernels when it comes from the driver's cache"}
+            if "launch" in message:
+                self._launch(self._kernels[variant.digest], **message["launch"])
+        except (KernelBuildError, cl.MemoryError) as error:
+            return {"refused": str(error)[:300]}
+        except DriverError:
+            return {"trouble": "has no kernels when the driver has built it"}
+        except cl.Error as error:
+            return {"trouble": "cannot be launched: " + " ".join(str(error).split())[:300]}
+        return {"salt": salt}
+
+    def _launch(
+        self,
+        kernels: dict[str, Any],
+        kernel: str,
+        size: list[int],
+        local: list[int] | None,
+        arguments: list[tuple[str, Any]],
+    ) -> None:
+        given = [_given(self._context, self._queue, *argument) for argument in arguments]
+        kernels[kernel](self._queue, tuple(size), None if local is None else tuple(local), *given)
+        self._queue.finish()
+
+
+def _serve(index: int) -> None:
+    """The child: answer until the parent has gone; end by itself where a driver hangs and nobody is left to see it."""
+    from clsplat.device.context import all_devices
+
+    stage = None
+    for line in sys.stdin:
+        message = json.loads(line)
+        faulthandler.dump_traceback_later(1.5 * message["seconds"], exit=True)
+        stage = stage or _Stage(all_devices()[index])
+        answer = stage.answer(message)
+        faulthandler.cancel_dump_traceback_later()
+        tell(**answer)
+
+
+if __name__ == "__main__":
+    _serve(int(sys.argv[1]))
