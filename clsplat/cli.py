@@ -359,6 +359,11 @@ def _run(arguments: Sequence[str] | None) -> int:
                 traceback.print_exc()
             print(f"clsplat: error: {one_line(error)}", file=sys.stderr)
             return error.exit_status if isinstance(error, ClsplatError) else 1
+        except Exception as error:
+            if debug or not type(error).__module__.startswith("pyopencl"):
+                raise
+            print(f"clsplat: error: the OpenCL driver failed: {one_line(error)}", file=sys.stderr)
+            return 1
 
 
 def parse(arguments: Sequence[str]) -> Verb:

@@ -19,6 +19,7 @@ from typing import Any
 from clsplat.device.child import tell
 from clsplat.device.context import Device, all_devices
 from clsplat.device.source import kernel_root
+from clsplat.errors import DriverError
 from clsplat.selftest_bench import Bench, Outcome, digest_of
 from clsplat.selftest_result import BOUNDS, INDICES, STAGES, Result
 from clsplat.selftest_scenes import scenes
@@ -70,6 +71,8 @@ def run(
         for bench in benches:
             try:
                 outcomes.append(RUN[name](bench))
+            except DriverError:  # in another shape it may work
+                raise
             except Exception as error:  # noqa: BLE001  # drivers, and sizes that a wrong kernel has made, raise anything
                 text = " ".join(str(error).split())[:300]
                 outcomes.append(Outcome([], {}, 0.0, f"{type(error).__name__}: {text}"))
@@ -108,15 +111,19 @@ def _child(index: int, shape: tuple[int, int], stages: Sequence[str], *, quick: 
     """Build and run on the `index`-th device; a line of JSON for what begins, another for what came of it."""
     tell(begins="opening the device")
     device = Device(all_devices()[index]).with_shape(lanes=shape[0], items=shape[1])
-    if not quick:
-        start = time.perf_counter()
-        for path in sorted(kernel_root().glob("*.cl")):
-            tell(begins=f"building {path.name}")
-            device.kernels(path.stem, **BUILT_WITH.get(path.stem, {}))
-        tell(built=time.perf_counter() - start)
-    for result in run(device, quick=quick, stages=stages, say=lambda name: tell(begins=name)):
-        tell(result=asdict(result))
-    tell(done=sorted(device.rehearsal.done))
+    device.rehearsal.say = lambda kernel: tell(begins=kernel)
+    try:
+        if not quick:
+            start = time.perf_counter()
+            for path in sorted(kernel_root().glob("*.cl")):
+                device.kernels(path.stem, **BUILT_WITH.get(path.stem, {}))
+            tell(built=time.perf_counter() - start)
+        for result in run(device, quick=quick, stages=stages, say=lambda name: tell(begins=name)):
+            tell(result=asdict(result))
+    except DriverError as error:
+        tell(failed=str(error))
+    else:
+        tell(done=sorted(device.rehearsal.done))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from clsplat.device import known
 from clsplat.device.child import REGARDLESS, Child, patience, python_module, regardless
 from clsplat.device.context import Device, all_devices
-from clsplat.device.shapes import Shape, shape_of, wanted_shape
+from clsplat.device.shapes import Shape, another_shape, failures, instead, wanted_shape
 from clsplat.errors import DeviceError, DriverError
 from clsplat.selftest_result import FORWARD, STAGES, TRAINING, Result
 
@@ -82,8 +82,8 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = STAGES, *, quick: 
                 report.build_seconds = told.get("built", report.build_seconds)
                 if "result" in told:
                     report.results.append(Result(**told["result"]))
-                if "done" in told:
-                    report.kernels = told["done"]
+                if "done" in told or "failed" in told:
+                    report.kernels, report.end = told.get("done", []), told.get("failed", "")
                     return report
             report.end = f"the process {child.ending(begun)}"
         except TimeoutError as error:
@@ -102,38 +102,45 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
     if regardless():
         return device
     wanted = [name for name in STAGES if name in FORWARD or name in stages]
-    device = _reshaped(device)
-    while not set(stages) <= _passed(device):
-        name = f"{device.name}, {device.driver.split('  ')[0].strip()}"
-        print(f"{name}: used for the first time, a short test of its driver", file=sys.stderr)
-        report = examine(all_devices().index(device.cl_device), device.shape, wanted, quick=True)
-        advice = f"clsplat selftest tells more, --device takes another device, {REGARDLESS}=1 goes on regardless"
-        if report.end:
-            known.remember(device.cl_device, device.shape.label, failed=report.end)
-            other = _reshaped(device)
-            if other is device:
-                raise DriverError(f"{name}, kernels in the shape {device.shape.label}: {report.end}; {advice}")
-            device = other
-            continue
-        if report.failure:
-            raise DeviceError(f"{name}: the driver {report.verdict}; {advice}")
-        if report.other_bits:
-            warnings.warn(f"{name}: {report.verdict}", stacklevel=2)
-        known.remember(device.cl_device, device.shape.label, stages=wanted, kernels=dict.fromkeys(report.kernels, ""))
-        break
+    name = f"{device.name}, {device.driver.split('  ')[0].strip()}"
+    advice = f"clsplat selftest tells more, --device takes another device, {REGARDLESS}=1 goes on regardless"
+    given, cl_device, told = device, device.cl_device, False
+    while True:
+        label = device.shape.label
+        entry = known.entries(cl_device).get(label, known.Entry())
+        if not entry.failed and set(stages) <= entry.stages:
+            break
+        if not entry.failed:
+            if not told:
+                print(f"{name}: used for the first time, a short test of its driver", file=sys.stderr)
+            told = True
+            report = examine(all_devices().index(cl_device), device.shape, wanted, quick=True)
+            if not report.end:
+                _check(report, name, advice)
+                known.remember(cl_device, label, stages=wanted, kernels=dict.fromkeys(report.kernels, ""))
+                break
+            known.remember(cl_device, label, failed=report.end)
+        other = another_shape(cl_device, given.shape)
+        if other is None:
+            failed = failures(cl_device)
+            raise DriverError(
+                f"{name}, kernels in the shape {given.shape.label}: {failed[given.shape.label]}; none of "
+                f"{', '.join(failed)} works; {advice}"
+            )
+        device = given.with_shape(lanes=other.lanes, items=other.items)
+    if device is not given:
+        warnings.warn(
+            instead(cl_device, given.shape, device.shape, failures(cl_device)[given.shape.label]), stacklevel=2
+        )
     return device
 
 
-def _passed(device: Device) -> frozenset[str]:
-    return known.entries(device.cl_device).get(device.shape.label, known.Entry()).stages
-
-
-def _reshaped(device: Device) -> Device:
-    """The device in the shape that it would be opened with now, if its own has failed."""
-    failed = {label for label, entry in known.entries(device.cl_device).items() if entry.failed}
-    if device.shape.label not in failed or (shape := shape_of(device.cl_device)).label in failed:
-        return device
-    return device.with_shape(lanes=shape.lanes, items=shape.items)
+def _check(report: Report, name: str, advice: str) -> None:
+    """Raise DeviceError where the driver computes wrongly; warn where its bits are others."""
+    if report.failure:
+        raise DeviceError(f"{name}: the driver {report.verdict}; {advice}")
+    if report.other_bits:
+        warnings.warn(f"{name}: {report.verdict}", stacklevel=3)
 
 
 def examine_device(index: int) -> Report:

@@ -8,7 +8,6 @@ same bits only within a shape, and a trial that another load disturbed would cha
 from __future__ import annotations
 
 import statistics
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,8 +18,10 @@ import pyopencl as cl
 
 from clsplat.bench import synthetic, wall_ms
 from clsplat.device.buffers import upload
+from clsplat.device.child import Child, patience, python_module, tell
 from clsplat.device.context import Device, all_devices
 from clsplat.device.shapes import Shape, candidates, default_shape, save_shape
+from clsplat.errors import DriverError
 from clsplat.rendering import Rasterizer
 from clsplat.stages.project import allocate_gaussians, upload_gaussians
 
@@ -28,8 +29,6 @@ WORKLOAD = (50_000, 640, 480)
 """Gaussians, width and height of what is drawn."""
 ENOUGH = 0.97
 """A shape takes the default's place at this part of its time or less: what is nearer may be the trial's noise."""
-PATIENCE = 120.0
-"""Seconds after which a candidate is given up."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +40,19 @@ class Trial:
 
 
 def tune(device: cl.Device, index: int, progress: Callable[[Shape], Any] | None = None) -> tuple[list[Trial], Shape]:
-    """Try the candidates on the device, the `index`-th of all, and keep the quickest. Raises OSError."""
+    """Try the candidates on the device, the `index`-th of all, and keep the quickest. Raises DriverError where none
+    works, and OSError."""
     trials = []
     for shape in candidates(device):
         if progress is not None:
             progress(shape)
         trials.append(Trial(shape, _in_a_process(index, shape)))
+    if all(trial.ms is None for trial in trials):
+        shapes = ", ".join(trial.shape.label for trial in trials)
+        raise DriverError(
+            f"{device.name.strip()}: the driver aborted or hung in every shape that was tried, {shapes}; clsplat "
+            "selftest tells more"
+        )
     best = choose(trials)
     save_shape(device, None if best == default_shape(device) else best)
     return trials, best
@@ -63,12 +69,12 @@ def choose(trials: list[Trial]) -> Shape:
 
 
 def _in_a_process(index: int, shape: Shape) -> float | None:
-    command = [sys.executable, "-m", "clsplat.tune", str(index), str(shape.lanes), str(shape.items)]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-        return float(done.stdout) if done.returncode == 0 else None
-    except (subprocess.TimeoutExpired, ValueError):
-        return None
+    with Child(python_module("clsplat.tune", str(index), str(shape.lanes), str(shape.items))) as child:
+        try:
+            told = child.receive(patience())
+        except TimeoutError:
+            return None
+    return float(told["ms"]) if told is not None else None
 
 
 def measure(device: Device, workload: tuple[int, int, int] = WORKLOAD, repeat: int = 7) -> float:
@@ -90,4 +96,4 @@ def measure(device: Device, workload: tuple[int, int, int] = WORKLOAD, repeat: i
 if __name__ == "__main__":
     chosen = all_devices()[int(sys.argv[1])]
     shape = replace(default_shape(chosen), lanes=int(sys.argv[2]), items=int(sys.argv[3]))
-    print(measure(Device(chosen, shape)))
+    tell(ms=measure(Device(chosen, shape)))

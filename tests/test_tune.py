@@ -6,14 +6,26 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import pyopencl as cl
 import pytest
 from pipeline import shaped
 
 from clsplat import tune
 from clsplat.cli import main
 from clsplat.device.context import Device, list_devices
-from clsplat.device.shapes import Shape, candidates, default_shape, save_shape, saved_path, saved_shapes, shape_of
+from clsplat.device.shapes import (
+    Shape,
+    candidates,
+    default_shape,
+    most_items,
+    save_shape,
+    saved_path,
+    saved_shapes,
+    shape_of,
+)
 from clsplat.errors import DeviceError
 
 Capture = pytest.CaptureFixture[str]
@@ -79,6 +91,40 @@ def test_a_shape_that_is_too_large_for_the_device(default_device: Device, monkey
     monkeypatch.setenv("CLSPLAT_SHAPE", "1x1048576")
     with pytest.raises(DeviceError, match=r"CLSPLAT_SHAPE=1x1048576: .* has at most [0-9]+ items in a work-group"):
         shape_of(device)
+
+
+def gpu(items: int, local_kib: int) -> Any:
+    """A device that is none, with these limits."""
+    platform = SimpleNamespace(name="none", version="OpenCL 1.2 none")
+    return SimpleNamespace(
+        type=cl.device_type.GPU, max_work_group_size=items, local_mem_size=local_kib << 10, max_compute_units=4,
+        name="a GPU", driver_version="1", platform=platform, native_vector_width_float=1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("items", "local_kib", "most"), [(1024, 32, 512), (1024, 64, 1024), (1024, 16, 256), (256, 64, 256), (1, 32, 1)]
+)
+def test_items_that_fit_local_memory(items: int, local_kib: int, most: int) -> None:
+    device = gpu(items, local_kib)
+    assert most_items(device) == most
+    assert default_shape(device).items == min(most, 256)
+    assert all(shape.items <= most for shape in candidates(device))
+    if most > 1:
+        assert replace(default_shape(device), items=most).local_bytes <= max(local_kib, 32) << 10
+
+
+def test_a_shape_that_local_memory_is_too_small_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sort has 16 counters of 4 bytes an item: 64 KiB for 1024, where OpenCL promises 32."""
+    device = gpu(1024, 32)
+    monkeypatch.setenv("CLSPLAT_SHAPE", "1x1024")
+    with pytest.raises(
+        DeviceError, match="has 32 KiB of local memory, and a group of 1024 items needs 64 KiB; expected"
+    ):
+        shape_of(device)
+    monkeypatch.setenv("CLSPLAT_SHAPE", "1x512")
+    assert shape_of(device).items == 512
+    assert shape_of(gpu(1024, 64)).items == 512
 
 
 @pytest.mark.parametrize("content", ["no JSON", "[]", '{"a": 1}'])

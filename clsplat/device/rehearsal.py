@@ -15,7 +15,7 @@ import faulthandler
 import json
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -95,17 +95,19 @@ def _process(index: int) -> _Process:
 class Rehearsal:
     """What a driver has shown that it can build and launch, in one shape of the kernels, LANESxITEMS.
 
-    done: names of what this process has built and launched itself, for `clsplat.trust`, whose process this may be.
+    In a process that is a trial itself, such as that of `clsplat.trust`, done has the names of what was built and
+    launched, and say, if given, is told each kernel that comes next.
     """
 
     def __init__(self, device: cl.Device, index: int, shape: str) -> None:
         self._device, self._index, self._shape = device, index, shape
         self.done: set[str] = set()
+        self.say: Callable[[str], None] | None = None
 
     def build(self, variant: Variant) -> Variant:
         """See that the kernel file can be built; the text that can. Raises DriverError."""
         if regardless():
-            self.done.add(variant.digest)
+            self._begin(f"{variant.stem}.cl", variant.digest)
             return variant
         if variant.digest not in self._known:
             self._ask({"build": _text(variant)}, variant, "", variant.digest)
@@ -117,13 +119,18 @@ class Rehearsal:
         """See that the kernel can be launched. Raises DriverError."""
         name = f"{kernel.variant.digest} {kernel.name}"
         if regardless():
-            self.done.add(name)
+            self._begin(f"{kernel.variant.stem}.cl, {kernel.name}", name)
         elif name not in self._known:
             given = [_described(argument) for argument in arguments]
             if sum(value for kind, value in given if kind == "buffer") <= MOST_BYTES:
                 launch = {"kernel": kernel.name, "size": _few(size, local), "local": local, "arguments": given}
                 text = _text(kernel.variant.anew(self._known.get(kernel.variant.digest, "")))
                 self._ask({"build": text, "launch": launch}, kernel.variant, kernel.name, name)
+
+    def _begin(self, what: str, name: str) -> None:
+        self.done.add(name)
+        if self.say is not None:
+            self.say(what)
 
     def fail(self, stem: str, name: str, trouble: str) -> DriverError:
         """Remember that the driver cannot be used in this shape; what to raise."""

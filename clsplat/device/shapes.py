@@ -123,24 +123,41 @@ def wanted_shape(device: cl.Device) -> Shape:
     return shape
 
 
+def failures(device: cl.Device) -> dict[str, str]:
+    """By shape, LANESxITEMS: how the driver failed in it, as far as is known. Empty with CLSPLAT_TRUST_DRIVER=1."""
+    if regardless():
+        return {}
+    return {label: entry.failed for label, entry in known.entries(device).items() if entry.failed}
+
+
 def shape_of(device: cl.Device) -> Shape:
     """The shape that a device gets which is opened without another: `wanted_shape`, or, with a warning, the first other
     one where the driver has failed in that before. Raises DeviceError as `wanted_shape`."""
-    wanted = wanted_shape(device)
-    failed = {} if regardless() else {label: e.failed for label, e in known.entries(device).items() if e.failed}
+    wanted, failed = wanted_shape(device), failures(device)
     if wanted.label not in failed:
         return wanted
+    other = another_shape(device, wanted)
+    if other is None:  # it is told when it fails again
+        return wanted
+    _tell_once(instead(device, wanted, other, failed[wanted.label]))
+    return other
+
+
+def another_shape(device: cl.Device, wanted: Shape) -> Shape | None:
+    """The first shape in which the driver has not failed, if there is one."""
     smaller = [replace(wanted, lanes=lanes, items=1) for lanes in (4, 1)] if wanted.items == 1 else []
     smaller += [replace(wanted, items=items) for items in (128, 64, 32) if items < wanted.items]
-    other = next((shape for shape in (*candidates(device), *smaller) if shape.label not in failed), None)
-    if other is None:  # what fails is told when it fails again
-        return wanted
+    failed = failures(device)
+    return next((shape for shape in (*candidates(device), *smaller) if shape.label not in failed), None)
+
+
+def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
+    """The warning that another shape is taken."""
     driver = device.platform.version.split("  ")[0].strip()
-    _tell_once(
-        f"{device.name.strip()}, {driver}: the shape {wanted.label} of the kernels failed ({failed[wanted.label]}), "
-        f"{other.label} is taken; clsplat selftest tries {wanted.label} anew"
+    return (
+        f"{device.name.strip()}, {driver}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
+        f"taken (clsplat selftest tries {wanted.label} anew)"
     )
-    return other
 
 
 @lru_cache(maxsize=8)
