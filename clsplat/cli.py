@@ -287,8 +287,9 @@ class Tune:
 class Selftest:
     """Test every device: build the kernels, run each stage on frozen scenes, compare with float64 and stored digests.
 
-    Exit status 1 where a driver cannot be trusted. train, eval, render and demo make a short form of this test the
-    first time they meet a device; CLSPLAT_TRUST_DRIVER=1 leaves that out.
+    Exit status 1 where a driver cannot be trusted. train, eval, render, view, bench and demo make a short form of this
+    test the first time they meet a device; CLSPLAT_TRUST_DRIVER=1 leaves that out. A shape of the kernels in which a
+    driver failed is tried anew here.
     """
 
     device: Device = "all"

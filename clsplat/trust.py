@@ -120,7 +120,7 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
                 known.remember(cl_device, label, stages=wanted, kernels=dict.fromkeys(report.kernels, ""))
                 break
             known.remember(cl_device, label, failed=report.end)
-        other = another_shape(cl_device, given.shape)
+        other = another_shape(cl_device)
         if other is None:
             failed = failures(cl_device)
             raise DriverError(

@@ -136,19 +136,26 @@ def shape_of(device: cl.Device) -> Shape:
     wanted, failed = wanted_shape(device), failures(device)
     if wanted.label not in failed:
         return wanted
-    other = another_shape(device, wanted)
+    other = another_shape(device)
     if other is None:  # it is told when it fails again
         return wanted
     _tell_once(instead(device, wanted, other, failed[wanted.label]))
     return other
 
 
-def another_shape(device: cl.Device, wanted: Shape) -> Shape | None:
+def shapes_in_turn(device: cl.Device) -> list[Shape]:
+    """The shapes that are tried, the default first: the candidates, then those that ask less of a compiler."""
+    first = candidates(device)
+    default = first[0]
+    smaller = [replace(default, lanes=lanes, items=1) for lanes in (4, 1)] if default.items == 1 else []
+    smaller += [replace(default, items=items) for items in (128, 64, 32) if items < default.items]
+    return [*first, *(shape for shape in smaller if shape not in first)]
+
+
+def another_shape(device: cl.Device) -> Shape | None:
     """The first shape in which the driver has not failed, if there is one."""
-    smaller = [replace(wanted, lanes=lanes, items=1) for lanes in (4, 1)] if wanted.items == 1 else []
-    smaller += [replace(wanted, items=items) for items in (128, 64, 32) if items < wanted.items]
     failed = failures(device)
-    return next((shape for shape in (*candidates(device), *smaller) if shape.label not in failed), None)
+    return next((shape for shape in shapes_in_turn(device) if shape.label not in failed), None)
 
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
