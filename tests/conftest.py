@@ -18,19 +18,18 @@ os.environ.setdefault("CLSPLAT_TRUST_DRIVER", "1")  # the test at a driver's fir
 
 from browser import browser  # noqa: F401  # a fixture
 from calls import train
+from drivers import KEPT, begin_session, check_some_are_kept, label
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from pipeline import shaped, shapes_of
 from tiny import CONFIG, short, write_scene
 
-from clsplat.device.context import Device, list_devices, open_device
+from clsplat.device.context import Device, open_device
 
-INFOS = list_devices()
+begin_session()
 
 
-def _label(index: int) -> str:
-    words = INFOS[index].version.replace("+", " ").split()
-    number = words[words.index("PoCL") + 1] if "PoCL" in words else words[1]
-    return f"{INFOS[index].platform.split()[0]}-{number}"
+def pytest_configure() -> None:
+    check_some_are_kept()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -42,7 +41,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         item.add_marker(pytest.mark.xdist_group(item.path.stem if driver is None else f"driver {driver}"))
 
 
-@pytest.fixture(scope="session", params=range(len(INFOS)), ids=_label)
+@pytest.fixture(scope="session", params=KEPT, ids=label)
 def device(request: pytest.FixtureRequest) -> Device:
     """Each driver in turn, in its own shape."""
     return open_device(str(request.param))
@@ -54,10 +53,10 @@ def default_device() -> Device:
     return open_device()
 
 
-SHAPED = [(index, shape) for index in range(len(INFOS)) for shape in shapes_of(open_device(str(index)))]
+SHAPED = [(index, shape) for index in KEPT for shape in shapes_of(open_device(str(index)))]
 
 
-@pytest.fixture(scope="session", params=SHAPED, ids=lambda of: f"{of[1][0]}x{of[1][1]}-{_label(of[0])}")
+@pytest.fixture(scope="session", params=SHAPED, ids=lambda of: f"{of[1][0]}x{of[1][1]}-{label(of[0])}")
 def shaped_device(request: pytest.FixtureRequest) -> Device:
     """Each driver in kernel shapes."""
     index, (lanes, items) = request.param

@@ -27,6 +27,7 @@ from clsplat.runs import Run
 # From photographs to pictures
 
 
+@pytest.mark.smoke
 def test_train_leaves_a_run(trained: Path, scene: Path) -> None:
     names = {str(path.relative_to(trained)) for path in trained.rglob("*") if path.is_file()}
     expected = {"config.toml", "model.ply", "metrics.jsonl", "eval.json", "report.html", "test/00.png", "test/08.png"}
@@ -40,6 +41,7 @@ def test_train_leaves_a_run(trained: Path, scene: Path) -> None:
     assert run.model_record()["gaussians"] == len(model)
 
 
+@pytest.mark.smoke
 def test_eval_finds_what_training_found(trained: Path, scene: Path, capfd: Capture) -> None:
     stored = json.loads((trained / "eval.json").read_text())
     assert main(["eval", str(trained / "model.ply"), "--scene", str(scene), "--json"]) == 0
@@ -53,6 +55,7 @@ def test_eval_finds_what_training_found(trained: Path, scene: Path, capfd: Captu
     (trained / "eval.json").write_text(json.dumps(stored))
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("extension", ["exr", "png"])
 @pytest.mark.parametrize("alpha", [False, True])
 def test_render_writes_what_clsplat_render_gives(
@@ -99,6 +102,7 @@ def test_overwriting_starts_again(trained: Path, scene: Path, tmp_path: Path) ->
     assert (run / "model.ply").read_bytes() == (trained / "model.ply").read_bytes()
 
 
+@pytest.mark.smoke
 def test_more_iterations_later(trained: Path, scene: Path, tmp_path: Path, capfd: Capture) -> None:
     run = tmp_path / "run"
     assert train(scene, run, short(iterations=17)) == 0

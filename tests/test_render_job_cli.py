@@ -112,6 +112,7 @@ def test_up_in_a_file_is_up_in_the_picture(shot: list[str], tmp_path: Path) -> N
         np.testing.assert_allclose(found["forward.u"][seen], 0, atol=1e-3)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(
     ("extension", "flags", "format_"),
     [

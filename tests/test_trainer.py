@@ -237,6 +237,7 @@ def test_random_choices_go_on_where_they_stopped(alpha_scene: Scene, default_dev
     assert run.model_path.read_bytes() == whole
 
 
+@pytest.mark.smoke
 def test_every_driver_trains_alike(device: Device, default_device: Device, scene: Scene) -> None:
     config = short(iterations=16)
     trainers = [Trainer(scene, config, opened) for opened in (device, default_device)]

@@ -8,12 +8,14 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pytest
+from drivers import why_not
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import upload
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device, all_devices, open_device
 from clsplat.device.layout import SPLAT, TILE, SlotFields
 from clsplat.gaussians import Gaussians
 from clsplat.rendering import Frame, Rasterizer
@@ -37,7 +39,10 @@ def shapes_of(device: Device, *more: tuple[int, int]) -> tuple[tuple[int, int], 
 
 @cache
 def shaped(device: Device, lanes: int, items: int) -> Device:
-    """The device in another shape; one for the whole session, as each builds its own kernels."""
+    """The device in another shape; one for the whole session, as each builds its own kernels. Skips a test in a shape
+    in which the driver would take the process down."""
+    if reason := why_not(all_devices().index(device.cl_device), lanes, items):
+        pytest.skip(reason)
     return device.with_shape(lanes=lanes, items=items)
 
 
