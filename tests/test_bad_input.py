@@ -17,6 +17,7 @@ from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, write_scene
 from clsplat.cli import main
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -222,6 +223,7 @@ def test_bad_cameras_for_render(trained: Path, tmp_path: Path, capfd: Capture) -
     assert not out.parent.exists()
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("verb", ["train", "eval", "render"])
 def test_an_unknown_device(verb: str, scene: Path, trained: Path, tmp_path: Path, capfd: Capture) -> None:
     arguments = {

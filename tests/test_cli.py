@@ -21,6 +21,7 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.runs import Run
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("verb", ["devices", "demo", "sfm", "train", "eval", "render"])
 def test_help(verb: str, capsys: Capture) -> None:
     assert main([verb, "--help"]) == 0
@@ -79,6 +80,7 @@ def test_settings_without_sense(flags: str, message: str, folder: str, tmp_path:
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize(
     ("error", "status"),
     [
@@ -259,6 +261,7 @@ def test_bad_models(verb: str, trouble: str, model: str, folder: str, pipeline: 
     assert not pipeline.written
 
 
+@pytest.mark.smoke
 def test_devices_for_real() -> None:
     listed = command("devices", "--json")
     assert listed.returncode == 0, listed.stderr

@@ -29,6 +29,7 @@ def convert(*arguments: object) -> int:
     return main(["convert", *map(str, arguments)])
 
 
+@pytest.mark.smoke
 def test_what_was_lost_is_said(model: Path, capsys: Capture) -> None:
     target = model.with_suffix(".splat")
     assert convert(model, target) == 0
@@ -201,6 +202,7 @@ def test_info_counts_what_a_reader_refuses(model: Path, capsys: Capture) -> None
     assert "none.ply: no such file" in capsys.readouterr().err
 
 
+@pytest.mark.smoke
 def test_a_run_is_its_model(trained: Path, tmp_path: Path, capsys: Capture) -> None:
     assert main(["info", str(trained), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["path"] == str(trained / "model.ply")

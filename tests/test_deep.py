@@ -87,6 +87,7 @@ def test_the_same_bits_in_every_shape(device: Device) -> None:
         assert_same_bits(other, first)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("projection", ["perspective", "orthographic", "equirectangular", "fisheye"])
 @pytest.mark.parametrize("bins", [1, 12])
 def test_flattened_it_is_the_picture(default_device: Device, projection: str, bins: int) -> None:

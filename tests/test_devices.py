@@ -28,6 +28,7 @@ def test_each_by_its_index_and_by_its_version(capsys: Capture) -> None:
         assert found["version"] == device["version"]
 
 
+@pytest.mark.smoke
 def test_it_is_the_one_that_the_other_verbs_take(capsys: Capture) -> None:
     kind = list_devices()[-1].kind
     (found,) = listed(capsys, "--device", kind)
@@ -47,6 +48,7 @@ def test_the_environment_does_not_shorten_the_list(monkeypatch: pytest.MonkeyPat
     assert len(listed(capsys)) == len(list_devices())
 
 
+@pytest.mark.smoke
 def test_an_unknown_one(capsys: Capture) -> None:
     assert main(["devices", "--device", "abacus"]) == 2
     captured = capsys.readouterr()

@@ -18,6 +18,7 @@ import OpenImageIO as oiio
 import pytest
 from calls import Capture, flags, one_error, train
 from compare import assert_close
+from quick import quick
 from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, short, write_scene
 
 import clsplat
@@ -27,6 +28,7 @@ from clsplat.runs import Run
 # From photographs to pictures
 
 
+@pytest.mark.smoke
 def test_train_leaves_a_run(trained: Path, scene: Path) -> None:
     names = {str(path.relative_to(trained)) for path in trained.rglob("*") if path.is_file()}
     expected = {"config.toml", "model.ply", "metrics.jsonl", "eval.json", "report.html", "test/00.png", "test/08.png"}
@@ -40,6 +42,7 @@ def test_train_leaves_a_run(trained: Path, scene: Path) -> None:
     assert run.model_record()["gaussians"] == len(model)
 
 
+@pytest.mark.smoke
 def test_eval_finds_what_training_found(trained: Path, scene: Path, capfd: Capture) -> None:
     stored = json.loads((trained / "eval.json").read_text())
     assert main(["eval", str(trained / "model.ply"), "--scene", str(scene), "--json"]) == 0
@@ -53,6 +56,7 @@ def test_eval_finds_what_training_found(trained: Path, scene: Path, capfd: Captu
     (trained / "eval.json").write_text(json.dumps(stored))
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("extension", ["exr", "png"])
 @pytest.mark.parametrize("alpha", [False, True])
 def test_render_writes_what_clsplat_render_gives(
@@ -99,6 +103,7 @@ def test_overwriting_starts_again(trained: Path, scene: Path, tmp_path: Path) ->
     assert (run / "model.ply").read_bytes() == (trained / "model.ply").read_bytes()
 
 
+@pytest.mark.smoke
 def test_more_iterations_later(trained: Path, scene: Path, tmp_path: Path, capfd: Capture) -> None:
     run = tmp_path / "run"
     assert train(scene, run, short(iterations=17)) == 0
@@ -177,6 +182,7 @@ def test_ctrl_c_and_resume_give_the_same_model(scene: Path, tmp_path: Path, long
     assert steps == list(range(10, LONG.iterations + 1, 10))
 
 
+@pytest.mark.slow
 def test_kill_and_resume_give_the_same_model(scene: Path, tmp_path: Path, long_model: bytes, capfd: Capture) -> None:
     run = tmp_path / "run"
     process = start(scene, run)
@@ -227,7 +233,9 @@ def full() -> OSError:
     return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("stage", ["config.toml", "checkpoint", "model.ply", "eval.json"])
+@pytest.mark.parametrize(
+    "stage", quick(["config.toml", "checkpoint", "model.ply", "eval.json"], "checkpoint", "model.ply")
+)
 @pytest.mark.parametrize("kind", ["full disk", "Ctrl-C"])
 def test_a_write_that_fails_leaves_what_was_there(
     kind: str, stage: str, scene: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture

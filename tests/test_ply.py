@@ -33,6 +33,7 @@ def plain_table(count: int = 5) -> np.ndarray:
     return np.random.default_rng(1).standard_normal((count, len(NAMES))).astype(np.float32)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_round_trip(tmp_path: Path, degree: int, count: int) -> None:

@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from drivers import KEPT
 from pipeline import shaped
+from quick import quick
 
 from clsplat import trust
 from clsplat.cli import main
@@ -69,7 +70,14 @@ def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
 
 
-@pytest.mark.parametrize("words", BROKEN)
+@pytest.mark.parametrize(
+    "words",
+    quick(
+        BROKEN,
+        *("arithmetic: x / y", "duplicate: gaussian_from_visible[order[rank]]", "blend: before * alpha"),
+        *("channels: weight > largest[k]", "project_grad: sums[field] += slot[field]"),
+    ),
+)
 def test_one_wrong_operation_is_found(words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device) -> None:
     change, stage = BROKEN[words]
     results = condemned(default_device, monkeypatch, f"{words} => {change}", stage)
@@ -121,7 +129,7 @@ SLOPPY = {
 """A division or a square root that is off by two or three ulp, which OpenCL allows a GPU."""
 
 
-@pytest.mark.parametrize("words", SLOPPY)
+@pytest.mark.parametrize("words", quick(SLOPPY, "arithmetic: x / y", "features: q[0] / length", "adam: sqrt(*v)"))
 def test_rounding_otherwise_is_told_and_forgiven(
     words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device
 ) -> None:
@@ -193,9 +201,10 @@ def test_every_driver_here_passes(capsys: Capture) -> None:
 
 
 def test_the_table(capsys: Capture) -> None:
-    assert main(["selftest", "--device", "0"]) == 0
+    index = min(KEPT)
+    assert main(["selftest", "--device", str(index)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith(f"0: {list_devices()[0].name}, OpenCL ")
+    assert lines[0].startswith(f"{index}: {KEPT[index].name}, OpenCL ")
     assert lines[1].split()[:3] == ["stage", "worst", "error"]
     assert [line.split()[0] for line in lines[2:-1]] == ["build", *STAGES]
     assert lines[-1] == "This driver can be trusted."
@@ -207,7 +216,7 @@ def test_the_table(capsys: Capture) -> None:
 )
 def test_a_broken_driver_fails(change: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BREAK, change)
-    assert main(["selftest", "--device", "0"]) == 1
+    assert main(["selftest", "--device", str(min(KEPT))]) == 1
     captured = capsys.readouterr()
     assert captured.out.splitlines()[-1].startswith("This driver cannot be trusted: ")
     (line,) = captured.err.splitlines()
@@ -255,13 +264,12 @@ def untrusting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
-    """The stages of each test that is made."""
+    """The stages of each test that is asked for; none is made, and all pass."""
     made: list[tuple[str, ...]] = []
-    real = trust.examine
 
-    def counting(index: int, shape: Any, stages: Sequence[str], *, quick: bool) -> Report:
+    def counting(_index: int, _shape: Any, stages: Sequence[str], **_: object) -> Report:
         made.append(tuple(stages))
-        return real(index, shape, stages, quick=quick)
+        return Report()
 
     monkeypatch.setattr(trust, "examine", counting)
     return made
@@ -376,8 +384,14 @@ def test_training_and_rendering_ask_for_it(
         assert "cannot be trusted: blend: " in capsys.readouterr().err
 
 
-def test_asking_again_takes_no_time(untrusting: Path, default_device: Device) -> None:
+@pytest.mark.smoke
+def test_asking_again_starts_no_process(
+    untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
     trust.require(default_device, FORWARD)
-    start = time.perf_counter()
+
+    def started(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(trust, "examine", started)
     trust.require(default_device, FORWARD)
-    assert time.perf_counter() - start < 0.1, "a file of a few lines is read, and the kernels' texts are hashed"

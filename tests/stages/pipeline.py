@@ -8,12 +8,14 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pytest
+from drivers import why_not
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import upload
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device, all_devices, open_device
 from clsplat.device.layout import SPLAT, TILE, SlotFields
 from clsplat.gaussians import Gaussians
 from clsplat.rendering import Frame, Rasterizer
@@ -28,16 +30,22 @@ from clsplat.stages.project import (
 BACKGROUND = (0.1, 0.2, 0.3)
 
 
+QUICK_SHAPES = (8, 1), (1, 64)
+"""A CPU's and a GPU's."""
+
+
 def shapes_of(device: Device, *more: tuple[int, int]) -> tuple[tuple[int, int], ...]:
     """(lanes, items) that a driver is tested in: a CPU's shape, a GPU's; the default driver also in the scalar loop, in
     a mixture, and in `more`. Building takes most of the time. Each driver in each shape: tools/digests.py."""
-    both = (8, 1), (1, 64)
-    return (*both, (1, 1), (8, 16), *more) if device is open_device() else both
+    return (*QUICK_SHAPES, (1, 1), (8, 16), *more) if device is open_device() else QUICK_SHAPES
 
 
 @cache
 def shaped(device: Device, lanes: int, items: int) -> Device:
-    """The device in another shape; one for the whole session, as each builds its own kernels."""
+    """The device in another shape; one for the whole session, as each builds its own kernels. Skips a test in a shape
+    in which the driver would take the process down."""
+    if reason := why_not(all_devices().index(device.cl_device), lanes, items):
+        pytest.skip(reason)
     return device.with_shape(lanes=lanes, items=items)
 
 

@@ -41,6 +41,7 @@ def test_steps(shaped_device: Device, count: int) -> None:
         assert not g[group].get().any(), "the gradient is to be left zero"
 
 
+@pytest.mark.smoke
 def test_no_gradient_no_step(device: Device) -> None:
     p, g, m, v = (allocate_gaussians(device, 20, 1, zero=True) for _ in range(4))
     p["means"].fill(0.5)
@@ -75,6 +76,7 @@ def test_sparse_steps_are_those_of_the_visible(shaped_device: Device, count: int
         np.testing.assert_array_equal(got[~visible], values[~visible], err_msg=group)
 
 
+@pytest.mark.smoke
 def test_sh_rest_waits_for_its_step(device: Device) -> None:
     """Its second update, at step 6 of every third, is Adam's second step."""
     config = OptimiserConfig(sh_rest_every=3)

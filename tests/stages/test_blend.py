@@ -30,6 +30,7 @@ def assert_image(device: Device, name: str) -> None:
     assert_close_images(Pipeline.run(device, scene).image, wanted.image, 2e-5, ignore=wanted.margin < 1e-4)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("name", scenes.NAMED)
 def test_image(device: Device, name: str) -> None:
     assert_image(device, name)

@@ -128,6 +128,7 @@ def test_nothing_there(shaped_device: Device) -> None:
         assert (values == (-1 if name == "index" else 0)).all(), name
 
 
+@pytest.mark.smoke
 def test_behind_the_other_camera(device: Device) -> None:
     gaussians, camera = scenes.one()
     pipeline = Pipeline.run(device, (gaussians, camera))

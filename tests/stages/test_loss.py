@@ -54,6 +54,7 @@ def test_equal_images_have_no_loss(shaped_device: Device) -> None:
     assert squared == 0
 
 
+@pytest.mark.smoke
 def test_a_smaller_image_after_a_larger_one(device: Device) -> None:
     """The workspace's margins move with the size, and have to be zero again."""
     rng, work = np.random.default_rng(0), Workspace(device)

@@ -17,6 +17,7 @@ from clsplat.reference import render as reference
 WHITEN = np.sqrt(np.log2(np.e) / 2)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("name", scenes.NAMED)
 def test_projection(device: Device, name: str) -> None:
     scene = scenes.NAMED[name]()
@@ -37,6 +38,7 @@ def test_projection(device: Device, name: str) -> None:
     assert_close(run.splat("L11", "L12", "L22")[shown] / WHITEN / scale, whitening / scale, absolute=1e-5)
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("name", scenes.NAMED)
 def test_gradients(device: Device, name: str) -> None:
     assert_gradients(device, name)

@@ -176,6 +176,7 @@ def test_motion_to_another_projection_is_none(default_device: Device) -> None:
         motion_of(default_device, [0.0, 0, 1], camera, replace(camera, projection="fisheye"))
 
 
+@pytest.mark.smoke
 def test_a_turn_of_the_panorama_is_a_shift(device: Device) -> None:
     # A quarter turn of the camera about its own vertical axis moves the picture by a quarter of its width.
     camera, gaussians = panorama(96, 48), all_around(300, 7)

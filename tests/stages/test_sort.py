@@ -67,6 +67,7 @@ def test_radix_by_wide_digits(shaped_device: Device, n: int, bits: int) -> None:
     check(keys, radix(shaped_device, keys, bits, 12345))
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("value", [0, 1, 0x7FFFFFFF, 0xFFFFFFFF])
 def test_equal_keys_keep_their_order(shaped_device: Device, value: int) -> None:
     keys = np.full(1500, value, np.uint32)

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The OpenCL devices that tests run on, and the kernel shapes that each of them can do.
+
+CLSPLAT_TEST_DRIVERS narrows them down: words with commas between, of which a device's platform, version or name has
+to contain one.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from clsplat.device.context import DeviceInfo, all_devices, list_devices
+from clsplat.device.shapes import Shape, default_shape
+from clsplat.files import atomic_write
+from clsplat.trust import examine
+
+NARROW = "CLSPLAT_TEST_DRIVERS"
+SESSION = "CLSPLAT_TEST_SESSION"
+"""The folder of what all processes of a run share: the first sets it, and it goes with that one."""
+
+
+def _kept() -> list[DeviceInfo]:
+    words = [word.strip().lower() for word in os.environ.get(NARROW, "").split(",") if word.strip()]
+    texts = {info.index: f"{info.platform} {info.version} {info.name}".lower() for info in list_devices()}
+    return [info for info in list_devices() if not words or any(word in texts[info.index] for word in words)]
+
+
+KEPT = {info.index: info for info in _kept()}
+"""By their index."""
+if os.environ.get(NARROW) and KEPT:
+    os.environ["CLSPLAT_DEVICE"] = str(min(KEPT))  # the default driver is one of them, in children too
+
+
+def check_some_are_kept() -> None:
+    """Raises UsageError where CLSPLAT_TEST_DRIVERS leaves none."""
+    if os.environ.get(NARROW) and not KEPT:
+        there = "; ".join(f"{info.version}, {info.name}" for info in list_devices()) or "none"
+        words = f"{NARROW}={os.environ[NARROW]}"
+        raise pytest.UsageError(f"{words}: no OpenCL device contains one of these words; there are: {there}")
+
+
+def label(index: int) -> str:
+    """A driver's name and version, short."""
+    words = KEPT[index].version.replace("+", " ").split()
+    number = words[words.index("PoCL") + 1] if "PoCL" in words else words[1]
+    return f"{KEPT[index].platform.split()[0]}-{number}"
+
+
+def begin_session() -> None:
+    """Make the folder that all processes of this run share, in the first of them."""
+    if SESSION not in os.environ:
+        folder = tempfile.mkdtemp(prefix="clsplat-tests-")
+        os.environ[SESSION] = folder
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+
+
+@cache
+def why_not(index: int, lanes: int, items: int) -> str:
+    """Why kernels in this shape cannot run on a device, found out in a process of its own; empty where they can.
+
+    PoCL 3.0 has no square root of 16 lanes on processors with AVX-512, and aborts at the first launch of a kernel that
+    has one. A wrong result is no reason: that is for the tests to find.
+    """
+    device = all_devices()[index]
+    if lanes <= default_shape(device).lanes:
+        return ""
+    answer = Path(os.environ[SESSION]) / f"{index}-{lanes}x{items}"
+    if answer.exists():
+        return answer.read_text()
+    with pytest.MonkeyPatch.context() as patch:
+        # of its own: an aborted build leaves a program without kernels there
+        patch.setenv("POCL_CACHE_DIR", tempfile.mkdtemp(dir=answer.parent))
+        report = examine(index, Shape(lanes, items, default_shape(device).chunks), ("arithmetic",), quick=True)
+    driver = " ".join(device.platform.version.split("  ")[0].split()[2:])
+    ends = {"signal": "aborts", "did not come back": "hangs", "DeviceError": "cannot be used"}
+    how = next((verb for words, verb in ends.items() if words in report.end), "")
+    reason = f"{driver} {how} in {lanes}x{items} on this processor" if how else ""
+    atomic_write(answer, reason.encode())
+    return reason
