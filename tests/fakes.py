@@ -152,7 +152,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         "training": {"train": train},
         "rendering": {"Renderer": Renderer},
         "device.context": {"open_device": open_device},
-        "trust": {"require": lambda *_: None},
+        "trust": {"require": lambda device, *_: device},
         "images": {"write_image": write_image},
     }
     for name, members in fakes.items():
