@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scenes
 from pipeline import Pipeline
+from quick import quick
 
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import Workspace, upload
@@ -48,7 +49,7 @@ def assert_lists_hold_every_tile(device: Device, name: str) -> None:
     assert [len(tiles) for tiles in got] == list(run.frame.projected.tile_counts.get())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick(NAMES, *IN_EVERY_SHAPE))
 def test_few_tiles_are_listed_in_vain(device: Device, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make(name)
     run = Pipeline.run(device, scene)
@@ -83,7 +84,7 @@ def test_equal_depths_go_by_index(device: Device) -> None:
     np.testing.assert_array_equal(gaussians, np.sort(gaussians))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick(NAMES, *IN_EVERY_SHAPE))
 def test_squares_are_those_of_the_longest_half_axis(device: Device, name: str) -> None:
     scene = make(name)
     run = Pipeline.run(device, scene, config=RasterizerConfig(tile_test="square"))
