@@ -7,14 +7,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import chromium_path, require
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 ARGUMENTS = (
     *("--no-sandbox", "--disable-dev-shm-usage"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
@@ -22,21 +21,15 @@ ARGUMENTS = (
 """Of root in a container, with little shared memory; WebGL without a GPU."""
 
 
-def chromium_path() -> str | None:
-    """The browser: CLSPLAT_CHROMIUM, or what the path has; None where there is none."""
-    named = os.environ.get("CLSPLAT_CHROMIUM")
-    return next((found for name in ([named] if named else NAMES) if (found := shutil.which(name))), None)
-
-
 @pytest.fixture(scope="module")  # while it is open there is an event loop in this thread, which other tests may mind
 def browser() -> Iterator[Any]:
     """A Playwright browser. Make a page of it with `browser.new_page()`, and close that."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="the extra `test` brings playwright")
-    path = chromium_path()
-    if path is None:
-        pytest.skip("no Chromium on this system: apt-get install chromium, or set CLSPLAT_CHROMIUM")
-    with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=path, args=list(ARGUMENTS))
+    for name in ("playwright", "chromium"):
+        require(name)
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=chromium_path(), args=list(ARGUMENTS))
         yield opened
         opened.close()
 

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -20,25 +22,48 @@ from browser import browser  # noqa: F401  # a fixture
 from calls import train
 from drivers import KEPT, begin_session, check_some_are_kept, label
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
-from pipeline import shaped, shapes_of
+from needs import missing
+from pipeline import QUICK_SHAPES, shaped, shapes_of
 from tiny import CONFIG, short, write_scene
 
 from clsplat.device.context import Device, open_device
 
 begin_session()
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a run in the background; tests interrupt its children
+# what PoCL takes by itself: tests that move the cache away then do not build every kernel anew
+os.environ.setdefault(
+    "POCL_CACHE_DIR", str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pocl" / "kcache")
+)
 
 
 def pytest_configure() -> None:
     check_some_are_kept()
 
 
+@pytest.hookimpl(tryfirst=True)  # before the slow ones are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """With `-n 2 --dist loadgroup`: a driver's tests in one process, so that its kernels are built once, which is what
-    most of the time goes to; else a file's."""
+    most of the time goes to; else a file's. The quick run has two shapes, as building is slow."""
     for item in items:
         parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
-        driver = parameters["shaped_device"][0] if "shaped_device" in parameters else parameters.get("device")
+        driver, shape = parameters.get("shaped_device", (parameters.get("device"), None))
+        if shape is not None and shape not in QUICK_SHAPES:
+            item.add_marker(pytest.mark.slow)
         item.add_marker(pytest.mark.xdist_group(item.path.stem if driver is None else f"driver {driver}"))
+        for marker in item.iter_markers("needs"):
+            if reason := missing(*marker.args):
+                item.add_marker(pytest.mark.skip(reason=reason))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """One line for each reason to skip tests."""
+    reasons = [str(report.longrepr[2]) for report in terminalreporter.stats.get("skipped", [])]
+    counts = Counter(reason.removeprefix("Skipped: ") for reason in reasons)
+    if counts:
+        terminalreporter.section("skipped")
+    for reason, count in counts.most_common():
+        terminalreporter.line(f"{count:5} {reason}")
 
 
 @pytest.fixture(scope="session", params=KEPT, ids=label)

@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small models for tests of files, and where the real ones are."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from needs import SCENES, require
 
 from clsplat.gaussians import Gaussians
-
-SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
 
 
 def real_file(name: str) -> Path:
     """A file or folder of the real data; skips the test where it is not there."""
     path = SCENES / name
     if not path.exists():
-        pytest.skip(f"{path} is not there (CLSPLAT_SCENES names the folder of the real data)")
+        require("scenes")
+        pytest.skip(f"CLSPLAT_SCENES has no {name}")
     return path
 
 

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Independent readers and writers of model files, from npm; tests that need one skip where it is not to be had.
+"""Independent readers and writers of model files, from npm; tests that need one skip where it is not installed.
 
-CLSPLAT_NODE_MODULES names a folder of installed packages. Without it they are installed once, into .pytest_cache.
-As a script: installs them, and says where they are or why not.
+CLSPLAT_NODE_MODULES names a folder of installed packages. Without it they are those that this file, as a script,
+installs into .pytest_cache; it says where they are or why not.
 """
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 import shutil
@@ -18,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import NODE_CACHE, node_modules, require
 
 PACKAGES = ("@playcanvas/splat-transform@2.7.1", "gltf-validator@2.0.0-dev.3.10")
 """splat-transform 3 asks for Node.js 22."""
-CACHE = Path(__file__).parents[1] / ".pytest_cache" / "node"
 
 VALIDATE = """
 const fs = require("fs"), path = require("path"), file = process.argv[1];
@@ -32,19 +31,17 @@ require("gltf-validator").validateBytes(new Uint8Array(fs.readFileSync(file)), {
 """
 
 
-@functools.cache
-def modules() -> Path | str:
-    """The folder node_modules, or why there is none."""
+def install() -> Path | str:
+    """The folder of the packages, or why there is none."""
     if shutil.which("node") is None:
         return "there is no node to run readers from npm with"
-    if given := os.environ.get("CLSPLAT_NODE_MODULES"):
-        return Path(given).resolve()
-    if (CACHE / "node_modules").is_dir():
-        return CACHE / "node_modules"
+    if found := node_modules():
+        return found
     if shutil.which("npm") is None:
         return "there is no npm; install it, or set CLSPLAT_NODE_MODULES"
-    CACHE.parent.mkdir(exist_ok=True)
-    folder = Path(tempfile.mkdtemp(dir=CACHE.parent))
+    cache = NODE_CACHE.parent
+    cache.parent.mkdir(exist_ok=True)
+    folder = Path(tempfile.mkdtemp(dir=cache.parent))
     command = ["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", "--prefix", str(folder), *PACKAGES]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
@@ -55,17 +52,17 @@ def modules() -> Path | str:
         shutil.rmtree(folder)
         return f"npm cannot install {' '.join(PACKAGES)}: {done.stderr.strip()[-200:]}"
     try:
-        folder.rename(CACHE)
+        folder.rename(cache)
     except OSError:  # another process was first
         shutil.rmtree(folder)
-    return CACHE / "node_modules"
+    return NODE_CACHE
 
 
 def _node(package: str, *arguments: str) -> str:
     """What node prints; skips the test where the package is not there."""
-    folder = modules()
-    if isinstance(folder, str):
-        pytest.skip(folder)
+    require("node")
+    folder = node_modules()
+    assert folder is not None
     if not (folder / package).is_dir():
         pytest.skip(f"CLSPLAT_NODE_MODULES has no {package}: npm install --ignore-scripts {' '.join(PACKAGES)}")
     done = subprocess.run(
@@ -95,5 +92,5 @@ def validate_gltf(path: Path) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    where = modules()
+    where = install()
     sys.exit(where if isinstance(where, str) else print(where))

@@ -295,6 +295,7 @@ def test_settings_hold_every_switch_and_preset() -> None:
         assert any(getattr(config, field) != getattr(RasterizerConfig(), field) for config in named.values()), field
 
 
+@pytest.mark.slow
 def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tradeoff, "CROP", 48)
     candidates = {
@@ -392,9 +393,9 @@ def result() -> dict[str, object]:
     }
 
 
+@pytest.mark.needs("matplotlib")
 @pytest.mark.parametrize("name", ["plot.svg", "plot.PNG"])
 def test_plot_is_written(tmp_path: Path, result: dict[str, object], name: str) -> None:
-    pytest.importorskip("matplotlib")
     path, again = tmp_path / name, tmp_path / f"again_{name}"
     for file in (path, again):
         plots.check_plot(file)
@@ -407,9 +408,9 @@ def test_plot_is_written(tmp_path: Path, result: dict[str, object], name: str) -
             assert words.replace("'", "&#39;") in text or words in text
 
 
+@pytest.mark.needs("matplotlib")
 @pytest.mark.usefixtures("_quick")
 def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("matplotlib")
     some = {"exact": PRESETS["exact"], "fast": PRESETS["fast"]}
     monkeypatch.setattr(tradeoff, "settings", lambda: some)
     path = tmp_path / "plot.svg"
@@ -460,8 +461,8 @@ def test_preset_in_training(tmp_path: Path, capsys: Capture) -> None:
     assert "--preset fast and --resume" in capsys.readouterr().err
 
 
+@pytest.mark.needs("matplotlib")
 def test_plot_of_training(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     run = tmp_path / "run"
     scene = write_scene(tmp_path / "scene")
     assert main(["train", str(scene), "-o", str(run), "--iterations", "4", "--eval-at", "2"]) == 0

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from needs import require
 
 from clsplat.errors import InputError
 from clsplat.paths import choose_shot, read_shot
@@ -44,7 +45,7 @@ def Xform "rig"
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Path:
-    pytest.importorskip("pxr", reason="usd-core is not installed (the extra `usd` brings it)")
+    require("pxr")
     path = tmp_path / "shot.usda"
     path.write_text(STAGE)
     return path

@@ -200,6 +200,7 @@ def test_a_folder_that_is_read_only_is_named(scene: Path, tmp_path: Path, capfd:
     assert f"Permission denied: '{tmp_path / 'run'}'" in capfd.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_a_few_kills(capfd: Capture, default_device: object) -> None:
     """`tools/stress_kills.py --kills 100` is the long form."""
     assert stress_kills.main(["--kills", "2", "--seed", "5"]) == 0

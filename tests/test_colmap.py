@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import os
 import random
 import shutil
 from pathlib import Path
@@ -9,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from needs import SCENES
 
 from clsplat.colmap import find_model, read_cameras, read_model, rotation_from_quaternion
 from clsplat.errors import InputError
-
-SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
-needs_scenes = pytest.mark.skipif(not SCENES.is_dir(), reason=f"no real scenes: {SCENES} is not there (CLSPLAT_SCENES)")
 
 
 def make_model(folder: Path, names: list[str] | None = None, model: str = "PINHOLE") -> pycolmap.Reconstruction:
@@ -190,7 +187,7 @@ def test_rotation_from_quaternion() -> None:
     np.testing.assert_allclose(rotation_from_quaternion(quaternion), pycolmap.Rotation3d(xyzw).matrix(), atol=1e-15)
 
 
-@needs_scenes
+@pytest.mark.needs("scenes")
 @pytest.mark.parametrize("name", ["fox", "sceaux_castle"])
 def test_real_points_project_to_their_observations(name: str) -> None:
     """Our cameras, our points and COLMAP's keypoints, matched by COLMAP's tracks: the README's reprojection error."""

@@ -33,6 +33,7 @@ def test_photos_are_whole_repeatable_and_hold_no_pose(tmp_path):
     assert not [attribute.name for attribute in spec.extra_attribs if attribute.name.startswith(("Exif", "GPS"))]
 
 
+@pytest.mark.slow
 def test_every_object_is_textured(surfaces):
     for surface in surfaces:
         rows, columns = surface.rows, surface.columns

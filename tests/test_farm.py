@@ -6,7 +6,6 @@ from __future__ import annotations
 import ast
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from typing import Any
 
 import pytest
 from calls import Capture, error_line, left_behind
+from needs import openjd_path, require
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
 from clsplat import farm
@@ -93,8 +93,9 @@ def workers() -> list[int]:
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.needs("distributed")
 def test_a_worker_is_killed_half_way(shot: list[str], whole: dict[str, bytes], tmp_path: Path, capsys: Capture) -> None:
-    pytest.importorskip("distributed", reason="the extra `farm` brings it")
     killer = Killer(tmp_path)
     killer.start()
     capsys.readouterr()
@@ -110,8 +111,9 @@ def test_a_worker_is_killed_half_way(shot: list[str], whole: dict[str, bytes], t
     assert contents(tmp_path) == whole
 
 
+@pytest.mark.slow
+@pytest.mark.needs("distributed")
 def test_ctrl_c_of_a_terminal(shot: list[str], tmp_path: Path) -> None:
-    pytest.importorskip("distributed", reason="the extra `farm` brings it")
     line = [sys.executable, "-m", "clsplat", "render", *shot, "-o", str(tmp_path / "a.####.exr"), "--workers", "2"]
     line += ["--progress", "json", "--width", "1600"]  # large enough that there are frames left
     process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -127,7 +129,9 @@ def test_ctrl_c_of_a_terminal(shot: list[str], tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    distributed = pytest.importorskip("distributed", reason="the extra `farm` brings it")
+    require("distributed")
+    import distributed
+
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, host="127.0.0.1", protocol="tcp://"
     ) as made:
@@ -151,8 +155,8 @@ def test_a_frame_that_fails_ends_the_job(
     assert not [path for path in tmp_path.iterdir() if path.suffix == ".exr"]
 
 
+@pytest.mark.needs("distributed")
 def test_no_scheduler(shot: list[str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("distributed", reason="the extra `farm` brings it")
     monkeypatch.setattr(farm, "PATIENCE", 1)
     assert render(shot, tmp_path, "--scheduler", "tcp://127.0.0.1:9") == 2
     assert "--scheduler tcp://127.0.0.1:9: no scheduler answers there" in error_line(capsys)
@@ -211,7 +215,8 @@ def test_what_a_worker_does(shot: list[str], tmp_path: Path) -> None:
 
 
 def test_a_frame_whose_workers_are_always_lost(shot: list[str], tmp_path: Path, monkeypatch: Any) -> None:
-    distributed = pytest.importorskip("distributed", reason="the extra `farm` brings it")
+    require("distributed")
+    import distributed
 
     class Future:
         key = "clsplat-abc-7"
@@ -244,12 +249,11 @@ def test_a_frame_whose_workers_are_always_lost(shot: list[str], tmp_path: Path, 
 
 @pytest.fixture
 def openjd() -> str:
-    found = shutil.which("openjd", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
-    if found is None:
-        pytest.skip("openjd-cli is not installed, the extra `dev` brings it")
-    return found
+    require("openjd")
+    return str(openjd_path())
 
 
+@pytest.mark.slow
 def test_the_open_job_description_runs(openjd: str, shot: list[str], whole: dict[str, bytes], tmp_path: Path) -> None:
     checked = subprocess.run([openjd, "check", str(TEMPLATE)], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stdout + checked.stderr

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from models import real_file
+from needs import require
 from splats import lopsided
 
 from clsplat.camera import Camera
@@ -34,7 +35,7 @@ FILES = {
 def through(name: str, model: Gaussians, folder: Path) -> Gaussians:
     module, _ = FILES[name]
     if module is usd:
-        pytest.importorskip("pxr", reason="usd-core is not installed")
+        require("pxr")
     options = {"version": int(name[1])} if name.startswith("v") else {}
     module.write(folder / name, model, **options)
     read: Gaussians = module.read(folder / name)

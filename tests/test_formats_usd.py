@@ -11,14 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from needs import require
 from scipy.spatial.transform import Rotation
 from splats import assert_refused_or_sound, assert_within, colours, covariances, damaged, lopsided, with_origin
 
 from clsplat.errors import InputError
 from clsplat.formats import usd
 
-pytest.importorskip("pxr", reason="usd-core is not installed")
-from pxr import Gf, Sdf, Usd, UsdGeom
+require("pxr")
+from pxr import Gf, Sdf, Usd, UsdGeom  # noqa: E402
 
 EXACT = {"means": 0, "rotations": 1e-6, "log_scales": 5e-7, "opacities": 2e-7, "sh0": 0, "sh": 0}
 """The rest is float32's rounding of unit quaternions, of exp and of the sigmoid."""

@@ -65,6 +65,7 @@ def peak_of(read: Callable[[], object]) -> int:
 # The sample
 
 
+@pytest.mark.slow
 def test_a_sample_of_every_reader() -> None:
     tallies = stress(list(READERS), 500, seed=7, jobs=2)
     assert {name: tally.failures for name, tally in tallies.items() if tally.failures} == {}
@@ -103,6 +104,7 @@ def test_a_verdict_can_be_good(tmp_path: Path) -> None:
     assert verdict(broken(read=lambda _: None), tmp_path) == (False, "")
 
 
+@pytest.mark.slow
 def test_a_crash_and_a_loop_are_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = tmp_path / "hostile_fakes.py"
     module.write_text(

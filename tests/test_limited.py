@@ -221,6 +221,7 @@ def test_the_command_line_says_what_it_will_do(
     assert main([*call, "--max-device-mem", "1M"]) == 0
 
 
+@pytest.mark.slow
 def test_bench_under_a_limit(capsys: pytest.CaptureFixture[str]) -> None:
     call = ["bench", "--gaussians", "2000", "--size", "96x64", "--repeat", "1", "--json"]
     found = []

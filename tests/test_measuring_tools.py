@@ -31,8 +31,8 @@ def test_sizes() -> None:
     assert sizes(10_000, 29_999) == [10_000]
 
 
+@pytest.mark.needs("matplotlib")
 def test_sort(tmp_path: Path, capsys: Capture) -> None:
-    pytest.importorskip("matplotlib")
     plot = tmp_path / "sort.svg"
     assert bench_sort.main(["--max", "3e4", "--repeat", "1", "--json", "--plot", str(plot)]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -82,8 +82,8 @@ def test_wrong_calls_of_bench_sort(flags: str, message: str, capsys: Capture) ->
     assert message in one_error(capsys, "bench_sort")
 
 
+@pytest.mark.needs("matplotlib")
 def test_growth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    pytest.importorskip("matplotlib")
     for name, value in {"GAUSSIANS": 500, "WIDTH": 80, "HEIGHT": 60, "FEWEST": 100}.items():
         monkeypatch.setattr(bench_growth, name, value)
     monkeypatch.setattr(bench_growth, "MEGAPIXELS", (0.003, 0.006, 0.012, 1.0))
@@ -155,6 +155,7 @@ def test_peer_with_a_known_limit(peer_scene: Path, capsys: Capture) -> None:
     assert result["repeat"] == 28
 
 
+@pytest.mark.slow
 def test_peer_with_a_program(peer_scene: Path, tmp_path: Path, capsys: Capture) -> None:
     program = tmp_path / "limit.py"
     program.write_text("import sys; print(f'2 threads 8 lanes: {sys.argv[1]} Gpairs/s')")

@@ -9,6 +9,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
+from needs import require
 
 from clsplat.device.source import kernel_root
 
@@ -20,7 +21,7 @@ FOUND = "from clsplat.device.source import kernel_root; print(kernel_root())"
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     """The wheel, built in the environment at hand: no network."""
-    pytest.importorskip("hatchling", reason="the extra `test` brings it")
+    require("hatchling")
     folder = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
     built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -18,6 +18,7 @@ import OpenImageIO as oiio
 import pytest
 from calls import Capture, flags, one_error, train
 from compare import assert_close
+from quick import quick
 from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, short, write_scene
 
 import clsplat
@@ -181,6 +182,7 @@ def test_ctrl_c_and_resume_give_the_same_model(scene: Path, tmp_path: Path, long
     assert steps == list(range(10, LONG.iterations + 1, 10))
 
 
+@pytest.mark.slow
 def test_kill_and_resume_give_the_same_model(scene: Path, tmp_path: Path, long_model: bytes, capfd: Capture) -> None:
     run = tmp_path / "run"
     process = start(scene, run)
@@ -231,7 +233,9 @@ def full() -> OSError:
     return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("stage", ["config.toml", "checkpoint", "model.ply", "eval.json"])
+@pytest.mark.parametrize(
+    "stage", quick(["config.toml", "checkpoint", "model.ply", "eval.json"], "checkpoint", "model.ply")
+)
 @pytest.mark.parametrize("kind", ["full disk", "Ctrl-C"])
 def test_a_write_that_fails_leaves_what_was_there(
     kind: str, stage: str, scene: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture

@@ -17,6 +17,7 @@ import pytest
 from calls import Capture
 from calls import train as command_train
 from compare import assert_same_bits
+from quick import quick
 from tiny import CONFIG, short, write_scene
 
 from clsplat import replay
@@ -166,7 +167,7 @@ def test_trouble_in_the_command_line_is_a_warning(scene: Scene, tmp_path: Path, 
     assert told[0].startswith("clsplat: warning: step 7, view 0")
 
 
-@pytest.mark.parametrize("stop", [7, 8, 9, 11, 12, 20])
+@pytest.mark.parametrize("stop", quick([7, 8, 9, 11, 12, 20], 7, 11))
 def test_trouble_and_stopping_give_the_same_bytes_as_trouble_alone(
     scene: Scene, default_device: Device, tmp_path: Path, stop: int
 ) -> None:

@@ -280,6 +280,7 @@ def test_a_full_disk_ends_the_job(shot: list[str], tmp_path: Path, capsys: Captu
     assert "a.0003.exr: cannot be written: No space left on device" in error_line(capsys)
 
 
+@pytest.mark.slow
 def test_killed_at_random(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     more = ["--count", "40", "--channels", "rgb,alpha,depth,normals", "--exr", "half", "--width", "240"]
     assert stress_render_kills.main(["-o", str(tmp_path), "--kills", "3", "--", *shot, *more]) == 0

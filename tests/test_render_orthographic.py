@@ -14,6 +14,7 @@ import OpenImageIO as oiio
 import pytest
 from calls import Capture, error_line
 from compare import assert_close
+from needs import require
 from numpy.typing import NDArray
 from scenes import make_gaussians
 from scipy.spatial.transform import Rotation
@@ -60,7 +61,7 @@ def keyed(path: Path, poses: Sequence[tuple[NDArray[np.float64], NDArray[np.floa
 
 def stage(path: Path) -> Path:
     """The camera, and at frame 2 a step to its right; apertures are in tenths of a unit."""
-    pytest.importorskip("pxr", reason="usd-core is not installed (the extra `usd` brings it)")
+    require("pxr")
 
     def rows(step: float) -> str:
         matrix = np.eye(4)

@@ -222,8 +222,10 @@ def test_another_colour_space_is_not_what_is_wanted(shot: list[str], tmp_path: P
     assert spec.getattribute("clsplat:colorspace") == "ACEScg"
 
 
+@pytest.mark.needs("av")
 def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    av = pytest.importorskip("av", reason="the extra `video` brings it")
+    import av
+
     small = tmp_path / "small.mp4"
     flags = "--video.fps 12 --video.crf 10 --video.preset fast --count 9 --path through --json"
     assert render(shot, tmp_path, flags, "a.mp4") == 0
@@ -286,8 +288,10 @@ def test_the_plan(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.needs("distributed")
 def test_everything_on_a_farm(shot: list[str], tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed", reason="the extra `farm` brings it")
+    import distributed
+
     cases = [("all", EVERYTHING, "a.####.exr"), ("deep", "--deep --deep.bins 3", "a.####.exr")]
     cases += [] if video_missing() else [("video", "", "a.mp4")]
     with distributed.LocalCluster(
@@ -300,6 +304,7 @@ def test_everything_on_a_farm(shot: list[str], tmp_path: Path) -> None:
             assert contents(tmp_path / name / "there") == contents(tmp_path / name / "here") != {}, name
 
 
+@pytest.mark.needs("av")
 def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Capture, monkeypatch: Any) -> None:
     cases = [
         ("--colorspace ACEScq", "a.#.exr", "--colorspace ACEScq: not in the configuration"),

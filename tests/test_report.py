@@ -154,9 +154,11 @@ def test_pictures_are_the_photograph_and_the_render(reported: Path, scene: Path)
 # That it needs nothing else
 
 
+@pytest.mark.needs("html5lib")
 @pytest.mark.parametrize("kind", ["report", "compare"])
 def test_it_is_one_valid_file_for_everybody(kind: str, reported: Path, tmp_path: Path) -> None:
-    html5lib = pytest.importorskip("html5lib", reason="the extra `test` brings it")
+    import html5lib
+
     path = tmp_path / "page.html"
     runs = [str(reported)] * (2 if kind == "compare" else 1)
     assert main([kind, *runs, "-o", str(path)]) == 0

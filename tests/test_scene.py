@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import warnings
 from pathlib import Path
@@ -12,15 +11,13 @@ import numpy as np
 import pycolmap
 import pytest
 from models import real_file
+from needs import SCENES
 from PIL import Image as Pillow
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.images import read_image, write_image
 from clsplat.scene import camera_bounds, detect, load_scene
-
-SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
-needs_scenes = pytest.mark.skipif(not SCENES.is_dir(), reason=f"no real scenes: {SCENES} is not there (CLSPLAT_SCENES)")
 
 RNG = np.random.default_rng(2)
 WIDTH, HEIGHT = 48, 32
@@ -286,7 +283,7 @@ def test_bounds_lie_about_what_the_cameras_look_at() -> None:
     assert low[2] < 1 < high[2]
 
 
-@needs_scenes
+@pytest.mark.needs("scenes")
 @pytest.mark.parametrize(
     ("name", "views", "held_out", "points"),
     [
@@ -323,7 +320,7 @@ def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarra
     return scale, rotation, mean_target - scale * rotation @ mean_source
 
 
-@needs_scenes
+@pytest.mark.needs("scenes")
 def test_two_descriptions_of_the_fox_agree() -> None:
     """The distorted transforms.json by others and our undistorted COLMAP model of the same photos.
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from drivers import KEPT
 from pipeline import shaped
+from quick import quick
 
 from clsplat import trust
 from clsplat.cli import main
@@ -67,7 +68,14 @@ def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
 
 
-@pytest.mark.parametrize("words", BROKEN)
+@pytest.mark.parametrize(
+    "words",
+    quick(
+        BROKEN,
+        *("arithmetic: x / y", "duplicate: gaussian_from_visible[order[rank]]", "blend: before * alpha"),
+        *("channels: weight > largest[k]", "project_grad: sums[field] += slot[field]"),
+    ),
+)
 def test_one_wrong_operation_is_found(words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device) -> None:
     change, stage = BROKEN[words]
     results = condemned(default_device, monkeypatch, f"{words} => {change}", stage)
@@ -119,7 +127,7 @@ SLOPPY = {
 """A division or a square root that is off by two or three ulp, which OpenCL allows a GPU."""
 
 
-@pytest.mark.parametrize("words", SLOPPY)
+@pytest.mark.parametrize("words", quick(SLOPPY, "arithmetic: x / y", "features: q[0] / length", "adam: sqrt(*v)"))
 def test_rounding_otherwise_is_told_and_forgiven(
     words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device
 ) -> None:
@@ -253,13 +261,12 @@ def untrusting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
-    """The stages of each test that is made."""
+    """The stages of each test that is asked for; none is made, and all pass."""
     made: list[tuple[str, ...]] = []
-    real = trust.examine
 
-    def counting(index: int, shape: Any, stages: Sequence[str], *, quick: bool) -> Report:
+    def counting(_index: int, _shape: Any, stages: Sequence[str], **_: object) -> Report:
         made.append(tuple(stages))
-        return real(index, shape, stages, quick=quick)
+        return Report()
 
     monkeypatch.setattr(trust, "examine", counting)
     return made

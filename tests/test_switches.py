@@ -242,6 +242,7 @@ def test_approximate_switches(default_device: Device, switch: str, name: str) ->
     assert all(np.isfinite(values).all() for values in gradients(got).values())
 
 
+@pytest.mark.slow
 def test_approximate_switches_in_every_shape_and_on_every_device(device: Device, default_device: Device) -> None:
     config = RasterizerConfig("3sigma", sh_degree_limit=1, alpha_min=3 / 255, transmittance_min=1e-2)
     wanted = run(shaped(default_device, 8, 1), "cloud", config)

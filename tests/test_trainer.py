@@ -91,6 +91,7 @@ def test_end_to_end_reaches_its_psnr_on_held_out_views(scene: Scene, default_dev
     assert sorted(path.name for path in run.test_path.iterdir()) == ["00.png", "08.png"]
 
 
+@pytest.mark.slow
 def test_density_control_makes_up_for_few_points(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     few = Scene("few", scene.views, scene.points[::4], scene.point_colors[::4], scene.bounds)
     psnr = {}

@@ -3,19 +3,16 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from needs import SCENES
 
 from clsplat.errors import InputError
 from clsplat.images import write_image
 from clsplat.transforms import read_blender, read_point_cloud, read_transforms
-
-SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
-needs_scenes = pytest.mark.skipif(not SCENES.is_dir(), reason=f"no real scenes: {SCENES} is not there (CLSPLAT_SCENES)")
 
 POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 
@@ -222,7 +219,7 @@ def test_ngps_volume(tmp_path: Path) -> None:
     np.testing.assert_allclose(box, [[0, 0, -0.5], [1, 1, 0.5]])
 
 
-@needs_scenes
+@pytest.mark.needs("scenes")
 def test_lego() -> None:
     frames = read_blender(SCENES / "lego_blender_400").frames
     assert sum(frame.split == "train" for frame in frames) == 87

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from needs import require
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.picture_config import VideoConfig
 from clsplat.video import VideoWriter, check_video, write_video, yuv420
 
-av = pytest.importorskip("av")
+require("av")
+import av  # noqa: E402
 
 
 def frames(count: int, width: int, height: int) -> list[NDArray[np.float32]]:

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from calls import Capture, error_line
 from models import random_gaussians
+from needs import require
 from tiny import CONFIG
 from viewer_browser import clsplat
 
@@ -21,7 +22,7 @@ from clsplat.cli import Train, main, parse
 from clsplat.runs import Run
 from clsplat.viewer.server import Address
 
-pytest.importorskip("viser", reason="the extra `view` brings it")
+require("viser")
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from needs import require
 
 SLOW = 60_000
 """Milliseconds for what takes one second on a machine that has nothing else to do."""
@@ -20,7 +21,7 @@ SLOW = 60_000
 @contextmanager
 def clsplat(*arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """A command that serves a page, with --port 0: its address, and the process, which is ended as by Ctrl-C."""
-    pytest.importorskip("viser", reason="the extra `view` brings it")
+    require("viser")
     command = [sys.executable, "-m", "clsplat", *arguments, "--port", "0"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stderr is not None

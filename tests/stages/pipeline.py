@@ -30,11 +30,14 @@ from clsplat.stages.project import (
 BACKGROUND = (0.1, 0.2, 0.3)
 
 
+QUICK_SHAPES = (8, 1), (1, 64)
+"""A CPU's and a GPU's."""
+
+
 def shapes_of(device: Device, *more: tuple[int, int]) -> tuple[tuple[int, int], ...]:
     """(lanes, items) that a driver is tested in: a CPU's shape, a GPU's; the default driver also in the scalar loop, in
     a mixture, and in `more`. Building takes most of the time. Each driver in each shape: tools/digests.py."""
-    both = (8, 1), (1, 64)
-    return (*both, (1, 1), (8, 16), *more) if device is open_device() else both
+    return (*QUICK_SHAPES, (1, 1), (8, 16), *more) if device is open_device() else QUICK_SHAPES
 
 
 @cache
