@@ -425,8 +425,8 @@ def full_temporary(found: Found, alone: Machine) -> Machine:
     """A TMPDIR without a byte left, for training beside it and on it."""
     script = 'mount -t tmpfs -o size=64k none "$1" && { cat /dev/zero >"$1/filler" 2>/dev/null; shift; exec "$@"; }'
     scene, train = ten_steps("{folder}/work")
-    on_it = Step("on it", (*train.command[:5], "{folder}/tmp/run", "--iterations", "10"), TRAIN_LIMIT, 1, "No space left")
-    on_it = replace(on_it, command=tuple("{folder}/tmp/run" if w == "{folder}/work/run" else w for w in train.command))
+    command = tuple("{folder}/tmp/run" if word == "{folder}/work/run" else word for word in train.command)
+    on_it = Step("on it", command, TRAIN_LIMIT, status=1, says="No space left")
     return replace(
         alone,
         name="full-tmp",
@@ -457,7 +457,8 @@ def _stranger() -> tuple[str, ...]:
     """Nobody, who may read all if the checkout or Python lie in root's home: so nothing has to be copied."""
     nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
     reading = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
-    import_it = (PYTHON, "-c", "import clsplat.cli, pyopencl")
+    # a child too: setpriv itself may still follow paths that its command may not
+    import_it = (PYTHON, "-c", "import clsplat.cli, pyopencl, subprocess, sys; subprocess.check_call([sys.executable, '-V'])")
     for command in (nobody, (*nobody, *reading)):
         if _is_root() and _works((*command, *import_it)):
             return command
