@@ -17,6 +17,7 @@ where one failed. docs/machines.md has what each is for.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import platform
 import shlex
@@ -32,7 +33,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
-from opencl_drivers import SYSTEM_VENDORS
+from opencl_drivers import BESIDE, SYSTEM_VENDORS
 
 ROOT = Path(__file__).resolve().parents[1]
 HOOKS = ROOT / "tools" / "hooks"
@@ -212,10 +213,8 @@ def wrong(step: Step, status: int | None, errors: str, output: str) -> str:
 
 def _end(child: subprocess.Popen[bytes]) -> None:
     """End all that a step has started; it leads a group of its own."""
-    try:
+    with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
     child.wait()
 
 
@@ -263,7 +262,7 @@ class Found:
 def look() -> Found:
     """What this machine has."""
     intel = Path(sys.prefix) / "lib" / "libintelocl.so"
-    debian = os.environ.get("CLSPLAT_DEBIAN_POCL", "")
+    debian = os.environ.get(BESIDE, "")
     if not debian and (listed := SYSTEM_VENDORS / "pocl.icd").exists():
         debian = listed.read_text().strip()
     qemu = os.environ.get("CLSPLAT_QEMU", "") or shutil.which("qemu-x86_64") or shutil.which("qemu-x86_64-static") or ""
@@ -357,9 +356,16 @@ def machines(found: Found) -> list[Machine]:
         replace(
             home_alone,
             name="lang-c",
-            purpose="LANG=C without Python's UTF-8 mode, and a scene with letters beyond ASCII in its path",
+            purpose="LANG=C, and a scene with letters beyond ASCII in its path",
             steps=(short_test(), *ten_steps("{folder}/work/é"), smoke()),
-            variables=(("LANG", "C"), ("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")),
+            variables=(("LANG", "C"),),
+        ),
+        replace(
+            home_alone,
+            name="ascii",
+            purpose="LC_ALL=C with Python kept from making UTF-8 of it",
+            steps=(short_test(), *ten_steps("{folder}/work"), smoke()),
+            variables=(("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")),
         ),
     ]
 
@@ -458,9 +464,9 @@ def _stranger() -> tuple[str, ...]:
     nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
     reading = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
     # a child too: setpriv itself may still follow paths that its command may not
-    import_it = (PYTHON, "-c", "import clsplat.cli, pyopencl, subprocess, sys; subprocess.check_call([sys.executable, '-V'])")
+    code = "import clsplat.cli, pyopencl, subprocess, sys; subprocess.check_call([sys.executable, '-V'])"
     for command in (nobody, (*nobody, *reading)):
-        if _is_root() and _works((*command, *import_it)):
+        if _is_root() and _works((*command, PYTHON, "-c", code)):
             return command
     return ()
 
@@ -503,7 +509,9 @@ def table(results: Sequence[Result], *, markdown: bool = False) -> str:
         rows.insert(1, ("---",) * 4)
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows)
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
 
 
 def main(arguments: Sequence[str]) -> int:
