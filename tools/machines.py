@@ -41,7 +41,7 @@ PYTHON = sys.executable
 
 SHORT_LIMIT = 300
 """Seconds for the short self-test: 12 of one core with PoCL, 40 with Intel's runtime, and the machine may be busy."""
-SMOKE_LIMIT = 300
+SMOKE_LIMIT = 600
 """Seconds for the smoke tests, which take 40 of a core."""
 FULL_LIMIT = 1200
 """Seconds for tools/test, which takes 6 minutes on two cores."""
