@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import scenes
 from pipeline import BACKGROUND, Pipeline, shaped
+from quick import quick
 from tiny import write_scene
 
 from clsplat import bench as measure
@@ -133,7 +134,7 @@ def test_contributing_pairs_exactly(default_device: Device) -> None:
 
 
 @pytest.mark.parametrize("name", ["overlap", "saturating", "random_cloud"])
-@pytest.mark.parametrize("shape", [(1, 1), (1, 64), (8, 16)], ids=str)
+@pytest.mark.parametrize("shape", quick([(1, 1), (1, 64), (8, 16)], (1, 64)), ids=str)
 def test_evaluated_pairs_are_those_of_a_brute_force_count(
     default_device: Device, shape: tuple[int, int], name: str
 ) -> None:
@@ -337,6 +338,7 @@ def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPat
     assert "step ms" in text
 
 
+@pytest.mark.slow
 def test_half_of_the_colours_are_kept_where_they_can_be(profiled: Device) -> None:
     subject = measure.synthetic(300, 70, 50)
     camera, moved = subject.camera, tradeoff.aside(subject.camera, subject.gaussians, 2.0)
@@ -394,7 +396,7 @@ def result() -> dict[str, object]:
 
 
 @pytest.mark.needs("matplotlib")
-@pytest.mark.parametrize("name", ["plot.svg", "plot.PNG"])
+@pytest.mark.parametrize("name", quick(["plot.svg", "plot.PNG"], "plot.svg"))
 def test_plot_is_written(tmp_path: Path, result: dict[str, object], name: str) -> None:
     path, again = tmp_path / name, tmp_path / f"again_{name}"
     for file in (path, again):
@@ -453,6 +455,7 @@ def test_wrong_calls_are_one_line(arguments: list[str], named: str, capsys: Capt
     assert captured.err.startswith("clsplat: error: ")
 
 
+@pytest.mark.slow
 def test_preset_in_training(tmp_path: Path, capsys: Capture) -> None:
     scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
     assert main(["train", str(scene), "-o", str(run), "--iterations", "1", "--preset", "fast"]) == 0

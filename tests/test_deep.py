@@ -13,7 +13,7 @@ import pytest
 import scenes
 from compare import assert_close, assert_same_bits
 from numpy.typing import NDArray
-from pipeline import shaped, shapes_of
+from pipeline import EVERY_SHAPE, shaped, shapes_of
 
 from clsplat.camera import Camera, Window
 from clsplat.colour import LINEAR, Colours
@@ -78,10 +78,11 @@ def test_against_the_twin(shaped_device: Device, name: str) -> None:
         assert_close(values[sure][:, 4:], of[sure][:, 4:], relative=1e-6, absolute=1e-6)
 
 
-def test_the_same_bits_in_every_shape(device: Device) -> None:
+@EVERY_SHAPE
+def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
     gaussians, camera = scenes.random_cloud(2000, 8, 150, 100)
     bounds = bin_bounds(gaussians, camera, DeepConfig(bins=7))
-    renderers = (Renderer(shaped(device, *shape)) for shape in shapes_of(device, (4, 1)))
+    renderers = (Renderer(shaped(device, *shape)) for shape in shapes_of(device, (4, 1), every=every))
     first, *others = (render_deep(renderer, gaussians, camera, bounds) for renderer in renderers)
     for other in others:
         assert_same_bits(other, first)

@@ -17,6 +17,7 @@ def surfaces():
     return objects
 
 
+@pytest.mark.slow
 def test_photos_are_whole_repeatable_and_hold_no_pose(tmp_path):
     heard = []
     for folder in ("one", "two"):

@@ -13,6 +13,7 @@ import pytest
 from compare import relative_error
 from golden_frames import SCENES, arrays_of
 from pipeline import shaped
+from quick import quick
 
 from clsplat.device.context import Device
 from clsplat.layers import LAYERS
@@ -87,7 +88,7 @@ def test_a_child(tmp_path: Path) -> None:
     assert (tmp_path / "arrays.npz").exists()
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 64), (4, 1), (8, 16), (16, 1)], ids=str)
+@pytest.mark.parametrize("shape", quick([(1, 1), (1, 64), (4, 1), (8, 16), (16, 1)], (1, 64)), ids=str)
 def test_gradients_of_two_shapes(shape: tuple[int, int], default_device: Device) -> None:
     """The order of blending's sums is the shape's: of each parameter group within GRADIENT_BOUND, in norm."""
     wanted, got = arrays_of(shaped(default_device, 8, 1)), arrays_of(shaped(default_device, *shape))

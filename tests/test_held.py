@@ -10,6 +10,7 @@ import pytest
 import scenes
 from compare import assert_same_bits
 from numpy.typing import NDArray
+from quick import quick
 
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
@@ -74,7 +75,7 @@ def test_degrees_are_those_of_the_gaussians(shaped_device: Device) -> None:
     assert_same_bits(got, whole(shaped_device, cut(gaussians, degrees), camera))
 
 
-@pytest.mark.parametrize("limit", [0, 1, 2])
+@pytest.mark.parametrize("limit", quick([0, 1, 2], 1))
 def test_degrees_and_the_limit_of_all(default_device: Device, limit: int) -> None:
     gaussians, camera = cloud()
     degrees = np.random.default_rng(1).choice(4, len(gaussians), p=(0.6, 0.1, 0.1, 0.2)).astype(np.uint8)
@@ -199,6 +200,7 @@ def test_colours_are_forgotten_with_the_model(default_device: Device) -> None:
     assert_same_bits(renderer.render(brighter, camera).image, whole(default_device, brighter, camera))
 
 
+@pytest.mark.slow
 def test_kept_colours_with_everything_else(default_device: Device) -> None:
     gaussians, camera = cloud()
     settings = {"sh_storage": "half", "sh_tolerance": 0.8, "frustum_cull": False, "opacity_cull": False}

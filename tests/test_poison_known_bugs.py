@@ -128,6 +128,7 @@ def test_an_infinite_scale_spoils_nothing(device: Device, model: Gaussians, log_
     assert_as_if_absent(device, changed, 7)
 
 
+@pytest.mark.slow
 def test_opacities_about_the_least_visible_one(device: Device, default_device: Device, model: Gaussians) -> None:
     """Under it the logarithm of what is left of the extent would be negative."""
     least = -np.log(np.float64(254.0))

@@ -16,6 +16,7 @@ import OpenImageIO as oiio
 import pytest
 import stress_render_kills
 from calls import Capture, error_line, left_behind
+from quick import quick
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
 from clsplat.cli import main
@@ -243,7 +244,7 @@ def start(shot: list[str], folder: Path, *more: str) -> subprocess.Popen[str]:
     return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", quick([signal.SIGINT, signal.SIGTERM], signal.SIGINT))
 def test_interrupted(number: int, shot: list[str], tmp_path: Path) -> None:
     process = start(shot, tmp_path, "--count", "3000", "--progress", "json")
     assert process.stdout is not None
@@ -292,6 +293,7 @@ def test_killed_at_random(shot: list[str], tmp_path: Path, capsys: Capture) -> N
         stress_render_kills.main(["-o", str(tmp_path), "--", *shot])
 
 
+@pytest.mark.slow
 def test_the_kill_test_finds_damage(shot: list[str], tmp_path: Path, monkeypatch: Any, capsys: Capture) -> None:
     def spoil(line: object, folder: Path, *_: object) -> int:
         folder.mkdir(exist_ok=True)

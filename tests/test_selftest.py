@@ -103,6 +103,7 @@ def test_all_scenes_in_the_shape_of_a_cpu(default_device: Device, lanes: int) ->
     assert [result for result in results if not (result.passed and result.same_bits)] == []
 
 
+@pytest.mark.slow
 def test_a_shape_without_a_stored_digest_is_no_failure(default_device: Device) -> None:
     stages = (*FORWARD, "blend_grad")
     results = {result.stage: result for result in run(shaped(default_device, 4, 4), quick=True, stages=stages)}
@@ -210,7 +211,14 @@ def test_the_table(capsys: Capture) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    ["blend: before * alpha => before + alpha", "scan: sum += VALUE => sum += 2 * VALUE", "loss: mu1 => this is no C"],
+    quick(
+        [
+            "blend: before * alpha => before + alpha",
+            "scan: sum += VALUE => sum += 2 * VALUE",
+            "loss: mu1 => this is no C",
+        ],
+        "loss: mu1 => this is no C",
+    ),
 )
 def test_a_broken_driver_fails(change: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BREAK, change)

@@ -150,6 +150,7 @@ def test_same_seed_same_bytes(scene, photos, tmp_path):
         assert (again / "sparse/0" / name).read_bytes() == (scene[0] / "sparse/0" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_exif_orientation_subfolders_and_a_photo_of_something_else(pictures, tmp_path):
     folder = tmp_path / "photos"
     turns = [1, 6, 3, 8, 1, 2, 6, 8, 3, 1, 6, 1]
@@ -181,6 +182,7 @@ def test_exif_orientation_subfolders_and_a_photo_of_something_else(pictures, tmp
     assert sfm.reconstruct(folder, output) == output
 
 
+@pytest.mark.slow
 def test_photos_that_lose_their_alpha_are_named(pictures, tmp_path):
     for index, picture in enumerate(pictures[0]):
         alpha = np.full((HEIGHT, WIDTH, 1), 255, np.uint8)

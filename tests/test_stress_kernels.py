@@ -59,6 +59,7 @@ def test_frames_and_their_gradients_of(name: str, device: Device) -> None:
     assert [fault for fault in found["faults"] if "99.9" not in fault] == []
 
 
+@pytest.mark.slow
 def test_ten_thousand_on_one_pixel(default_device: Device) -> None:
     rng = np.random.default_rng(0)
     found = compare_frame(default_device, SCENES["one_pixel"](rng), rng)
@@ -121,6 +122,7 @@ def test_a_wrong_loss_is_found(default_device: Device, monkeypatch: pytest.Monke
     assert any(fault.startswith("loss gradient") for fault in faults)
 
 
+@pytest.mark.slow
 def test_command(tmp_path: Path) -> None:
     plot = tmp_path / "errors.svg"
     command = [sys.executable, ROOT / "tools" / "stress", "kernels", "--cases", "600", "--only", "scales,counts,wild"]

@@ -15,6 +15,7 @@ from compare import assert_same_bits
 from golden_frames import checksums
 from numpy.typing import NDArray
 from pipeline import BACKGROUND, Pipeline, shaped
+from quick import quick
 
 from clsplat.config import PRESETS, RasterizerConfig
 from clsplat.device.buffers import upload
@@ -149,7 +150,9 @@ def test_default_is_the_plain_text() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("switch", EXACT_OFF)
+@pytest.mark.parametrize(
+    "switch", quick(EXACT_OFF, "square", "pairs by all bits", "vectors", "early stop", "gradient skip", "all")
+)
 def test_exact_switches_change_no_bit(default_device: Device, switch: str, name: str) -> None:
     device = shaped(default_device, 8, 1)
     wanted, got = run(device, name, RasterizerConfig()), run(device, name, EXACT_OFF[switch])
@@ -161,7 +164,7 @@ def test_exact_switches_change_no_bit(default_device: Device, switch: str, name:
         assert_same_bits(got_gradients[array] + np.float32(0), values + np.float32(0), array)
 
 
-@pytest.mark.parametrize("extent", ["opacity", "constant", "3sigma"])
+@pytest.mark.parametrize("extent", quick(["opacity", "constant", "3sigma"], "opacity"))
 @pytest.mark.parametrize("name", ["off_frustum", "sheaf", "cloud"])
 def test_culling_that_is_off_lists_more_gaussians(default_device: Device, name: str, extent: Any) -> None:
     check_culling(default_device, name, RasterizerConfig(extent=extent), ((False, True), (True, False), (False, False)))
@@ -206,7 +209,7 @@ def test_culling_that_is_off_in_bands(default_device: Device) -> None:
     assert_same_bits(frames[1].blended.image.get(), frames[0].blended.image.get())
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 64), (4, 1), (8, 16)], ids=str)
+@pytest.mark.parametrize("shape", quick([(1, 1), (1, 64), (4, 1), (8, 16)], (1, 64)), ids=str)
 def test_exact_switches_in_every_shape(default_device: Device, shape: tuple[int, int]) -> None:
     wanted = run(shaped(default_device, *shape), "saturating", RasterizerConfig())
     got = run(shaped(default_device, *shape), "saturating", EXACT_OFF["all"])
@@ -227,7 +230,7 @@ def test_switches_that_are_off_do_more_work(default_device: Device) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("switch", APPROXIMATE)
+@pytest.mark.parametrize("switch", quick(APPROXIMATE, "3sigma", "fast"))
 def test_approximate_switches(default_device: Device, switch: str, name: str) -> None:
     """3sigma leaves out alpha of at most exp(-4.5) a Gaussian; alpha_min up to 2/255 a Gaussian, of which several lie
     at a pixel; transmittance_min the last Gaussian of a pixel, whose weight is at most 1e-3 / (1 - 0.99). Bands of SH

@@ -560,13 +560,24 @@ def test_a_training_gives_its_share_only() -> None:
     assert 0.04 < spent / end < 0.051
 
 
-def test_waiting_ends_with_news() -> None:
+def test_waiting_ends_with_news(monkeypatch: pytest.MonkeyPatch) -> None:
     found = Viewing(FakeModel())
     found.join(0, FakePage())
-    timer = threading.Timer(0.05, lambda: found.moved(0, pose()))
-    timer.start()
-    found.wait(20.0)
-    timer.join()
+    waits, real = threading.Event(), found._news.wait
+
+    def announced(most: float) -> bool:
+        waits.set()
+        return real(most)
+
+    def move() -> None:
+        waits.wait()
+        found.moved(0, pose())  # which needs the lock that waiting gives back
+
+    monkeypatch.setattr(found._news, "wait", announced)
+    mover = threading.Thread(target=move)
+    mover.start()
+    found.wait(threading.TIMEOUT_MAX)
+    mover.join()
     assert found.work()
     found.wake()
-    found.wait(20.0)
+    found.wait(threading.TIMEOUT_MAX)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from drivers import why_not
 from numpy.typing import NDArray
+from quick import quick
 
 from clsplat.camera import Camera
 from clsplat.config import RasterizerConfig
@@ -34,10 +35,14 @@ QUICK_SHAPES = (8, 1), (1, 64)
 """A CPU's and a GPU's."""
 
 
-def shapes_of(device: Device, *more: tuple[int, int]) -> tuple[tuple[int, int], ...]:
+EVERY_SHAPE = pytest.mark.parametrize("every", quick([False, True], False))
+"""Of a test of all shapes at once: the quick run has two, as building takes most of the time."""
+
+
+def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[int, int], ...]:
     """(lanes, items) that a driver is tested in: a CPU's shape, a GPU's; the default driver also in the scalar loop, in
-    a mixture, and in `more`. Building takes most of the time. Each driver in each shape: tools/digests.py."""
-    return (*QUICK_SHAPES, (1, 1), (8, 16), *more) if device is open_device() else QUICK_SHAPES
+    a mixture, and in `more`, unless not `every` one is wanted. Each driver in each shape: tools/digests.py."""
+    return (*QUICK_SHAPES, (1, 1), (8, 16), *more) if every and device is open_device() else QUICK_SHAPES
 
 
 @cache

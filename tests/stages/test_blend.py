@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
-from pipeline import BACKGROUND, Pipeline, shaped, shapes_of
+from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 
 from clsplat.config import RasterizerConfig
 from clsplat.device.buffers import upload
@@ -53,11 +53,12 @@ def test_sizes_at_the_seams(shaped_device: Device, size: tuple[int, int]) -> Non
     assert not padded[:, size[1] :].any(), "below the image is not black"
 
 
-def test_the_same_bits_in_every_shape(device: Device) -> None:
+@EVERY_SHAPE
+def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
     scene = scenes.random_cloud(2000, 8, 150, 100)
     frames = [
         Pipeline.run(shaped(device, lanes, items), scene).frame.blended
-        for lanes, items in shapes_of(device, (1, 256), (4, 1))
+        for lanes, items in shapes_of(device, (1, 256), (4, 1), every=every)
     ]
     for other in frames[1:]:
         assert_same_bits(other.image.get(), frames[0].image.get())
