@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -115,6 +116,25 @@ def test_one_that_hangs_is_ended_with_its_children(tmp_path: Path) -> None:
     assert time.monotonic() - start < 60
     time.sleep(4)
     assert not here.exists()
+
+
+def test_ctrl_c_ends_what_runs(tmp_path: Path) -> None:
+    begun = tmp_path / "begun"
+    code = f"import pathlib, time; pathlib.Path({str(begun)!r}).touch(); time.sleep(600)"
+    script = (
+        f"import sys; sys.path.insert(0, {str(ROOT / 'tools')!r})\n"
+        "from machines import Machine, Step, run_all\n"
+        f"step = Step('it', (sys.executable, '-c', {code!r}), 600)\n"
+        "sys.exit(run_all([Machine('one', '', (step,)), Machine('two', '', (step,))]))"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as child:
+        while not begun.exists():
+            assert child.poll() is None
+            time.sleep(0.1)
+        begun.unlink()
+        child.send_signal(signal.SIGINT)
+        assert child.wait(60) == 130
+    assert not begun.exists(), "nor is the next one begun"
 
 
 @pytest.mark.parametrize(

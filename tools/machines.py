@@ -184,17 +184,23 @@ def run_step(step: Step, wrap: Sequence[str], environment: dict[str, str], folde
             stderr=errors,
             start_new_session=True,
         )
+        _RUNNING.add(child)
         try:
             status = child.wait(step.limit)
         except subprocess.TimeoutExpired:
             status = None
         finally:
             _end(child)
+            _RUNNING.discard(child)
         texts = []
         for stream in (output, errors):
             stream.seek(0)
             texts.append(stream.read().decode(errors="replace"))
     return wrong(step, status, texts[1], "".join(texts)), "".join(texts)
+
+
+_RUNNING: set[subprocess.Popen[bytes]] = set()
+"""What Ctrl-C has to end: the terminal sends it to our own group alone."""
 
 
 def wrong(step: Step, status: int | None, errors: str, output: str) -> str:
@@ -565,7 +571,13 @@ def run_all(rows: Sequence[Machine], *, jobs: int = 1, markdown: bool = False) -
 
     start = time.monotonic()
     with ThreadPoolExecutor(jobs) as pool:
-        results = list(pool.map(run, rows))
+        try:
+            results = list(pool.map(run, rows))
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in tuple(_RUNNING):
+                _end(child)
+            return 130
     failed = [result.machine.name for result in results if result.trouble]
     missing = sum(bool(result.machine.missing) for result in results)
     print(f"\n{table(results, markdown=markdown)}\n")
