@@ -23,6 +23,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from clsplat.cli_models import Compare, Convert, Device, Flag, Folder, Host, Info, Memory, Report, View
 from clsplat.config import (
+    DEMO_ITERATIONS,
     PRESETS,
     Compression,
     ExrDepth,
@@ -56,6 +57,8 @@ class Demo:
 
     output: Output
     """Folder for everything the demo makes."""
+    iterations: int = DEMO_ITERATIONS
+    """Training steps. A few hundred show that all works, and less of the scene."""
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""

@@ -114,6 +114,9 @@ class RasterizerConfig:
         _check(self, "--rasterizer.", rules)
 
 
+DEMO_ITERATIONS = 2000
+"""Steps of `clsplat demo`, about a minute of two cores."""
+
 PRESETS: dict[Preset, RasterizerConfig] = {
     "exact": RasterizerConfig(),
     "default": RasterizerConfig(),

@@ -10,24 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from clsplat import sfm
-from clsplat.config import TrainConfig
+from clsplat.config import DEMO_ITERATIONS, TrainConfig
 from clsplat.demo_scene import Progress, ignore_progress, write_photos
 from clsplat.errors import InputError
 from clsplat.trajectory import turntable
 
 PHOTOS = 40
 WIDTH, HEIGHT = 320, 240
-ITERATIONS = 2000
 TURNTABLE_FRAMES = 60
 
 
 def run_demo(
-    output: Path, *, device: str | None = None, iterations: int = ITERATIONS, frames: int = TURNTABLE_FRAMES
+    output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS, frames: int = TURNTABLE_FRAMES
 ) -> dict[str, Any]:
     """Make everything below output: photos/, scene/, run/ and turntable/; returns the evaluation, as in eval.json.
 
-    What an earlier, interrupted demo has finished is used again. device: as `clsplat devices` names it. Raises
-    InputError for a folder that holds something else, and what the steps raise.
+    What an earlier, interrupted demo has finished is used again. device: as `clsplat devices` names it; iterations: of
+    training; frames: of the turntable. Raises InputError for a folder that holds something else, and what the steps
+    raise.
     """
     from clsplat.device.context import open_device
     from clsplat.progress import StageProgress

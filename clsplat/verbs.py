@@ -83,12 +83,14 @@ def devices(verb: Devices) -> int:
 
 def demo(verb: Demo) -> int:
     """The whole pipeline on a scene of its own."""
+    from clsplat.config import TrainConfig
     from clsplat.demo import run_demo
     from clsplat.device.context import open_device
     from clsplat.trust import require
 
+    TrainConfig(iterations=verb.iterations).check()
     require(open_device(verb.device))
-    result = run_demo(verb.output, device=verb.device)
+    result = run_demo(verb.output, device=verb.device, iterations=verb.iterations)
     if verb.json:
         print(json.dumps(result, indent=2))
     return 0

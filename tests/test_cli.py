@@ -16,7 +16,7 @@ from fakes import Pipeline
 
 from clsplat import verbs
 from clsplat.cli import Eval, Train, main, parse
-from clsplat.config import TrainConfig
+from clsplat.config import DEMO_ITERATIONS, TrainConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.runs import Run
 
@@ -62,6 +62,25 @@ def test_flags_become_the_config() -> None:
     assert parse(["train", "S", "--output", "R"]) == Train(Path("R"), Path("S"))
     assert parse(["train", "S", "-o", "R", "--warmup", ""]).config.warmup == ()  # type: ignore[union-attr]
     assert parse(["eval", "R"]) == Eval(Path("R"))
+
+
+def test_the_demo_takes_the_steps_it_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = []
+
+    def run_demo(output: Path, *, device: str | None, iterations: int) -> dict[str, object]:
+        given.append((output, iterations))
+        return {}
+
+    monkeypatch.setattr("clsplat.demo.run_demo", run_demo)
+    assert main(["demo", "-o", str(tmp_path), "--iterations", "30"]) == 0
+    assert main(["demo", "-o", str(tmp_path)]) == 0
+    assert given == [(tmp_path, 30), (tmp_path, DEMO_ITERATIONS)]
+
+
+def test_a_demo_of_no_steps_is_refused_before_anything_is_made(tmp_path: Path, capsys: Capture) -> None:
+    assert main(["demo", "-o", str(tmp_path / "demo"), "--iterations", "0"]) == 2
+    assert "--iterations 0: expected at least 1" in error_line(capsys)
+    assert not (tmp_path / "demo").exists()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every OpenCL driver of this machine at once: the ones installed system-wide and those from PyPI.
+"""Every OpenCL driver of this machine at once: the ones installed system-wide and those from PyPI, and Debian's PoCL
+where it is unpacked beside the system and CLSPLAT_DEBIAN_POCL names its libpocl.so.
 
 The PoCL that `pyopencl[pocl]` brings loads by itself, wherever OCL_ICD_VENDORS points. Any other driver needs an
 .icd file in the one folder that OCL_ICD_VENDORS names, read when pyopencl is first imported. Intel's CPU runtime
@@ -18,6 +19,7 @@ import tempfile
 from pathlib import Path
 
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
+BESIDE = "CLSPLAT_DEBIAN_POCL"
 PACKAGED_LIBRARIES = ("libintelocl.so",)
 """Drivers that a package on PyPI puts under sys.prefix/lib."""
 
@@ -30,6 +32,9 @@ def list_drivers(folder: Path) -> list[str]:
         for icd in sorted(SYSTEM_VENDORS.glob("*.icd")):
             shutil.copyfile(icd, folder / icd.name)
             names.append(icd.stem)
+    if BESIDE in os.environ and "pocl" not in names:
+        (folder / "pocl.icd").write_text(f"{os.environ[BESIDE]}\n")
+        names.append("pocl")
     for library in PACKAGED_LIBRARIES:
         path = Path(sys.prefix) / "lib" / library
         if path.exists():
