@@ -24,6 +24,7 @@ from scipy import ndimage
 
 from clsplat.camera import Camera
 from clsplat.errors import ClsplatError
+from clsplat.files import remove, replace
 from clsplat.trajectory import look_at
 
 Float32 = NDArray[np.float32]
@@ -421,9 +422,11 @@ def write_jpeg(path: Path, image: Float32) -> None:
     output = oiio.ImageOutput.create(str(part))
     if output is None or not output.open(str(part), spec) or not output.write_image(pixels) or not output.close():
         reason = oiio.geterror() if output is None else output.geterror()
-        part.unlink(missing_ok=True)
+        if output is not None:
+            output.close()  # Windows removes no file that is open
+        remove(part)
         raise ClsplatError(f"{path}: cannot write the photo: {reason}")
-    part.replace(path)
+    replace(part, path)
 
 
 def write_photos(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import is_file, open_input, temporary_name
+from clsplat.files import is_file, open_input, replace, temporary_name
 
 Float32 = NDArray[np.float32]
 Metadata = Mapping[str, str | int | float]
@@ -50,13 +50,13 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     """All pictures (by extension) under `folder`, if `deep` with its sub-folders, sorted; hidden files and folders are
     left out. Links to folders are followed, to each folder once."""
     found: list[Path] = []
-    seen: set[tuple[int, int]] = set()
+    seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True):
-        status = Path(root).stat()
-        if (status.st_dev, status.st_ino) in seen:
+        real = os.path.realpath(root)  # not the inode: some file systems of Windows number every folder 0
+        if real in seen:
             folders.clear()
             continue
-        seen.add((status.st_dev, status.st_ino))
+        seen.add(real)
         folders[:] = sorted(name for name in folders if deep and not name.startswith("."))
         found += [
             path
@@ -361,7 +361,7 @@ def atomic_output(path: Path, specs: Sequence[Any], kind: str) -> Iterator[Outpu
         output.take(output.file.open(output.name, specs[0] if len(specs) == 1 else tuple(specs)))
         yield output
         output.take(output.file.close())
-        temporary.replace(target)
+        replace(temporary, target)
     except OSError as error:
         raise ClsplatError(f"{path}: cannot be written: {error.strerror}") from None
     finally:

@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import is_file
+from clsplat.files import WINDOWS, is_file
 from clsplat.images import error_of, open_image
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -134,6 +134,8 @@ def _stage(folder: Path, target: Path, path: Path) -> Photo:
         _write_upright(path, copy)
     else:
         try:
+            if WINDOWS and not os.access(path, os.W_OK):
+                raise PermissionError("a link to a file that is read-only cannot be removed again")
             os.link(path.resolve(), copy)
         except OSError:
             shutil.copyfile(path, copy)

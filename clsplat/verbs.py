@@ -114,7 +114,7 @@ def sfm(verb: Sfm) -> int:
         progress=StageProgress(),
     )
     if verb.json:
-        print((verb.output / RECORD).read_text().rstrip())
+        print((verb.output / RECORD).read_text("utf-8").rstrip())
     print(f"scene in {verb.output}; next: clsplat train {verb.output} -o RUN", file=sys.stderr)
     return 0
 
@@ -168,7 +168,7 @@ def train(verb: Train) -> int:
         at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
         print(f"clsplat: interrupted {at}; go on with: clsplat train -o {run.path} --resume", file=sys.stderr)
         return 130
-    result = json.loads(run.eval_path.read_text()) if run.eval_path.exists() else None
+    result = json.loads(run.eval_path.read_text("utf-8")) if run.eval_path.exists() else None
     if verb.json:
         print(json.dumps(result, indent=2))
     elif result is not None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import temporary_name
+from clsplat.files import replace, temporary_name
 from clsplat.layers import VIDEO
 from clsplat.picture_config import VideoConfig
 
@@ -160,9 +160,9 @@ class VideoWriter:
     def _finish(self) -> None:
         self._container.mux(self._stream.encode(None))
         self._container.close()
-        with open(self._temporary, "rb") as file:
+        with open(self._temporary, "r+b") as file:  # Windows flushes only what may be written to
             os.fsync(file.fileno())
-        self._temporary.replace(self._target)
+        replace(self._temporary, self._target)
 
 
 def write_video(path: Path, frames: Iterable[NDArray[Any]], config: VideoConfig | None = None) -> int:
