@@ -53,11 +53,12 @@ def run(verb: Verb) -> int:
 
 def devices(verb: Devices) -> int:
     """Print the table of devices."""
+    from clsplat.device.advice import driver_advice
     from clsplat.device.context import find_device, list_devices
 
     found = list_devices() if verb.device is None else [find_device(verb.device)]
     if not found:
-        raise DeviceError("no OpenCL device found, expected a driver such as pip install 'pyopencl[pocl]' brings")
+        raise DeviceError(f"no OpenCL device found: {driver_advice()}")
     if verb.json:
         print(json.dumps([asdict(info) for info in found], indent=2))
         return 0
@@ -87,8 +88,11 @@ def demo(verb: Demo) -> int:
     from clsplat.device.context import open_device
     from clsplat.trust import require
 
+    for name in ("iterations", "frames"):
+        if getattr(verb, name) < 1:
+            raise InputError(f"--{name} {getattr(verb, name)}: expected at least 1")
     require(open_device(verb.device))
-    result = run_demo(verb.output, device=verb.device)
+    result = run_demo(verb.output, device=verb.device, iterations=verb.iterations, frames=verb.frames)
     if verb.json:
         print(json.dumps(result, indent=2))
     return 0

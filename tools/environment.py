@@ -42,8 +42,8 @@ def set_up(extras: tuple[str, ...] = ()) -> Path:
             sys.exit(f"{sys.argv[0]}: {sys.executable} -m venv failed; on Debian and Ubuntu, install python3-venv")
 
     stamp = ENVIRONMENT / "clsplat-installed"
-    state = hashlib.sha256((ROOT / "pyproject.toml").read_bytes() + str(ROOT).encode()).hexdigest()
-    lines = stamp.read_text().splitlines() if stamp.exists() else []
+    state = hashlib.sha256((ROOT / "pyproject.toml").read_bytes() + os.fsencode(ROOT)).hexdigest()
+    lines = stamp.read_text("utf-8").splitlines() if stamp.exists() else []
     installed = set(lines[1:]) if lines[:1] == [state] else None
     if installed is None or not installed.issuperset(extras):
         wanted = sorted({*extras, *(installed or ())})
@@ -53,7 +53,7 @@ def set_up(extras: tuple[str, ...] = ()) -> Path:
         command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--editable", target]
         if _call(command) != 0:
             sys.exit(f"{sys.argv[0]}: pip could not install clsplat, see above; is the package index reachable?")
-        stamp.write_text("\n".join([state, *wanted]) + "\n")
+        stamp.write_text("\n".join([state, *wanted]) + "\n", "utf-8")
     return python
 
 
@@ -78,4 +78,5 @@ def _call(command: list[str], *, quiet: bool = False) -> int:
 
 
 if __name__ == "__main__":
+    sys.stdout.reconfigure(encoding=sys.getfilesystemencoding(), errors=sys.getfilesystemencodeerrors())  # as paths are
     print(set_up(tuple(sys.argv[1:])))

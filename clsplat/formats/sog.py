@@ -388,6 +388,5 @@ def _write_webp(path: Path, pixels: Bytes) -> None:
     spec.attribute("compression", "lossless")
     spec.attribute("oiio:UnassociatedAlpha", 1)  # or colours would be divided by alpha
     output = oiio.ImageOutput.create(str(path))
-    if output is None or not output.open(str(path), spec) or not output.write_image(pixels):
+    if output is None or not output.open(str(path), spec) or not output.write_image(pixels) or not output.close():
         raise OSError(f"{path.name}: OpenImageIO cannot write it: {error_of(output or oiio)}")
-    output.close()

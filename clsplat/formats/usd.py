@@ -105,7 +105,7 @@ def readable(path: Path) -> Iterator[None]:
 
 def _open(path: Path) -> Any:
     """The stage, without payloads, all of whose layers are in the file's folder or below it."""
-    from pxr import Tf, Usd, UsdUtils
+    from pxr import Ar, Tf, Usd, UsdUtils
 
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
     try:
@@ -116,7 +116,8 @@ def _open(path: Path) -> Any:
         raise InputError(f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more")
     folder = Path(os.path.realpath(path)).parent
     for layer in stage.GetUsedLayers():
-        if layer.realPath and not Path(os.path.realpath(layer.realPath.split("[")[0])).is_relative_to(folder):
+        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # of a layer in a .usdz, the .usdz
+        if file and not Path(os.path.realpath(file)).is_relative_to(folder):
             raise InputError(f"{path}: refers to {layer.realPath}, expected layers in the same folder or below it")
     del diagnostics
     return stage
@@ -217,7 +218,8 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     from pxr import Usd, UsdUtils
 
     suffix = path.suffix.lower()
-    with tempfile.TemporaryDirectory(prefix="clsplat-usd-") as folder:
+    # USD may hold its file open for longer, which Windows does not remove
+    with tempfile.TemporaryDirectory(prefix="clsplat-usd-", ignore_cleanup_errors=True) as folder:
         made = Path(folder) / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
         stage = Usd.Stage.CreateNew(str(made))
         _author(stage, gaussians, up_axis, meters_per_unit)
