@@ -138,6 +138,14 @@ def name_trouble(name: str, *, windows: bool = WINDOWS) -> str | None:
     return None
 
 
+def native_name(path: str | os.PathLike[str]) -> str:
+    """The name of a file for a library that takes names in UTF-8, whatever the locale says. Raises InputError."""
+    try:
+        return os.fsencode(path).decode("utf-8")
+    except UnicodeError:
+        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it") from None
+
+
 def identity(path: PurePath, *, ignores_case: bool = IGNORES_CASE) -> str:
     """Equal for two paths that the system takes for one file, whatever links there are."""
     text = str(path)

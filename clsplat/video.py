@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import replace, temporary_name
+from clsplat.files import native_name, replace, temporary_name
 from clsplat.layers import VIDEO
 from clsplat.picture_config import VideoConfig
 
@@ -122,7 +122,7 @@ class VideoWriter:
 
         config = self._config
         rate = Fraction(config.fps).limit_denominator(1001)
-        self._container = av.open(str(self._temporary), "w", format="mp4", options={"movflags": "+faststart"})
+        self._container = av.open(native_name(self._temporary), "w", format="mp4", options={"movflags": "+faststart"})
         # one thread a core, but the same bytes whatever their number
         options = {"crf": str(config.crf), "preset": config.preset, "x264-params": "threads=4:sliced-threads=0"}
         self._stream = self._container.add_stream("libx264", rate=rate, options=options)

@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 from calls import Capture, error_line, left_behind
+from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
 from clsplat import farm
@@ -93,6 +94,7 @@ def workers() -> list[int]:
     return found
 
 
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="finds the workers in /proc")
 def test_a_worker_is_killed_half_way(shot: list[str], whole: dict[str, bytes], tmp_path: Path, capsys: Capture) -> None:
     pytest.importorskip("distributed", reason="the extra `farm` brings it")
     killer = Killer(tmp_path)
@@ -110,6 +112,7 @@ def test_a_worker_is_killed_half_way(shot: list[str], whole: dict[str, bytes], t
     assert contents(tmp_path) == whole
 
 
+@posix
 def test_ctrl_c_of_a_terminal(shot: list[str], tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="the extra `farm` brings it")
     line = [sys.executable, "-m", "clsplat", "render", *shot, "-o", str(tmp_path / "a.####.exr"), "--workers", "2"]
@@ -250,6 +253,7 @@ def openjd() -> str:
     return found
 
 
+@posix
 def test_the_open_job_description_runs(openjd: str, shot: list[str], whole: dict[str, bytes], tmp_path: Path) -> None:
     checked = subprocess.run([openjd, "check", str(TEMPLATE)], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stdout + checked.stderr

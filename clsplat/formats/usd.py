@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from clsplat.edit import merge
 from clsplat.errors import InputError, plain
-from clsplat.files import atomic_writer, open_input
+from clsplat.files import atomic_writer, native_name, open_input
 from clsplat.formats import conventions, packing
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
@@ -109,7 +109,7 @@ def _open(path: Path) -> Any:
 
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
     try:
-        stage = Usd.Stage.Open(os.path.realpath(path), Usd.Stage.LoadNone)
+        stage = Usd.Stage.Open(native_name(os.path.realpath(path)), Usd.Stage.LoadNone)
     except Tf.ErrorException:
         stage = None
     if stage is None:
@@ -221,13 +221,13 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     # USD may hold its file open for longer, which Windows does not remove
     with tempfile.TemporaryDirectory(prefix="clsplat-usd-", ignore_cleanup_errors=True) as folder:
         made = Path(folder) / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
-        stage = Usd.Stage.CreateNew(str(made))
+        stage = Usd.Stage.CreateNew(native_name(made))
         _author(stage, gaussians, up_axis, meters_per_unit)
         stage.GetRootLayer().Save()
         del stage
         if suffix == ".usdz":
             package = Path(folder) / "gaussians.usdz"
-            if not UsdUtils.CreateNewUsdzPackage(str(made), str(package)):
+            if not UsdUtils.CreateNewUsdzPackage(native_name(made), native_name(package)):
                 raise OSError(f"{path}: USD could not make the package")
             made = package
         with atomic_writer(path) as file, made.open("rb") as source:
