@@ -74,7 +74,13 @@ def _runs(python: Path) -> bool:
 
 def _call(command: list[str], *, quiet: bool = False) -> int:
     stream = subprocess.DEVNULL if quiet else sys.stderr
-    return subprocess.run(command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, check=False).returncode
+    # venv and pip write paths in UTF-8, and fail where the locale's encoding is another and the checkout's path is not
+    # ASCII; what they set up runs in any locale
+    utf8 = {} if sys.getfilesystemencoding() == "utf-8" else {"PYTHONUTF8": "1"}
+    done = subprocess.run(
+        command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, env={**os.environ, **utf8}, check=False
+    )
+    return done.returncode
 
 
 if __name__ == "__main__":
