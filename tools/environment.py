@@ -59,7 +59,7 @@ def set_up(extras: tuple[str, ...] = ()) -> Path:
 
 def run(command: list[str]) -> int:
     """Run a command to its end and give its exit status; Ctrl-C is for the command, and then for us."""
-    process = subprocess.Popen(command)
+    process = subprocess.Popen(command, env=_variables())
     while True:
         try:
             status = process.wait()
@@ -74,13 +74,16 @@ def _runs(python: Path) -> bool:
 
 def _call(command: list[str], *, quiet: bool = False) -> int:
     stream = subprocess.DEVNULL if quiet else sys.stderr
-    # venv and pip write paths in UTF-8, and fail where the locale's encoding is another and the checkout's path is not
-    # ASCII; what they set up runs in any locale
-    utf8 = {} if sys.getfilesystemencoding() == "utf-8" else {"PYTHONUTF8": "1"}
     done = subprocess.run(
-        command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, env={**os.environ, **utf8}, check=False
+        command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, env=_variables(), check=False
     )
     return done.returncode
+
+
+def _variables() -> dict[str, str]:
+    """Ours, with UTF-8 whatever the locale where the checkout's path is not ASCII: venv and pip write that path in UTF-8,
+    into files that Python before 3.13 reads as the locale says."""
+    return dict(os.environ) if str(ROOT).isascii() else {**os.environ, "PYTHONUTF8": "1"}
 
 
 if __name__ == "__main__":
