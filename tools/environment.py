@@ -81,8 +81,8 @@ def _call(command: list[str], *, quiet: bool = False) -> int:
 
 
 def _variables() -> dict[str, str]:
-    """Ours, with UTF-8 whatever the locale where the checkout's path is not ASCII: venv and pip write that path in UTF-8,
-    into files that Python before 3.13 reads as the locale says."""
+    """Ours, with UTF-8 whatever the locale where the checkout's path is not ASCII: venv and pip write that path in
+    UTF-8, into files that Python before 3.13 reads as the locale says."""
     return dict(os.environ) if str(ROOT).isascii() else {**os.environ, "PYTHONUTF8": "1"}
 
 
