@@ -60,10 +60,6 @@ class Demo:
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
-    iterations: int = 2000
-    """Steps of the training."""
-    frames: int = 60
-    """Frames of the turntable."""
     json: Flag = False
     """Print the evaluation as JSON on standard output."""
 

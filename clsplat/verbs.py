@@ -88,11 +88,8 @@ def demo(verb: Demo) -> int:
     from clsplat.device.context import open_device
     from clsplat.trust import require
 
-    for name in ("iterations", "frames"):
-        if getattr(verb, name) < 1:
-            raise InputError(f"--{name} {getattr(verb, name)}: expected at least 1")
     require(open_device(verb.device))
-    result = run_demo(verb.output, device=verb.device, iterations=verb.iterations, frames=verb.frames)
+    result = run_demo(verb.output, device=verb.device)
     if verb.json:
         print(json.dumps(result, indent=2))
     return 0

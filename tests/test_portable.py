@@ -19,7 +19,7 @@ from models import random_gaussians
 from packaging.requirements import Requirement
 
 from clsplat import files, frames, process, sfm_photos, transforms
-from clsplat.cli import _unboxed, main
+from clsplat.cli import _unboxed
 from clsplat.device import packaged
 from clsplat.device.advice import driver_advice
 from clsplat.errors import InputError
@@ -422,10 +422,3 @@ def test_frames_of_reports() -> None:
         "╭─ Value error ─╮\n│ Error parsing it │\n│ of -- two lines │\n│ ──────── │\n│ For full helptext │\n╰────╯\n"
     )
     assert _unboxed(plain) == _unboxed(boxed) == "Error parsing it of -- two lines"
-
-
-@pytest.mark.parametrize("flag", ["--iterations", "--frames"])
-def test_a_demo_of_nothing(flag: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo", "-o", str(tmp_path / "demo"), flag, "0"]) == 2
-    assert capsys.readouterr().err == f"clsplat: error: {flag} 0: expected at least 1\n"
-    assert not (tmp_path / "demo").exists()
