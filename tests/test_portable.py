@@ -337,9 +337,6 @@ def run_clsplat(folder: Path, environment: dict[str, str], *arguments: str) -> s
 
 
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-ascii_checkout = pytest.mark.skipif(
-    not str(ROOT).isascii(), reason="Python itself does not start there: its .pth file of the checkout is not ASCII"
-)
 LOCALES = {
     "C": {"LC_ALL": "C"},
     "C without Python's own help": ASCII,
@@ -347,9 +344,7 @@ LOCALES = {
 }
 
 
-@pytest.mark.parametrize(
-    "locale", [pytest.param(name, marks=ascii_checkout) if LOCALES[name] is ASCII else name for name in LOCALES]
-)
+@pytest.mark.parametrize("locale", LOCALES)
 def test_paths_of_any_letters_in_any_locale(locale: str, tmp_path: Path) -> None:
     folder = tmp_path / LETTERS
     folder.mkdir()
@@ -365,7 +360,6 @@ def test_paths_of_any_letters_in_any_locale(locale: str, tmp_path: Path) -> None
     assert done.stderr.count(b"\n") == 1
 
 
-@ascii_checkout
 def test_a_picture_in_a_folder_of_any_letters_where_the_locale_is_ascii(tmp_path: Path) -> None:
     folder = tmp_path / LETTERS
     folder.mkdir()
