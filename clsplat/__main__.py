@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+import io
 import sys
 
 
 def main() -> int:
     """Run the command line in `sys.argv`; returns the exit status."""
+    output = sys.stdout
+    if isinstance(output, io.TextIOWrapper) and output.errors == "strict":
+        output.reconfigure(errors="backslashreplace")  # a path may have letters that the stream's encoding lacks
     try:
         from clsplat.cli import main as run
 

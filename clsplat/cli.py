@@ -36,6 +36,7 @@ from clsplat.config import (
 )
 from clsplat.errors import ClsplatError, InputError
 from clsplat.picture_config import ColourConfig, DeepConfig, FramingConfig, SamplingConfig, VideoConfig
+from clsplat.process import reader_has_gone
 
 Output = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
 
@@ -326,7 +327,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         status = _run(arguments)
         sys.stdout.flush()  # here and not at the interpreter's end, where a reader that has gone would be a traceback
-    except BrokenPipeError:  # as `| head` does
+    except OSError as error:
+        if not reader_has_gone(error):
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return status
@@ -356,9 +359,9 @@ def _run(arguments: Sequence[str] | None) -> int:
                 traceback.print_exc()
             print("clsplat: interrupted", file=sys.stderr)
             return 130
-        except BrokenPipeError:
-            raise
         except (ClsplatError, OSError, MemoryError) as error:
+            if isinstance(error, OSError) and reader_has_gone(error):
+                raise
             if debug:
                 traceback.print_exc()
             print(f"clsplat: error: {one_line(error)}", file=sys.stderr)
@@ -470,13 +473,18 @@ def _columns(count: int | None) -> Iterator[None]:
 def _unboxed(report: str) -> str:
     """The message of one of tyro's boxes as one line: its frame and its further advice taken off."""
     words: list[str] = []
+    titled = "╭" in report  # else, where standard output is not UTF-8, the first rule is below the title
     for line in report.splitlines():
         text = line.strip("│ ").strip()
         if text.startswith("╭") or not text:
             continue
-        if text.startswith(("─", "╰")):
-            break
-        words.append(text)
+        if text.startswith(("─", "╰")) or not text.strip("-"):
+            if titled:
+                break
+            titled = True
+            words.clear()
+        else:
+            words.append(text)
     return " ".join(" ".join(words).split()) or "the call is wrong, see clsplat --help"
 
 

@@ -81,7 +81,7 @@ def _train(scene_folder: Path, run_folder: Path, iterations: int, device: Any) -
     run = Run.create(run_folder, config, scene=scene_folder, resume=False, overwrite=True)
     with TrainProgress(iterations) as progress:
         train(scene, config, device=device, run=run, on_step=progress)
-    result: dict[str, Any] = json.loads(run.eval_path.read_text())
+    result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
     return result
 
 

@@ -24,6 +24,7 @@ from scipy import ndimage
 
 from clsplat.camera import Camera
 from clsplat.errors import ClsplatError
+from clsplat.files import native_name, remove, replace
 from clsplat.trajectory import look_at
 
 Float32 = NDArray[np.float32]
@@ -418,12 +419,15 @@ def write_jpeg(path: Path, image: Float32) -> None:
     spec.attribute("jpeg:subsampling", "4:4:4")
     # under another name until it is whole: a later start must not take half a photo for one
     part = path.with_name(f".{path.name}")
-    output = oiio.ImageOutput.create(str(part))
-    if output is None or not output.open(str(part), spec) or not output.write_image(pixels) or not output.close():
+    name = native_name(part)
+    output = oiio.ImageOutput.create(name)
+    if output is None or not output.open(name, spec) or not output.write_image(pixels) or not output.close():
         reason = oiio.geterror() if output is None else output.geterror()
-        part.unlink(missing_ok=True)
+        if output is not None:
+            output.close()  # Windows removes no file that is open
+        remove(part)
         raise ClsplatError(f"{path}: cannot write the photo: {reason}")
-    part.replace(path)
+    replace(part, path)
 
 
 def write_photos(

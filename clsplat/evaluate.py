@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsplat import metrics
 from clsplat.errors import ClsplatError, InputError
+from clsplat.files import identity
 
 Image = NDArray[Any]
 
@@ -95,7 +96,9 @@ def evaluate(
 
 
 def picture_names(names: Sequence[str], extension: str = ".png") -> list[str]:
-    """Relative file names for views: the extension replaced, sub-folders kept; where two would be one, added."""
+    """Relative file names for views: the extension replaced, sub-folders kept; where two would be one, on a file system
+    that ignores case too, added."""
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
-    uses = Counter(stems)
-    return [(stem if uses[stem] == 1 else name) + extension for stem, name in zip(stems, names, strict=True)]
+    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names on every system
+    uses = Counter(keys)
+    return [(stem if uses[key] == 1 else name) + extension for stem, key, name in zip(stems, keys, names, strict=True)]

@@ -210,7 +210,7 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
             yield client
         return
     with (
-        dask.config.set({"distributed.worker.daemon": True}),
+        dask.config.set({"distributed.worker.daemon": True, "distributed.worker.multiprocessing-method": "spawn"}),
         distributed.LocalCluster(
             n_workers=workers,
             threads_per_worker=THREADS,

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing files so that a crash, Ctrl-C or a full disk leaves the previous file whole; opening files of others."""
+"""Writing files so that a crash, Ctrl-C or a full disk leaves the previous file whole; opening files of others; names
+that a system takes."""
 
 from __future__ import annotations
 
@@ -10,11 +11,13 @@ import re
 import secrets
 import socket
 import stat
+import sys
 import time
-from collections.abc import Iterable, Iterator
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from pathlib import Path
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO
 
 from clsplat.errors import InputError
@@ -24,6 +27,14 @@ MAX_DOCUMENT = 32 << 20
 """Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
 ABANDONED = 600.0
 """Seconds without a write after which a temporary file of another machine is nobody's any more."""
+WINDOWS = os.name == "nt"
+IGNORES_CASE = sys.platform in ("win32", "darwin")
+"""Whether the system's usual file systems take A.png and a.png for one file, and an accented letter for its parts."""
+PATIENCE = 2.0
+"""Seconds in which a file on Windows that another program has open is tried again: a virus scanner or an indexer lets
+go of a new file within one."""
+_REFUSED = re.compile(r'[<>:"|?*\x00-\x1f]')
+_DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE | re.DOTALL)
 _TEMPORARY = re.compile(rf"\.(.+)\.([0-9a-f]{{20}}){re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
 
 
@@ -66,7 +77,7 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(target)
+        replace(temporary, target)
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
@@ -81,6 +92,64 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
     """Write `data` as the whole content of `path`; see `atomic_writer`."""
     with atomic_writer(path) as file:
         file.write(data)
+
+
+def replace(source: Path, target: Path) -> None:
+    """Rename a file or a folder, in the place of a file that is there. Raises OSError."""
+
+    def rename() -> None:
+        source.replace(target)
+
+    _patiently(rename)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if it is there. Raises OSError."""
+    _patiently(lambda: path.unlink(missing_ok=True))
+
+
+def _patiently(act: Callable[[], None], *, windows: bool = WINDOWS) -> None:
+    """Do it; again and again for a while where Windows says that another program has the file open."""
+    until = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return act()
+        except PermissionError:
+            if not windows or time.monotonic() > until:
+                raise
+            time.sleep(0.02)
+
+
+def name_trouble(name: str, *, windows: bool = WINDOWS) -> str | None:
+    """Why no file below a folder can be called `name`, with its sub-folders before slashes; None where one can."""
+    pure: PurePath = PureWindowsPath(name) if windows else PurePosixPath(name)
+    if pure.anchor or ".." in pure.parts:
+        return "leads out of the output folder"
+    if not pure.name or "\0" in name:
+        return "is no name for a file"
+    if windows:
+        for part in pure.parts:
+            if found := _REFUSED.search(part):
+                return f"has {found[0]!r} in it, which no name of a file on Windows may have"
+            if _DEVICE.fullmatch(part):
+                return f"is a name that Windows keeps for a device ({part})"
+            if part[-1] in ". ":
+                return f"ends {part!r} with a dot or a space, which Windows drops"
+    return None
+
+
+def native_name(path: str | os.PathLike[str]) -> str:
+    """The name of a file for a library that takes names in UTF-8, whatever the locale says. Raises InputError."""
+    try:
+        return os.fsencode(path).decode("utf-8")
+    except UnicodeError:
+        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it") from None
+
+
+def identity(path: PurePath, *, ignores_case: bool = IGNORES_CASE) -> str:
+    """Equal for two paths that the system takes for one file, whatever links there are."""
+    text = str(path)
+    return unicodedata.normalize("NFC", text).casefold() if ignores_case else text
 
 
 def abandoned(targets: Iterable[Path]) -> list[Path]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from clsplat.errors import InputError
+from clsplat.files import identity, name_trouble
 
 MOST_FRAMES = 10_000_000
 RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?")
@@ -91,12 +92,13 @@ class Pattern:
 
 
 def _stem(name: str) -> str:
-    pure = PurePosixPath(name)
-    if pure.is_absolute() or ".." in pure.parts:
-        raise InputError(f"image name {name!r} leads out of the output folder")
-    if not pure.name:
+    if not PurePosixPath(name).name:
         raise InputError(f"image name {name!r} is empty, expected a name for the file")
-    return str(pure.with_suffix(""))
+    stem = str(PurePosixPath(name).with_suffix(""))
+    for each in (name, stem):
+        if trouble := name_trouble(each):
+            raise InputError(f"image name {name!r} {trouble}, expected one for a file in the output folder")
+    return stem
 
 
 def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
@@ -108,10 +110,12 @@ def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
             f"{pattern}: has no {{name}} in it, expected one to tell {len(frames)} cameras apart, or a frame number "
             "such as ####"
         )
-    taken: dict[Path, str] = {}
+    paths: list[Path] = []
+    taken: dict[str, str] = {}
     for frame, name in frames:
         path = parsed.path(frame, name)
-        if path in taken:
-            raise InputError(f"{path}: would be both {taken[path]} and {name}")
-        taken[path] = name
-    return list(taken)
+        if (key := identity(path)) in taken:
+            raise InputError(f"{path}: would be both {taken[key]} and {name}")
+        taken[key] = name
+        paths.append(path)
+    return paths

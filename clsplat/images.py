@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import is_file, open_input, temporary_name
+from clsplat.files import is_file, native_name, open_input, replace, temporary_name
 
 Float32 = NDArray[np.float32]
 Metadata = Mapping[str, str | int | float]
@@ -50,13 +50,13 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     """All pictures (by extension) under `folder`, if `deep` with its sub-folders, sorted; hidden files and folders are
     left out. Links to folders are followed, to each folder once."""
     found: list[Path] = []
-    seen: set[tuple[int, int]] = set()
+    seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True):
-        status = Path(root).stat()
-        if (status.st_dev, status.st_ino) in seen:
+        real = os.path.realpath(root)  # not the inode: some file systems of Windows number every folder 0
+        if real in seen:
             folders.clear()
             continue
-        seen.add((status.st_dev, status.st_ino))
+        seen.add(real)
         folders[:] = sorted(name for name in folders if deep and not name.startswith("."))
         found += [
             path
@@ -230,9 +230,7 @@ def open_image(path: Path, hints: Any = None) -> Any:
         known = file.read(8).startswith(SIGNATURES)
     if size > MAX_FILE_BYTES or (size > FREE_FILE_BYTES and not known):
         raise InputError(f"{path}: has {size} bytes and does not begin as a picture, expected at most {MAX_FILE_BYTES}")
-    name = str(path)
-    if name.encode("utf-8", "replace").decode() != name:
-        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it")
+    name = native_name(path)
     source = oiio.ImageInput.open(name, hints) if hints is not None else oiio.ImageInput.open(name)
     if source is None:
         raise InputError(f"{path}: does not decode: {_one_line(error_of(oiio))}; expected an image")
@@ -355,13 +353,13 @@ def atomic_output(path: Path, specs: Sequence[Any], kind: str) -> Iterator[Outpu
     # Not through files.atomic_writer: OpenImageIO writes to a name, not to an open file.
     target = Path(os.path.realpath(path))
     temporary = temporary_name(target)
-    output = Output(oiio.ImageOutput.create(kind), str(temporary), path)
+    output = Output(oiio.ImageOutput.create(kind), native_name(temporary), path)
     try:
         # several parts have to be announced together
         output.take(output.file.open(output.name, specs[0] if len(specs) == 1 else tuple(specs)))
         yield output
         output.take(output.file.close())
-        temporary.replace(target)
+        replace(temporary, target)
     except OSError as error:
         raise ClsplatError(f"{path}: cannot be written: {error.strerror}") from None
     finally:

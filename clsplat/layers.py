@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera, Window
 from clsplat.config import Compression, ExrDepth, Parts
 from clsplat.errors import InputError
+from clsplat.files import native_name
 from clsplat.images import image_size, steps_of, unassociate, write_spec
 
 Float64 = NDArray[np.float64]
@@ -189,7 +190,7 @@ def is_whole(
         image_size(path)  # finds a PNG that is cut short, of which libpng would print
     except InputError:
         return False
-    source = oiio.ImageInput.open(str(path))
+    source = oiio.ImageInput.open(native_name(path))
     if source is None:
         oiio.geterror()
         return False

@@ -24,7 +24,15 @@ from numpy.typing import NDArray
 import clsplat
 from clsplat.config import TrainConfig
 from clsplat.errors import ClsplatError, InputError, plain
-from clsplat.files import TEMPORARY_SUFFIX, atomic_write, atomic_writer, open_input, parse_json, read_document
+from clsplat.files import (
+    TEMPORARY_SUFFIX,
+    atomic_write,
+    atomic_writer,
+    open_input,
+    parse_json,
+    read_document,
+    remove,
+)
 from clsplat.gaussians import Gaussians
 
 if sys.version_info >= (3, 11):
@@ -93,7 +101,7 @@ class Run:
             scene = scene or earlier.scene
         elif overwrite and is_run(path):
             for file in owned_files(path):
-                file.unlink()
+                remove(file)
         run = cls(path, config, Path(scene).absolute() if scene is not None else None, resuming=resume)
         run.checkpoints_path.mkdir(parents=True, exist_ok=True)
         atomic_write(run.config_path, config_text(config, run.scene).encode())
@@ -141,7 +149,7 @@ class Run:
         except ValueError:
             raise ClsplatError(f"training diverged at step {record.get('step')}: {dict(record)}") from None
         try:
-            with open(self.metrics_path, "a", encoding="utf-8") as file:
+            with open(self.metrics_path, "a", encoding="utf-8", newline="\n") as file:
                 file.write(line + "\n")
         except OSError as error:  # a full disk does not say which file it was
             raise OSError(error.errno, error.strerror, str(self.metrics_path)) from None
@@ -188,7 +196,7 @@ class Run:
         keep = {p for _, p in earlier[-KEPT_CHECKPOINTS:]}
         for _, other in self.checkpoints():
             if other not in keep:
-                other.unlink()
+                remove(other)
         return path
 
     def checkpoints(self) -> list[tuple[int, Path]]:
@@ -216,7 +224,7 @@ class Run:
             raise InputError(f"{self.checkpoints_path}: no checkpoint there is whole, use --overwrite to start again")
         if self.resuming:
             for left in self.path.rglob(".*" + TEMPORARY_SUFFIX):
-                left.unlink(missing_ok=True)
+                remove(left)
             self.truncate_metrics(checkpoint.step if checkpoint else 0)
         return checkpoint
 

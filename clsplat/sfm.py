@@ -21,7 +21,8 @@ from typing import IO, Any, Literal
 
 from clsplat import sfm_photos
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import parse_json, read_document
+from clsplat.files import parse_json, read_document, replace
+from clsplat.process import apart
 
 Progress = Callable[[str, float | None], None]
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -125,7 +126,7 @@ def reconstruct(
         result = answer["result"]
         missing = sorted({photo.name for photo in photos} - set(result["registered"]))
         record = {"fingerprint": fingerprint, "photos": len(photos), "unregistered": missing, **result}
-        (work / "result" / RECORD).write_text(json.dumps(record, indent=2) + "\n")
+        (work / "result" / RECORD).write_bytes((json.dumps(record, indent=2) + "\n").encode())
         if missing:
             lost = _listed([images / name for name in missing], images)
             warnings.warn(f"{images}: {lost} could not be placed and will not be used", stacklevel=2)
@@ -198,7 +199,6 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
     log_path = work / "log.txt"
     search_path = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
     with open(log_path, "wb") as log:
-        # a session of its own: Ctrl-C on the terminal is for us, and we end the worker
         process = subprocess.Popen(
             [sys.executable, "-m", "clsplat.sfm_worker"],
             stdin=subprocess.PIPE,
@@ -207,7 +207,7 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
             text=True,
             encoding="utf-8",
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, search_path))},
-            start_new_session=True,
+            **apart(),  # Ctrl-C on the terminal is for us, and we end the worker
         )
         assert process.stdin is not None
         assert process.stdout is not None
@@ -216,16 +216,18 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
             process.stdin.flush()
             answer = _follow(process.stdout, work / "database.db", report)
             process.wait()
-        except BrokenPipeError:
+        except OSError:  # the worker is gone: a broken pipe, or on Windows an invalid argument
             answer = {}
         finally:
             process.kill()
             process.wait()
-            with contextlib.suppress(BrokenPipeError):  # closing writes what the worker never read
+            with contextlib.suppress(OSError):  # closing writes what the worker never read
                 process.stdin.close()
             process.stdout.close()
     if not answer:
-        tail = [line.strip() for line in log_path.read_text(errors="replace").splitlines() if line.strip()][-3:]
+        tail = [line.strip() for line in log_path.read_text("utf-8", errors="replace").splitlines() if line.strip()][
+            -3:
+        ]
         raise ClsplatError(f"structure from motion failed (status {process.returncode}): {' | '.join(tail)}")
     return answer
 
@@ -283,12 +285,12 @@ def _move_into_place(work: Path, output: Path) -> None:
     """Make the finished result `output`; an earlier one goes only when the new one stands."""
     earlier = work / "earlier"
     if output.exists():
-        output.rename(earlier)
+        replace(output, earlier)
     try:
-        (work / "result").rename(output)
+        replace(work / "result", output)
     except BaseException:
         if earlier.exists():
-            earlier.rename(output)
+            replace(earlier, output)
         raise
 
 

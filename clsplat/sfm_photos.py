@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import is_file
+from clsplat.files import WINDOWS, is_file, native_name
 from clsplat.images import error_of, open_image
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -134,6 +134,8 @@ def _stage(folder: Path, target: Path, path: Path) -> Photo:
         _write_upright(path, copy)
     else:
         try:
+            if WINDOWS and not os.access(path, os.W_OK):
+                raise PermissionError("a link to a file that is read-only cannot be removed again")
             os.link(path.resolve(), copy)
         except OSError:
             shutil.copyfile(path, copy)
@@ -152,7 +154,7 @@ def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
 
 def has_alpha(path: Path) -> bool:
     """Whether an image file has an alpha channel; reads its header alone."""
-    source = oiio.ImageInput.open(str(path))
+    source = oiio.ImageInput.open(native_name(path))
     if source is None:
         return False
     found: bool = source.spec().alpha_channel >= 0
@@ -162,10 +164,10 @@ def has_alpha(path: Path) -> bool:
 
 def _write_upright(path: Path, copy: Path) -> None:
     """Write the photo as it is meant to be seen. EXIF stays, for the focal length, but says upright now."""
-    upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(str(path)))
+    upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(native_name(path)))
     upright.specmod().attribute("Orientation", 1)
     upright.specmod().attribute("Compression", "jpeg:98" if copy.suffix.lower() in (".jpg", ".jpeg") else "lzw")
-    if upright.has_error or not upright.write(str(copy)):
+    if upright.has_error or not upright.write(native_name(copy)):
         raise ClsplatError(f"{copy}: cannot write the turned copy of {path}: {_last_line(upright.geterror())}")
 
 

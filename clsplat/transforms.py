@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import math
 import os
+import posixpath
+import re
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -27,6 +29,7 @@ from clsplat.undistort import Lens, check_lens
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
+DRIVE = re.compile(r"\A[A-Za-z]:/")
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 """instant-ngp's defaults: its position is scale times the file's, plus offset."""
@@ -200,9 +203,9 @@ def load_document(path: Path, expected: str = "a transforms.json", key: str = "'
 
 
 def _plain(listed: str) -> str:
-    """A file_path as a name: forward slashes, nothing like "./" or "../" before it."""
-    parts = PurePosixPath(os.path.normpath(listed.replace("\\", "/")).replace(os.sep, "/")).parts
-    return "/".join(part for part in parts if part not in ("..", "/"))
+    """A file_path as a name: forward slashes, nothing like "./", "../" or "C:/" before it."""
+    text = DRIVE.sub("/", posixpath.normpath(listed.replace("\\", "/")))
+    return "/".join(part for part in text.split("/") if part not in ("", ".", ".."))
 
 
 def _find_file(folder: Path, listed: str) -> Path:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat import render_job
 from clsplat.cli import Render
+from clsplat.process import endings
 from clsplat.progress import FrameProgress
 from clsplat.render_job import Record
 from clsplat.render_request import Job, read_job, warn
@@ -47,7 +48,8 @@ def _run(job: Job) -> int:
         for shader in shaders:
             shader.check(tasks)
     if _is_main_thread():  # again, as pycolmap and compilers of kernels install handlers of their own
-        signal.signal(signal.SIGTERM, _interrupt)
+        for each in endings():
+            signal.signal(each, _interrupt)
     render_job.make_folders(tasks)
     render_job.remove_temporaries(tasks)
     there = render_job.complete(tasks, options) if verb.skip_existing else set()
@@ -112,16 +114,17 @@ def _print_profile(records: Any, wall: float, devices: int) -> None:
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Inside, SIGTERM raises KeyboardInterrupt in the main thread."""
+    """Inside, what asks the process to end raises KeyboardInterrupt in the main thread."""
     if not _is_main_thread():
         yield
         return
 
-    before = signal.signal(signal.SIGTERM, _interrupt)
+    before = {each: signal.signal(each, _interrupt) for each in endings()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _interrupt(*_: object) -> None:

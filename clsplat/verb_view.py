@@ -19,6 +19,7 @@ from clsplat.errors import InputError
 from clsplat.evaluate import background_colour
 from clsplat.gaussians import Gaussians
 from clsplat.memory import parse_bytes
+from clsplat.process import endings
 from clsplat.runs import Run, is_run, model_file
 from clsplat.viewer.look import Look
 from clsplat.viewer.models import HeldModel, LiveModel
@@ -163,12 +164,12 @@ def _print_address(server: Server) -> None:
 
 @contextmanager
 def _until_stopped() -> Iterator[Callable[[], bool]]:
-    """Inside, Ctrl-C and SIGTERM ask to end."""
+    """Inside, Ctrl-C and what else asks the process to end is heard."""
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield asked.is_set
         return
-    before = {each: signal.signal(each, lambda *_: asked.set()) for each in (signal.SIGINT, signal.SIGTERM)}
+    before = {each: signal.signal(each, lambda *_: asked.set()) for each in (signal.SIGINT, *endings())}
     try:
         yield asked.is_set
     finally:

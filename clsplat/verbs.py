@@ -53,11 +53,12 @@ def run(verb: Verb) -> int:
 
 def devices(verb: Devices) -> int:
     """Print the table of devices."""
+    from clsplat.device.advice import driver_advice
     from clsplat.device.context import find_device, list_devices
 
     found = list_devices() if verb.device is None else [find_device(verb.device)]
     if not found:
-        raise DeviceError("no OpenCL device found, expected a driver such as pip install 'pyopencl[pocl]' brings")
+        raise DeviceError(f"no OpenCL device found: {driver_advice()}")
     if verb.json:
         print(json.dumps([asdict(info) for info in found], indent=2))
         return 0
@@ -116,7 +117,7 @@ def sfm(verb: Sfm) -> int:
         progress=StageProgress(),
     )
     if verb.json:
-        print((verb.output / RECORD).read_text().rstrip())
+        print((verb.output / RECORD).read_text("utf-8").rstrip())
     print(f"scene in {verb.output}; next: clsplat train {verb.output} -o RUN", file=sys.stderr)
     return 0
 
@@ -170,7 +171,7 @@ def train(verb: Train) -> int:
         at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
         print(f"clsplat: interrupted {at}; go on with: clsplat train -o {run.path} --resume", file=sys.stderr)
         return 130
-    result = json.loads(run.eval_path.read_text()) if run.eval_path.exists() else None
+    result = json.loads(run.eval_path.read_text("utf-8")) if run.eval_path.exists() else None
     if verb.json:
         print(json.dumps(result, indent=2))
     elif result is not None:

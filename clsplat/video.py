@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import temporary_name
+from clsplat.files import native_name, replace, temporary_name
 from clsplat.layers import VIDEO
 from clsplat.picture_config import VideoConfig
 
@@ -122,7 +122,7 @@ class VideoWriter:
 
         config = self._config
         rate = Fraction(config.fps).limit_denominator(1001)
-        self._container = av.open(str(self._temporary), "w", format="mp4", options={"movflags": "+faststart"})
+        self._container = av.open(native_name(self._temporary), "w", format="mp4", options={"movflags": "+faststart"})
         # one thread a core, but the same bytes whatever their number
         options = {"crf": str(config.crf), "preset": config.preset, "x264-params": "threads=4:sliced-threads=0"}
         self._stream = self._container.add_stream("libx264", rate=rate, options=options)
@@ -160,9 +160,9 @@ class VideoWriter:
     def _finish(self) -> None:
         self._container.mux(self._stream.encode(None))
         self._container.close()
-        with open(self._temporary, "rb") as file:
+        with open(self._temporary, "r+b") as file:  # Windows flushes only what may be written to
             os.fsync(file.fileno())
-        self._temporary.replace(self._target)
+        replace(self._temporary, self._target)
 
 
 def write_video(path: Path, frames: Iterable[NDArray[Any]], config: VideoConfig | None = None) -> int:

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 from calls import Capture, error_line, left_behind
 from needs import openjd_path, require
+from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
 from clsplat import farm
@@ -95,6 +96,7 @@ def workers() -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.needs("distributed")
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="finds the workers in /proc")
 def test_a_worker_is_killed_half_way(shot: list[str], whole: dict[str, bytes], tmp_path: Path, capsys: Capture) -> None:
     killer = Killer(tmp_path)
     killer.start()
@@ -113,6 +115,7 @@ def test_a_worker_is_killed_half_way(shot: list[str], whole: dict[str, bytes], t
 
 @pytest.mark.slow
 @pytest.mark.needs("distributed")
+@posix
 def test_ctrl_c_of_a_terminal(shot: list[str], tmp_path: Path) -> None:
     line = [sys.executable, "-m", "clsplat", "render", *shot, "-o", str(tmp_path / "a.####.exr"), "--workers", "2"]
     line += ["--progress", "json", "--width", "1600"]  # large enough that there are frames left
@@ -254,6 +257,7 @@ def openjd() -> str:
 
 
 @pytest.mark.slow
+@posix
 def test_the_open_job_description_runs(openjd: str, shot: list[str], whole: dict[str, bytes], tmp_path: Path) -> None:
     checked = subprocess.run([openjd, "check", str(TEMPLATE)], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stdout + checked.stderr

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from systems import posix
 
 from clsplat.files import atomic_write, atomic_writer
 
@@ -59,6 +60,7 @@ def test_disk_full_for_real(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert list(tmp_path.iterdir()) == [path]
 
 
+@posix
 def test_link_is_followed_and_permissions_are_the_umasks(tmp_path: Path) -> None:
     target, link, plain = tmp_path / "target", tmp_path / "link", tmp_path / "plain"
     target.write_bytes(b"old")

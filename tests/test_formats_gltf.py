@@ -15,6 +15,7 @@ import pytest
 from node import splat_transform, validate_gltf
 from scipy.spatial.transform import Rotation
 from splats import assert_refused_or_sound, assert_within, colours, covariances, damaged, lopsided, with_origin
+from systems import can_link
 
 from clsplat.errors import InputError
 from clsplat.formats import gltf, spz
@@ -202,6 +203,8 @@ def test_no_buffer_is_outside_the_folder(tmp_path: Path, uri: str) -> None:
     changed(path, lambda asset: asset["buffers"][0].update(uri=uri))
     with pytest.raises(InputError, match="expected a file beside it"):
         gltf.read(path)
+    if not can_link():
+        return  # there is nothing to follow
     (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
     changed(path, lambda asset: asset["buffers"][0].update(uri="link.bin"))
     with pytest.raises(InputError, match="expected a file beside it"):

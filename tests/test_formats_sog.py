@@ -15,6 +15,7 @@ import pytest
 from models import real_file
 from node import splat_transform
 from splats import assert_refused_or_sound, assert_within, damaged, lopsided, losses, opacity, read_plainly, with_origin
+from systems import links
 
 from clsplat.errors import InputError
 from clsplat.formats import packing, sog
@@ -219,6 +220,7 @@ def test_lies(tmp_path: Path, lie: str) -> None:
     assert assert_refused_or_sound(sog.read, folder / "meta.json")
 
 
+@links
 def test_a_picture_that_is_a_link_to_itself(tmp_path: Path) -> None:
     path = tmp_path / "meta.json"
     sog.write(path, lopsided(20, degree=0))

@@ -35,6 +35,15 @@ def test_it_comes_back_as_it_was(tmp_path: Path, suffix: str) -> None:
     assert len(list(tmp_path.iterdir())) == 4
 
 
+@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
+def test_a_folder_with_brackets_and_letters_of_any_kind(tmp_path: Path, suffix: str) -> None:
+    """Layers in a package are named with brackets: PACKAGE[LAYER]."""
+    folder = tmp_path / "take [1] ü日"
+    folder.mkdir()
+    usd.write(folder / f"a{suffix}", lopsided())
+    assert_within(usd.read(folder / f"a{suffix}"), lopsided(), **EXACT)
+
+
 @pytest.mark.parametrize("suffix", [".usda", ".usdz"])
 def test_usd_has_nothing_against_it(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"model{suffix}"

@@ -35,6 +35,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from spoilers import SPOILERS
 from stress_files import stress, verdict
+from systems import links, posix
 
 from clsplat import colmap, images, runs, sfm, transforms
 from clsplat.config import TrainConfig
@@ -180,7 +181,13 @@ def huge(path: Path) -> None:
         file.truncate(1 << 33)  # takes no room on the disk
 
 
-PLACES = (pipe, loop, folder, zeros, huge)
+PLACES = (
+    pytest.param(pipe, marks=posix),
+    pytest.param(loop, marks=links),
+    folder,
+    pytest.param(zeros, marks=posix),
+    huge,
+)
 
 
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: place.__name__)
@@ -362,6 +369,7 @@ def test_a_scene_is_not_left_from_the_working_folder(tmp_path: Path, monkeypatch
     assert "inside the scene's folder" in refusal(lambda: load_scene(Path(path.name)))
 
 
+@links
 def test_files_inside_by_their_absolute_name_or_by_a_link(tmp_path: Path) -> None:
     folder = tmp_path / "scene"
     assert len(load_scene(change(folder, file_path=str(folder / "images/b.png")).parent).views) == 3
@@ -427,6 +435,7 @@ def test_any_document(tmp_path_factory: pytest.TempPathFactory, document: Any) -
 # Pictures
 
 
+@links
 def test_links_that_go_round(tmp_path: Path) -> None:
     make_photos(tmp_path)
     for name in ("a", "b", "c"):

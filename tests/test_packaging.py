@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -12,6 +13,11 @@ import pytest
 from needs import require
 
 from clsplat.device.source import kernel_root
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
 TEMPLATES = ("base.html", "compare.html", "page.js", "report.html", "style.css")
@@ -71,11 +77,40 @@ def test_kernels_are_found_from_the_checkout():
     assert kernel_root() == ROOT / "kernels"
 
 
+@pytest.mark.skipif(os.name != "posix", reason="files have a mode that says so on POSIX")
 def test_scripts_can_be_run():
     for name in ("tools/demo", "tools/test", ".ci/run"):
         path = ROOT / name
         assert path.stat().st_mode & 0o111, f"{name} is not executable"
         assert path.read_text().startswith("#!/usr/bin/env ")
+
+
+def test_the_hosted_workflow_runs_what_the_package_says_it_supports() -> None:
+    yaml = pytest.importorskip("yaml", reason="the extra `test` brings it")
+    requirement = pytest.importorskip("packaging.specifiers")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    workflow = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text("utf-8"))
+    (job,) = workflow["jobs"].values()
+    matrix = job["strategy"]["matrix"]
+    pythons = matrix["python"]
+    assert all(isinstance(python, str) for python in pythons)  # 3.10 is a number that ends in 1 otherwise
+    assert [system.partition("-")[0] for system in matrix["system"]] == ["ubuntu", "macos", "windows"]
+    named = [line.rpartition(" ")[2] for line in project["classifiers"] if "Python :: 3." in line]
+    allowed = requirement.SpecifierSet(project["requires-python"])
+    assert {python for python in named if python not in allowed} == set()
+    oldest, newest = (min(named, key=_number), max(named, key=_number))
+    assert (pythons[0], pythons[-1]) == (oldest, newest)
+    assert set(pythons) <= set(named)
+    assert f"3.{_number(oldest) - 1}" not in allowed
+    commands = [step["run"] for step in job["steps"] if "run" in step]
+    assert [line for line in commands if line.startswith("python tools/demo ")]
+    assert commands[-1] == "python tools/test"
+    names = {step["name"] for step in job["steps"] if "if" in step}
+    assert names == {"OpenCL driver on macOS", "OpenCL driver on Windows"}
+
+
+def _number(python: str) -> int:
+    return int(python.partition(".")[2])
 
 
 def test_the_architecture_names_every_module_and_tool() -> None:

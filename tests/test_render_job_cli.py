@@ -17,6 +17,7 @@ import pytest
 import stress_render_kills
 from calls import Capture, error_line, left_behind
 from quick import quick
+from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
 from clsplat.cli import main
@@ -244,6 +245,7 @@ def start(shot: list[str], folder: Path, *more: str) -> subprocess.Popen[str]:
     return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@posix
 @pytest.mark.parametrize("number", quick([signal.SIGINT, signal.SIGTERM], signal.SIGINT))
 def test_interrupted(number: int, shot: list[str], tmp_path: Path) -> None:
     process = start(shot, tmp_path, "--count", "3000", "--progress", "json")

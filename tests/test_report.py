@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from calls import Capture, error_line, train
 from pages import charts_of, figures_of, outside_of, parse, rows_of
+from systems import links
 from tiny import CONFIG, short
 
 from clsplat.cli import main
@@ -205,6 +206,7 @@ def compared(*runs: Path) -> str:
     return path.read_text("utf-8")
 
 
+@links
 def test_no_picture_outside_of_the_run_is_shown(copied: Path) -> None:
     write_image(copied / "secret.png", np.ones((40, 48, 3), np.float32))
     (copied / "test" / "link.png").symlink_to(copied / "secret.png")

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from systems import posix
 
 from clsplat.camera import Camera
 from clsplat.undistort import Lens, models, undistort
@@ -125,6 +126,7 @@ def test_a_fisheye_beyond_180_degrees_is_cut_to_a_pinhole() -> None:
     assert np.abs(image - pattern(*rays(camera)))[middle].mean() < 0.02
 
 
+@posix
 def test_reading_cameras_leaves_the_handler_of_sigterm() -> None:
     """pycolmap puts one there that prints its stack, which a job that is stopped while it begins would show."""
     code = """

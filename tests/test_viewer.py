@@ -15,6 +15,7 @@ import pytest
 from calls import Capture, error_line
 from models import random_gaussians
 from needs import require
+from systems import posix
 from tiny import CONFIG
 from viewer_browser import clsplat
 
@@ -148,6 +149,7 @@ def test_pages_of_other_sites_are_refused(url: str, origin: str | None, let_in: 
     assert found.value.response.status_code == 403
 
 
+@posix
 def test_ctrl_c_ends_it(model: Path) -> None:
     with clsplat("view", str(model)) as (_, process):
         process.send_signal(2)

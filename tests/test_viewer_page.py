@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import kept
+from systems import posix
 from tiny import CONFIG
 from viewer_browser import SLOW, choose, clsplat
 
@@ -188,6 +189,7 @@ def test_two_pages_have_their_own_cameras(browser: Any, served: tuple[str, Path]
         other.close()
 
 
+@posix
 def test_a_training_is_watched_and_paused(browser: Any, scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     arguments = ("train", str(scene), "-o", str(run), "--iterations", "1000000", "--view", "--checkpoint-every", "0")

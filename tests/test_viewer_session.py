@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from models import assert_equal, random_gaussians
+from systems import links
 from tiny import cameras
 
 from clsplat.errors import InputError
@@ -387,6 +388,7 @@ def test_too_many_keys(monkeypatch: pytest.MonkeyPatch) -> None:
         recorder.add(pose())
 
 
+@links
 def test_saved_paths_replace_nothing(tmp_path: Path) -> None:
     (tmp_path / "path-002.json").symlink_to(tmp_path / "elsewhere")
     names = [save_path(tmp_path, "{}").name for _ in range(2)]

@@ -17,6 +17,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = ROOT / ".venv"
 OLDEST = (3, 10)
+EDITABLE = str(ROOT).isascii()
+"""Before 3.13 Python reads an editable install's path as the locale says, not in UTF-8 as it is written, and may not
+start. Elsewhere clsplat is installed as any package, and the checkout comes first in PYTHONPATH."""
 
 
 def python_of(environment: Path) -> Path:
@@ -25,7 +28,7 @@ def python_of(environment: Path) -> Path:
 
 
 def set_up(extras: tuple[str, ...] = ()) -> Path:
-    """Make `.venv` if it is missing and install clsplat in it, editable; returns its Python.
+    """Make `.venv` if it is missing and install clsplat in it, editable where it can be; returns its Python.
 
     Installs again only when pyproject.toml has changed, the checkout has moved, or an extra is new. Exits with one
     line where this Python is too old or pip fails.
@@ -42,24 +45,26 @@ def set_up(extras: tuple[str, ...] = ()) -> Path:
             sys.exit(f"{sys.argv[0]}: {sys.executable} -m venv failed; on Debian and Ubuntu, install python3-venv")
 
     stamp = ENVIRONMENT / "clsplat-installed"
-    state = hashlib.sha256((ROOT / "pyproject.toml").read_bytes() + str(ROOT).encode()).hexdigest()
-    lines = stamp.read_text().splitlines() if stamp.exists() else []
+    state = hashlib.sha256((ROOT / "pyproject.toml").read_bytes() + os.fsencode(ROOT)).hexdigest()
+    lines = stamp.read_text("utf-8").splitlines() if stamp.exists() else []
     installed = set(lines[1:]) if lines[:1] == [state] else None
     if installed is None or not installed.issuperset(extras):
         wanted = sorted({*extras, *(installed or ())})
         target = f"{ROOT}[{','.join(wanted)}]" if wanted else str(ROOT)
         print("installing clsplat and what it needs (several hundred MB the first time)", file=sys.stderr, flush=True)
         stamp.unlink(missing_ok=True)
-        command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--editable", target]
-        if _call(command) != 0:
+        command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        if _call([*command, *(["--editable"] if EDITABLE else []), target]) != 0:
             sys.exit(f"{sys.argv[0]}: pip could not install clsplat, see above; is the package index reachable?")
-        stamp.write_text("\n".join([state, *wanted]) + "\n")
+        stamp.write_text("\n".join([state, *wanted]) + "\n", "utf-8")
     return python
 
 
 def run(command: list[str]) -> int:
     """Run a command to its end and give its exit status; Ctrl-C is for the command, and then for us."""
-    process = subprocess.Popen(command)
+    found = [] if EDITABLE else [str(ROOT)]
+    path = os.pathsep.join([*found, *filter(None, [os.environ.get("PYTHONPATH")])])
+    process = subprocess.Popen(command, env={**os.environ, **({"PYTHONPATH": path} if path else {})})
     while True:
         try:
             status = process.wait()
@@ -74,8 +79,14 @@ def _runs(python: Path) -> bool:
 
 def _call(command: list[str], *, quiet: bool = False) -> int:
     stream = subprocess.DEVNULL if quiet else sys.stderr
-    return subprocess.run(command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, check=False).returncode
+    # venv and pip write paths in UTF-8, and fail where the locale is another and a path has letters beyond ASCII
+    utf8 = {} if sys.getfilesystemencoding() == "utf-8" else {"PYTHONUTF8": "1"}
+    variables = {**os.environ, **utf8}
+    return subprocess.run(
+        command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, env=variables, check=False
+    ).returncode
 
 
 if __name__ == "__main__":
+    sys.stdout.reconfigure(encoding=sys.getfilesystemencoding(), errors=sys.getfilesystemencodeerrors())  # as paths are
     print(set_up(tuple(sys.argv[1:])))

@@ -33,7 +33,15 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError, plain
-from clsplat.files import MAX_DOCUMENT, atomic_writer, is_file, open_input, parse_json, read_document
+from clsplat.files import (
+    MAX_DOCUMENT,
+    atomic_writer,
+    is_file,
+    native_name,
+    open_input,
+    parse_json,
+    read_document,
+)
 from clsplat.formats import packing
 from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
@@ -387,7 +395,7 @@ def _write_webp(path: Path, pixels: Bytes) -> None:
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
     spec.attribute("compression", "lossless")
     spec.attribute("oiio:UnassociatedAlpha", 1)  # or colours would be divided by alpha
-    output = oiio.ImageOutput.create(str(path))
-    if output is None or not output.open(str(path), spec) or not output.write_image(pixels):
+    name = native_name(path)
+    output = oiio.ImageOutput.create(name)
+    if output is None or not output.open(name, spec) or not output.write_image(pixels) or not output.close():
         raise OSError(f"{path.name}: OpenImageIO cannot write it: {error_of(output or oiio)}")
-    output.close()

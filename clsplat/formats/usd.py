@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from clsplat.edit import merge
 from clsplat.errors import InputError, plain
-from clsplat.files import atomic_writer, open_input
+from clsplat.files import atomic_writer, native_name, open_input
 from clsplat.formats import conventions, packing
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
@@ -105,18 +105,19 @@ def readable(path: Path) -> Iterator[None]:
 
 def _open(path: Path) -> Any:
     """The stage, without payloads, all of whose layers are in the file's folder or below it."""
-    from pxr import Tf, Usd, UsdUtils
+    from pxr import Ar, Tf, Usd, UsdUtils
 
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
     try:
-        stage = Usd.Stage.Open(os.path.realpath(path), Usd.Stage.LoadNone)
+        stage = Usd.Stage.Open(native_name(os.path.realpath(path)), Usd.Stage.LoadNone)
     except Tf.ErrorException:
         stage = None
     if stage is None:
         raise InputError(f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more")
     folder = Path(os.path.realpath(path)).parent
     for layer in stage.GetUsedLayers():
-        if layer.realPath and not Path(os.path.realpath(layer.realPath.split("[")[0])).is_relative_to(folder):
+        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # of a layer in a .usdz, the .usdz
+        if file and not Path(os.path.realpath(file)).is_relative_to(folder):
             raise InputError(f"{path}: refers to {layer.realPath}, expected layers in the same folder or below it")
     del diagnostics
     return stage
@@ -217,15 +218,16 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     from pxr import Usd, UsdUtils
 
     suffix = path.suffix.lower()
-    with tempfile.TemporaryDirectory(prefix="clsplat-usd-") as folder:
+    # USD may hold its file open for longer, which Windows does not remove
+    with tempfile.TemporaryDirectory(prefix="clsplat-usd-", ignore_cleanup_errors=True) as folder:
         made = Path(folder) / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
-        stage = Usd.Stage.CreateNew(str(made))
+        stage = Usd.Stage.CreateNew(native_name(made))
         _author(stage, gaussians, up_axis, meters_per_unit)
         stage.GetRootLayer().Save()
         del stage
         if suffix == ".usdz":
             package = Path(folder) / "gaussians.usdz"
-            if not UsdUtils.CreateNewUsdzPackage(str(made), str(package)):
+            if not UsdUtils.CreateNewUsdzPackage(native_name(made), native_name(package)):
                 raise OSError(f"{path}: USD could not make the package")
             made = package
         with atomic_writer(path) as file, made.open("rb") as source:

@@ -15,6 +15,7 @@ import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
+from clsplat.files import native_name
 from clsplat.formats.usd import readable
 from clsplat.paths.shot import MOST_FRAMES, Frame, Shot
 from clsplat.transforms import opengl_pose
@@ -41,7 +42,7 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
     # takes what USD would print: a layer that does not resolve may have nothing to do with the camera
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        stage = Usd.Stage.Open(str(path))
+        stage = Usd.Stage.Open(native_name(path))
     except Tf.ErrorException:
         raise InputError(
             f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more"

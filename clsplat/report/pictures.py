@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluate import composite, picture_names
+from clsplat.files import native_name
 from clsplat.images import downscale, error_of, read_image
 from clsplat.runs import Run
 from clsplat.scene import Scene, View, detect, load_scene
@@ -123,8 +124,9 @@ def data_uri(image: NDArray[Any]) -> str:
         spec.attribute("Compression", f"jpeg:{QUALITY}")
     with tempfile.TemporaryDirectory() as folder:  # OpenImageIO's Python writes to files alone
         path = Path(folder) / f"picture.{kind}"
-        output = oiio.ImageOutput.create(str(path))
-        if not (output and output.open(str(path), spec) and output.write_image(pixels) and output.close()):
+        name = native_name(path)
+        output = oiio.ImageOutput.create(name)
+        if not (output and output.open(name, spec) and output.write_image(pixels) and output.close()):
             raise ClsplatError(f"a picture could not be encoded: {error_of(output or oiio)}")
         data = path.read_bytes()
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import io
 import ipaddress
+import os
 import re
 import socket
 import sys
@@ -69,7 +70,8 @@ class Address:
             found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             family, kind, protocol, _, address = found[0]
             with socket.socket(family, kind, protocol) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                if os.name == "posix":  # as asyncio does; on Windows it would take the port of another server
+                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
                 probe.listen()
         except (OSError, UnicodeError, IndexError) as error:
