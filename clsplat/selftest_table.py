@@ -8,8 +8,8 @@ import sys
 from dataclasses import asdict
 
 from clsplat.cli import Selftest
+from clsplat.device.advice import no_device
 from clsplat.device.context import DeviceInfo, find_device, list_devices
-from clsplat.errors import DeviceError
 from clsplat.selftest_result import Result
 from clsplat.trust import Report, examine_device
 
@@ -20,7 +20,7 @@ def selftest(verb: Selftest) -> int:
     """Test the devices one after the other; 1 if one of them cannot be trusted."""
     found = list_devices() if verb.device in (None, "all") else [find_device(verb.device)]
     if not found:
-        raise DeviceError("no OpenCL device found, expected a driver such as pip install 'pyopencl[pocl]' brings")
+        raise no_device()
     reports: list[Report] = []
     for info in found:
         if not verb.json:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb
 from clsplat.cli_models import Compare, Convert, Info, Report, View
-from clsplat.errors import DeviceError, InputError
+from clsplat.errors import InputError
 from clsplat.memory import Plan, parse_bytes
 
 if TYPE_CHECKING:
@@ -53,12 +53,12 @@ def run(verb: Verb) -> int:
 
 def devices(verb: Devices) -> int:
     """Print the table of devices."""
-    from clsplat.device.advice import driver_advice
+    from clsplat.device.advice import no_device
     from clsplat.device.context import find_device, list_devices
 
     found = list_devices() if verb.device is None else [find_device(verb.device)]
     if not found:
-        raise DeviceError(f"no OpenCL device found: {driver_advice()}")
+        raise no_device()
     if verb.json:
         print(json.dumps([asdict(info) for info in found], indent=2))
         return 0

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.driver_cache import make_room
+from clsplat.device.driver_cache import make_room
 
 
 def test_a_home_below_a_file_gets_a_folder_elsewhere(tmp_path: Path) -> None:

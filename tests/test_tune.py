@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -135,6 +136,21 @@ def test_a_broken_file_is_passed_over(content: str, default_device: Device) -> N
         assert shape_of(default_device.cl_device) == default_shape(default_device.cl_device)
     save_shape(default_device.cl_device, replace(default_shape(default_device.cl_device), lanes=4))
     assert list(saved_shapes().values()) == ["4x1"], "it is written anew"
+
+
+def test_a_home_that_is_no_folder_or_cannot_be_read(
+    default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = default_device.cl_device
+    (tmp_path / "file").touch()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+        assert shape_of(device) == default_shape(device)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    saved_path().mkdir(parents=True)  # what cannot be read by root either
+    with pytest.warns(UserWarning, match=r"shapes\.json: cannot be read \(Is a directory\)"):
+        assert shape_of(device) == default_shape(device)
 
 
 def test_measure_in_several_shapes(default_device: Device) -> None:

@@ -56,8 +56,9 @@ SHORT = """
 import sys
 from clsplat.cli import main
 from clsplat.device.context import list_devices, open_device
+from clsplat.device.known import memory_path
 from clsplat.errors import ClsplatError
-from clsplat.trust import memory_path, require
+from clsplat.trust import require
 if memory_path().exists():
     sys.exit(f"{memory_path()}: exists, expected a home in which no driver is known")
 if not list_devices():

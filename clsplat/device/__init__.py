@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """OpenCL: devices, their memory, and kernels built for them."""
 
-from clsplat.driver_cache import make_room
+from clsplat.device import driver_cache, packaged
 
-make_room()
+# before a driver is loaded
+driver_cache.make_room()
+packaged.offer()

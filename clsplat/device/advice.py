@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import platform
 
+from clsplat.errors import DeviceError
+
 
 def driver_advice(system: str | None = None, machine: str | None = None) -> str:
     """What to install, in a line without a full stop.
@@ -24,3 +26,8 @@ def driver_advice(system: str | None = None, machine: str | None = None) -> str:
     else:
         cpu = ", or one for the CPU: your distribution's PoCL, such as apt install pocl-opencl-icd"
     return f"install your GPU's driver{cpu}"
+
+
+def no_device() -> DeviceError:
+    """The error that there is no device at all."""
+    return DeviceError(f"no OpenCL device found: {driver_advice()}")

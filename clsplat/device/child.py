@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import IO, Any
 
 from clsplat.errors import InputError
+from clsplat.process import apart
 
 MARK = "clsplat-child "
 """Beginning of a line that is meant for the parent; drivers print lines of their own."""
@@ -64,8 +65,7 @@ class Child:
             encoding="utf-8",
             errors="replace",
             env={**os.environ, "PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", REGARDLESS: "1"},
-            start_new_session=os.name == "posix",
-            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+            **apart(),
         )
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._errors: list[str] = []

@@ -17,6 +17,7 @@ os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 import numpy as np
 import pyopencl as cl
 
+from clsplat.device.advice import no_device
 from clsplat.device.buffers import allocate
 from clsplat.device.launch import launch_groups
 from clsplat.device.memory import Memory
@@ -191,7 +192,7 @@ def select(selector: str | None) -> cl.Device:
     """
     devices, infos = all_devices(), list_devices()
     if not devices:
-        raise DeviceError("no OpenCL device found: install a driver, or the CPU one with: pip install 'pyopencl[pocl]'")
+        raise no_device()
     selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
     if selector is None:
         return next((d for d, i in zip(devices, infos, strict=True) if i.kind == "gpu"), devices[0])

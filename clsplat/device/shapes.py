@@ -191,10 +191,13 @@ def saved_shapes() -> dict[str, str]:
     """LANESxITEMS by device and driver. A file that is none of ours is passed over with a warning."""
     path = saved_path()
     try:
-        saved = json.loads(path.read_text())
-    except FileNotFoundError:
+        saved = json.loads(path.read_bytes())
+    except (FileNotFoundError, NotADirectoryError):  # a home may be a file, or none
         return {}
-    except (OSError, ValueError):
+    except OSError as error:
+        warnings.warn(f"{path}: cannot be read ({error.strerror}), so no tuned shape is used", stacklevel=2)
+        return {}
+    except ValueError:
         saved = None
     if not isinstance(saved, dict) or not all(isinstance(value, str) for value in saved.values()):
         warnings.warn(f"{path}: not a list of shapes, passed over; clsplat tune writes it anew", stacklevel=2)
