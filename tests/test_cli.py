@@ -302,7 +302,10 @@ def test_unknown_device_for_real(arguments: list[str], folder: str, model: str, 
 
 
 def test_reader_that_goes_away() -> None:
-    shell = f"{sys.executable} -m clsplat train --help | head -1"
-    done = subprocess.run(shell, shell=True, capture_output=True, text=True, timeout=60, check=False)
-    assert done.stdout.startswith("usage: clsplat train")
-    assert done.stderr == ""
+    command = [sys.executable, "-m", "clsplat", "train", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+        assert process.wait(timeout=60) == 1
