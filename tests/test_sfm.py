@@ -144,6 +144,7 @@ def test_finished_result_is_used_again_and_never_replaced_unasked(scene, photos,
     assert (output / "sparse/0/images.bin").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes(scene, photos, tmp_path):
     again = sfm.reconstruct(photos, tmp_path / "again", camera_model="SIMPLE_PINHOLE", threads=3)
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
