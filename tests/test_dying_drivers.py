@@ -110,14 +110,18 @@ def test_a_driver_that_fails_in_every_shape(
     assert {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("how", ["abort", "launch", pytest.param("hang", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("how", "verb"),
+    [("launch", "eval"), *(pytest.param(how, "bench", marks=pytest.mark.slow) for how in ("abort", "hang"))],
+)
 def test_another_shape_is_taken(
-    how: str, standing: Standing, default_device: Device, capsys: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    how: str, verb: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, default_device: Device,
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     monkeypatch.setenv(TIMEOUT, "20" if how == "hang" else "120")
     standing(how, 4, 4)
     label = default_device.shape.label
-    assert main(VERBS["bench"].split()) == 0
+    assert call(verb, scene, trained, tmp_path / "new") == 0
     (warning,) = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     assert f"kernels in the shape {label} failed: " in warning
     assert ".cl" in warning
@@ -130,11 +134,13 @@ def test_another_shape_is_taken(
     assert found[min(KEPT)]["shape"] != f"{label.replace('x', ' lanes x ')} items"
 
 
-def test_a_program_without_kernels_is_built_anew(standing: Standing, capsys: Capture) -> None:
+def test_a_program_without_kernels_is_built_anew(
+    standing: Standing, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
+) -> None:
     numbers = standing("empty", 3, 3)
-    assert main(VERBS["bench"].split()) == 0
+    assert call("eval", scene, trained, tmp_path / "new") == 0
     assert "warning" not in capsys.readouterr().err
-    assert len(numbers.read_text().splitlines()) > 10
+    assert len(numbers.read_text().splitlines()) > 5
 
 
 LATE = replace(short(checkpoint_every=5), optimiser=OptimiserConfig(means_rate_steps=400, sh_rest_every=3))
