@@ -33,6 +33,11 @@ def video_missing() -> str:
     return ""
 
 
+SMALL = 128
+"""Pixels of the shorter side under which x264 does without its tree of macroblocks: with it up to 102 of 250 videos of
+48x40 had other bytes on a busy machine, none of 225 of 320x240. It saves a quarter of a larger video's bytes."""
+
+
 def check_video(path: Path) -> None:
     """Raise InputError where this installation cannot write a video there."""
     if path.suffix.lower() != VIDEO:
@@ -124,7 +129,8 @@ class VideoWriter:
         rate = Fraction(config.fps).limit_denominator(1001)
         self._container = av.open(native_name(self._temporary), "w", format="mp4", options={"movflags": "+faststart"})
         # one thread a core, but the same bytes whatever their number
-        options = {"crf": str(config.crf), "preset": config.preset, "x264-params": "threads=4:sliced-threads=0"}
+        parameters = "threads=4:sliced-threads=0" + (":mbtree=0" if min(width, height) < SMALL else "")
+        options = {"crf": str(config.crf), "preset": config.preset, "x264-params": parameters}
         self._stream = self._container.add_stream("libx264", rate=rate, options=options)
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
         context = self._stream.codec_context

@@ -153,6 +153,18 @@ def test_a_home_that_is_no_folder_or_cannot_be_read(
         assert shape_of(device) == default_shape(device)
 
 
+def test_a_user_without_a_home(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", unknown)
+    device = default_device.cl_device
+    assert shape_of(device) == default_shape(device)
+    with pytest.raises(OSError):  # tune says that it cannot keep what it found
+        save_shape(device, default_shape(device))
+
+
 def test_measure_in_several_shapes(default_device: Device) -> None:
     for shape in ((8, 1), (1, 64)):
         assert tune.measure(shaped(default_device, *shape), (300, 70, 50), repeat=1) > 0

@@ -155,6 +155,7 @@ def run(shape: str, check: str, driver: Path, folder: Path) -> Result:
         "OCLGRIND_MAX_ERRORS": "10000",
         "OCLGRIND_GLOBAL_MEM_SIZE": str(1 << 30),
         "OCLGRIND_NUM_THREADS": "1",
+        "CLSPLAT_TRUST_DRIVER": "1",  # this process is the trial
         "PYOPENCL_NO_CACHE": "1",  # else the optimised build of one check would be found by the other
         "PYTHONPATH": os.pathsep.join(filter(None, (str(WORKLOAD.parents[1]), os.environ.get("PYTHONPATH", "")))),
     }

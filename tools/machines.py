@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import platform
 import shlex
 import shutil
 import signal
@@ -30,10 +29,10 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 
 from opencl_drivers import BESIDE, SYSTEM_VENDORS
+from processor import has_avx512, processor
 
 ROOT = Path(__file__).resolve().parents[1]
 HOOKS = ROOT / "tools" / "hooks"
@@ -285,7 +284,7 @@ def look() -> Found:
         debian=debian,
         rusticl=os.environ.get("CLSPLAT_RUSTICL", ""),
         qemu=qemu,
-        avx512=_has_avx512(),
+        avx512=has_avx512(),
         root=_is_root(),
         mounts=_mounts(),
         stranger=_stranger(),
@@ -456,13 +455,6 @@ def full_temporary(found: Found, alone: Machine) -> Machine:
     )
 
 
-def _has_avx512() -> bool:
-    try:
-        return "avx512f" in Path("/proc/cpuinfo").read_text().split()
-    except OSError:
-        return False
-
-
 def _is_root() -> bool:
     return os.name == "posix" and os.geteuid() == 0
 
@@ -499,16 +491,6 @@ def _works(command: Sequence[str]) -> bool:
     if shutil.which(command[0]) is None:
         return False
     return subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
-
-
-@cache
-def processor() -> str:
-    """Its name."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def table(results: Sequence[Result], *, markdown: bool = False) -> str:

@@ -39,8 +39,11 @@ class Entry:
 
 
 def cache_folder() -> Path:
-    """Our part of the user's cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
+    """Our part of the user's cache; a place that takes nothing for a user without a home, as containers have them."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
+    except RuntimeError:
+        return Path(os.devnull) / "clsplat"
 
 
 def memory_path() -> Path:
