@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from clsplat.device import known
 from clsplat.device.child import REGARDLESS, Child, patience, python_module, regardless
 from clsplat.device.context import Device, all_devices
-from clsplat.device.shapes import Shape, another_shape, failures, instead, wanted_shape
+from clsplat.device.shapes import Shape, failures, instead, shapes_in_turn, wanted_shape
 from clsplat.errors import DeviceError, DriverError
 from clsplat.selftest_result import FORWARD, STAGES, TRAINING, Result
 
@@ -24,12 +24,13 @@ from clsplat.selftest_result import FORWARD, STAGES, TRAINING, Result
 @dataclass
 class Report:
     """What became of a device. build_seconds: None where the kernels were not built first; end: how the process ended
-    before its work was done, in words, or empty; kernels: those that were built and launched, as
-    `device.rehearsal` names them."""
+    before its work was done, in words, or empty; crashed: whether that was the driver's doing; kernels: those that were
+    built and launched, as `device.rehearsal` names them."""
 
     results: list[Result] = field(default_factory=list)
     build_seconds: float | None = None
     end: str = ""
+    crashed: bool = False
     wanted: tuple[str, ...] = STAGES
     kernels: list[str] = field(default_factory=list)
 
@@ -84,10 +85,11 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = STAGES, *, quick: 
                     report.results.append(Result(**told["result"]))
                 if "done" in told or "failed" in told:
                     report.kernels, report.end = told.get("done", []), told.get("failed", "")
+                    report.crashed = bool(report.end)
                     return report
-            report.end = f"the process {child.ending(begun)}"
+            report.end, report.crashed = f"the process {child.ending(begun)}", child.crashed
         except TimeoutError as error:
-            report.end = f"the driver {error} from {begun}"
+            report.end, report.crashed = f"the driver {error} from {begun}", True
     return report
 
 
@@ -101,38 +103,59 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
     """
     if regardless():
         return device
-    wanted = [name for name in STAGES if name in FORWARD or name in stages]
-    name = f"{device.name}, {device.driver.split('  ')[0].strip()}"
-    advice = f"clsplat selftest tells more, --device takes another device, {REGARDLESS}=1 goes on regardless"
-    given, cl_device, told = device, device.cl_device, False
-    while True:
-        label = device.shape.label
-        entry = known.entries(cl_device).get(label, known.Entry())
-        if not entry.failed and set(stages) <= entry.stages:
-            break
-        if not entry.failed:
+    cl_device, given = device.cl_device, device.shape
+    failed = failures(cl_device)
+    shapes = [shape for shape in (given, *shapes_in_turn(cl_device)) if shape.label not in failed]
+    # where all have failed, the reason may be gone: the one that is wanted is tried anew
+    told = False
+    for shape in dict.fromkeys(shapes or [given]):
+        tried = device if shape == given else device.with_shape(lanes=shape.lanes, items=shape.items)
+        if not _has_passed(tried, stages):
             if not told:
-                print(f"{name}: used for the first time, a short test of its driver", file=sys.stderr)
+                print(f"{_name(device)}: used for the first time, a short test of its driver", file=sys.stderr)
             told = True
-            report = examine(all_devices().index(cl_device), device.shape, wanted, quick=True)
-            if not report.end:
-                _check(report, name, advice)
-                known.remember(cl_device, label, stages=wanted, kernels=dict.fromkeys(report.kernels, ""))
-                break
-            known.remember(cl_device, label, failed=report.end)
-        other = another_shape(cl_device)
-        if other is None:
-            failed = failures(cl_device)
-            raise DriverError(
-                f"{name}, kernels in the shape {given.shape.label}: {failed[given.shape.label]}; none of "
-                f"{', '.join(failed)} works; {advice}"
-            )
-        device = given.with_shape(lanes=other.lanes, items=other.items)
-    if device is not given:
-        warnings.warn(
-            instead(cl_device, given.shape, device.shape, failures(cl_device)[given.shape.label]), stacklevel=2
-        )
-    return device
+            if failure := _short_test(tried, stages):
+                known.remember(cl_device, shape.label, failed=failure)
+                continue
+        if shape != given:
+            warnings.warn(instead(cl_device, given, shape, failures(cl_device)[given.label]), stacklevel=2)
+        return tried
+    raise DriverError(
+        f"{_name(device)}, kernels in the shape {given.label}: {failures(cl_device)[given.label]}; none of "
+        f"{', '.join(failures(cl_device))} works; {_ADVICE}"
+    )
+
+
+_ADVICE = f"clsplat selftest tells more, --device takes another device, {REGARDLESS}=1 goes on regardless"
+
+
+def _name(device: Device) -> str:
+    return f"{device.name}, {device.driver.split('  ')[0].strip()}"
+
+
+def _has_passed(device: Device, stages: Sequence[str]) -> bool:
+    entry = known.entries(device.cl_device).get(device.shape.label, known.Entry())
+    return not entry.failed and set(stages) <= entry.stages
+
+
+def _short_test(device: Device, stages: Sequence[str]) -> str:
+    """How the driver aborted or hung in the device's shape, or nothing; what passed is remembered. Raises DriverError
+    where the test itself could not be made, and DeviceError as `require`."""
+    wanted = [name for name in STAGES if name in FORWARD or name in stages]
+    report = examine(all_devices().index(device.cl_device), device.shape, wanted, quick=True)
+    if report.crashed:
+        return report.end
+    if report.end:
+        raise DriverError(f"{_name(device)}: its test could not be made: {report.end}; {_ADVICE}")
+    _check(report, _name(device), _ADVICE)
+    known.remember(
+        device.cl_device,
+        device.shape.label,
+        stages=wanted,
+        kernels=dict.fromkeys(report.kernels, ""),
+        failed="",
+    )
+    return ""
 
 
 def _check(report: Report, name: str, advice: str) -> None:

@@ -8,6 +8,7 @@ built here first, these tests would be the ones to end.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from clsplat.device.child import REGARDLESS, TIMEOUT
 from clsplat.device.context import Device
 from clsplat.device.program import build, variant_of
 from clsplat.device.shapes import shapes_in_turn
+from clsplat.errors import DriverError
 
 ALWAYS = 10**6
 """More texts than are ever built."""
@@ -141,6 +143,32 @@ def test_a_program_without_kernels_is_built_anew(
     assert call("eval", scene, trained, tmp_path / "new") == 0
     assert "warning" not in capsys.readouterr().err
     assert len(numbers.read_text().splitlines()) > 5
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a process that is killed has no status of its own there")
+def test_what_the_system_kills_is_not_the_drivers_fault(
+    standing: Standing, default_device: Device, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    standing("kill", 1)
+    assert call("eval", scene, trained, tmp_path / "new") == 1
+    assert "its test could not be made: the process was ended by signal 9 in probe.cl" in error_of(capsys)
+    device = context.open_device()
+    with pytest.raises(DriverError, match=r"probe\.cl the process that tried it was ended by signal 9"):
+        device.kernels("scan")
+    assert not any(entry.failed for entry in known.entries(default_device.cl_device).values())
+
+
+def test_what_failed_in_every_shape_is_tried_anew(
+    standing: Standing, default_device: Device, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    """Its reason may be gone, and nobody shall have to find out where it is remembered."""
+    standing("abort", ALWAYS)
+    device = default_device.cl_device
+    for shape in shapes_in_turn(device):
+        known.remember(device, shape.label, failed="it did once")
+    assert call("eval", scene, trained, tmp_path / "new") == 0
+    assert "warning" not in capsys.readouterr().err
+    assert known.entries(device)[default_device.shape.label].failed == ""
 
 
 LATE = replace(

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -24,6 +25,8 @@ PATIENCE = 120.0
 """Seconds without a word after which a driver counts as hung: the slowest that works builds a kernel in 60."""
 TIMEOUT = "CLSPLAT_DRIVER_TIMEOUT"
 REGARDLESS = "CLSPLAT_TRUST_DRIVER"
+KILL = 9
+"""SIGKILL, which Windows has no name for."""
 
 
 def patience() -> float:
@@ -116,6 +119,12 @@ class Child:
         said = next((line for line in words if "ERROR" in line or "Assertion" in line), words[-1] if words else "")
         how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
         return how + (f" in {where}" if where else "") + (f" ({said[:300]})" if said else "")
+
+    @property
+    def crashed(self) -> bool:
+        """True if the process that has ended was taken down, as drivers do: not by an error of Python's, which has
+        status 1 or 2, and not by the system, which kills what takes too much memory."""
+        return self._process.wait() not in (0, 1, 2, *(-number for number in (signal.SIGTERM, KILL)))
 
     def close(self) -> None:
         """End the process."""

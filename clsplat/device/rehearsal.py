@@ -46,8 +46,8 @@ class _Process:
         self._child: Child | None = None
         self._timer: threading.Timer | None = None
 
-    def ask(self, message: dict[str, Any]) -> tuple[dict[str, Any], str]:
-        """The answer, or none and how the process ended."""
+    def ask(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
+        """The answer; or none, how the process ended, and whether that was the driver's doing."""
         with self._lock:
             if self._timer is not None:
                 self._timer.cancel()
@@ -56,20 +56,21 @@ class _Process:
             seconds = patience()
             self._child.send({**message, "seconds": seconds})
             try:
-                answer = self._child.receive(seconds)
-                ending = self._child.ending() if answer is None else ""
+                answer, ending, crashed = self._child.receive(seconds), "", True
+                if answer is None:
+                    ending, crashed = self._child.ending(), self._child.crashed
             except TimeoutError as error:
-                answer, ending = None, str(error)
+                answer, ending, crashed = None, str(error), True
             except BaseException:
                 self._end()
                 raise
             if answer is None:
                 self._end()
-                return {}, ending
+                return {}, ending, crashed
             self._timer = threading.Timer(IDLE, self.close)
             self._timer.daemon = True
             self._timer.start()
-            return answer, ""
+            return answer, "", False
 
     def close(self) -> None:
         """End it; the next question starts another."""
@@ -132,15 +133,16 @@ class Rehearsal:
         if self.say is not None:
             self.say(what)
 
-    def fail(self, stem: str, name: str, trouble: str) -> DriverError:
-        """Remember that the driver cannot be used in this shape; what to raise."""
+    def fail(self, stem: str, name: str, trouble: str, *, lasting: bool = True) -> DriverError:
+        """What to raise; lasting: remember too that the driver cannot be used in this shape."""
         text = f"{stem}.cl{f', {name},' if name else ''} {trouble}"
-        if not regardless():
+        advice = "--device takes another device"
+        if lasting and not regardless():
             known.remember(self._device, self._shape, failed=text)
+            advice = f"called again, another shape is taken if one works; {advice}"
         driver = self._device.platform.version.split("  ")[0].strip()
         return DriverError(
-            f"{self._device.name.strip()}, {driver}, kernels in the shape {self._shape}: {text}; the next call takes "
-            "another shape where there is one, --device another device"
+            f"{self._device.name.strip()}, {driver}, kernels in the shape {self._shape}: {text}; {advice}"
         )
 
     @cached_property
@@ -149,9 +151,11 @@ class Rehearsal:
         return dict(known.entries(self._device).get(self._shape, known.Entry()).kernels)
 
     def _ask(self, message: dict[str, Any], variant: Variant, kernel: str, name: str) -> None:
-        answer, ending = _process(self._index).ask(message)
-        if trouble := ending or str(answer.get("trouble", "")):
-            raise self.fail(variant.stem, kernel, f"the process that tried it {ending}" if ending else trouble)
+        answer, ending, crashed = _process(self._index).ask(message)
+        if ending:
+            raise self.fail(variant.stem, kernel, f"the process that tried it {ending}", lasting=crashed)
+        if trouble := str(answer.get("trouble", "")):
+            raise self.fail(variant.stem, kernel, trouble)
         self._known[name] = str(answer.get("salt", ""))
         if not answer.get("refused"):  # what is refused, with a reason, is refused here as well
             known.remember(self._device, self._shape, kernels={name: self._known[name]})
