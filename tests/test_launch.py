@@ -58,10 +58,22 @@ def test_a_group_that_the_driver_does_not_allow(
 ) -> None:
     """As drivers say of a kernel that takes many registers, which nobody knows before it is built."""
     monkeypatch.setattr(Kernel, "most_items", lambda *_: 32)
+    monkeypatch.setattr(launch, "tells_group_sizes", lambda _: True)
     label = default_device.shape.label
     wanted = rf"shape {label}: words\.cl, words, has 64 items in a group, where the driver allows it 32"
     with pytest.raises(DriverError, match=wanted):
         launch.launch_groups(default_device, words, 1, 64, 1, 2, 0.5, np.uint64(3), None)
+
+
+def test_a_limit_that_is_known_to_be_wrong(
+    default_device: Device, words: Kernel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rusticl says 32 of every kernel."""
+    monkeypatch.setattr(Kernel, "most_items", lambda *_: 32)
+    monkeypatch.setattr(launch, "tells_group_sizes", lambda _: False)
+    out = allocate(default_device, (5,), np.uint32)
+    launch.launch_groups(default_device, words, 1, 64, 1, 2, 0.5, np.uint64(3), out)
+    assert out.get()[0] == 1
 
 
 def test_a_launch_that_the_driver_refuses(default_device: Device, words: Kernel) -> None:

@@ -12,6 +12,7 @@ import pyopencl as cl
 
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.program import Kernel
+from clsplat.device.shapes import tells_group_sizes
 from clsplat.errors import DriverError
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def _first(
 ) -> None:
     """Tell the types of the kernel's arguments, and see that the driver can launch it. Raises DriverError."""
     types = [_type(value) for value in values]
-    most = kernel.most_items(device.cl_device)
+    most = kernel.most_items(device.cl_device) if tells_group_sizes(device.cl_device) else device.max_group
     if local is not None and prod(local) > most:
         raise device.rehearsal.fail(
             kernel.variant.stem, kernel.name, f"has {prod(local)} items in a group, where the driver allows it {most}"

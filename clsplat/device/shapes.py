@@ -65,6 +65,16 @@ def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
     return int(digits[0]), int(digits[1])
 
 
+def _is_rusticl(device: cl.Device) -> bool:
+    return str(device.platform.name).strip() == "rusticl"
+
+
+def tells_group_sizes(device: cl.Device) -> bool:
+    """False for a driver that is wrong about the work-items that it allows a group of a kernel: Rusticl of Mesa 22.3
+    says 32 of every kernel, and runs groups of 1024."""
+    return not _is_rusticl(device)
+
+
 def caches_programs(device: cl.Device) -> bool:
     """True for a driver that keeps what it builds on the disk, so that a second build takes no time."""
     return _pocl_version(device) is not None
@@ -78,7 +88,7 @@ def default_shape(device: cl.Device) -> Shape:
     lanes = 16 if device.native_vector_width_float >= 16 else 8
     if _pocl_version(device) == (3, 0):
         lanes = 8  # its compiler aborts on some float16 built-ins
-    if device.platform.name.strip() == "rusticl":  # with vectors llvmpipe does not come back from the larger kernels
+    if _is_rusticl(device):  # with vectors llvmpipe does not come back from the larger kernels
         return Shape(lanes=1, items=64, chunks=4 * device.max_compute_units)
     return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units)
 
