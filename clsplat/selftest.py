@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from clsplat.device.child import tell
+from clsplat.device.child import end_with_parent, tell
 from clsplat.device.context import Device, all_devices
 from clsplat.device.source import kernel_root
 from clsplat.errors import DriverError
@@ -109,6 +109,7 @@ def _result(name: str, benches: list[Bench], outcomes: list[Outcome]) -> Result:
 
 def _child(index: int, shape: tuple[int, int], stages: Sequence[str], *, quick: bool) -> None:
     """Build and run on the `index`-th device; a line of JSON for what begins, another for what came of it."""
+    end_with_parent()
     tell(begins="opening the device")
     device = Device(all_devices()[index]).with_shape(lanes=shape[0], items=shape[1])
     device.rehearsal.say = lambda kernel: tell(begins=kernel)
@@ -123,7 +124,7 @@ def _child(index: int, shape: tuple[int, int], stages: Sequence[str], *, quick: 
     except DriverError as error:
         tell(failed=str(error))
     else:
-        tell(done=sorted(device.rehearsal.done))
+        tell(done=device.rehearsal.done)
 
 
 if __name__ == "__main__":

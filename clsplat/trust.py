@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from clsplat.device import known
 from clsplat.device.child import REGARDLESS, Child, patience, python_module, regardless
 from clsplat.device.context import Device, all_devices
-from clsplat.device.shapes import Shape, failures, instead, shapes_in_turn, wanted_shape
+from clsplat.device.shapes import Shape, failures, instead, shapes_in_turn, tell_once, wanted_shape
 from clsplat.errors import DeviceError, DriverError
 from clsplat.selftest_result import FORWARD, STAGES, TRAINING, Result
 
@@ -25,14 +25,14 @@ from clsplat.selftest_result import FORWARD, STAGES, TRAINING, Result
 class Report:
     """What became of a device. build_seconds: None where the kernels were not built first; end: how the process ended
     before its work was done, in words, or empty; crashed: whether that was the driver's doing; kernels: those that were
-    built and launched, as `device.rehearsal` names them."""
+    built and launched, as `device.rehearsal` has them."""
 
     results: list[Result] = field(default_factory=list)
     build_seconds: float | None = None
     end: str = ""
     crashed: bool = False
     wanted: tuple[str, ...] = STAGES
-    kernels: list[str] = field(default_factory=list)
+    kernels: dict[str, str] = field(default_factory=dict)
 
     @property
     def failure(self) -> str:
@@ -84,7 +84,7 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = STAGES, *, quick: 
                 if "result" in told:
                     report.results.append(Result(**told["result"]))
                 if "done" in told or "failed" in told:
-                    report.kernels, report.end = told.get("done", []), told.get("failed", "")
+                    report.kernels, report.end = told.get("done", {}), told.get("failed", "")
                     report.crashed = bool(report.end)
                     return report
             report.end, report.crashed = f"the process {child.ending(begun)}", child.crashed
@@ -116,13 +116,14 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
             told = True
             if failure := _short_test(tried, stages):
                 known.remember(cl_device, shape.label, failed=failure)
+                failed[shape.label] = failure
                 continue
         if shape != given:
-            warnings.warn(instead(cl_device, given, shape, failures(cl_device)[given.label]), stacklevel=2)
+            tell_once(instead(cl_device, given, shape, failed[given.label]))
         return tried
     raise DriverError(
-        f"{_name(device)}, kernels in the shape {given.label}: {failures(cl_device)[given.label]}; none of "
-        f"{', '.join(failures(cl_device))} works; {_ADVICE}"
+        f"{_name(device)}, kernels in the shape {given.label}: {failed[given.label]}; none of {', '.join(failed)} "
+        f"works; {_ADVICE}"
     )
 
 
@@ -152,7 +153,7 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
         device.cl_device,
         device.shape.label,
         stages=wanted,
-        kernels=dict.fromkeys(report.kernels, ""),
+        kernels=report.kernels,
         failed="",
     )
     return ""
@@ -171,6 +172,6 @@ def examine_device(index: int) -> Report:
     device = all_devices()[index]
     shape = wanted_shape(device)
     report = examine(index, shape)
-    if not report.end and shape.label in known.entries(device):
+    if not report.failure and shape.label in known.entries(device):
         known.remember(device, shape.label, failed="")
     return report

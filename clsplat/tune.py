@@ -18,7 +18,7 @@ import pyopencl as cl
 
 from clsplat.bench import synthetic, wall_ms
 from clsplat.device.buffers import upload
-from clsplat.device.child import Child, patience, python_module, tell
+from clsplat.device.child import Child, end_with_parent, patience, python_module, tell
 from clsplat.device.context import Device, all_devices
 from clsplat.device.shapes import Shape, candidates, default_shape, save_shape
 from clsplat.errors import DriverError
@@ -94,6 +94,7 @@ def measure(device: Device, workload: tuple[int, int, int] = WORKLOAD, repeat: i
 
 
 if __name__ == "__main__":
+    end_with_parent()
     chosen = all_devices()[int(sys.argv[1])]
     shape = replace(default_shape(chosen), lanes=int(sys.argv[2]), items=int(sys.argv[3]))
     tell(ms=measure(Device(chosen, shape)))

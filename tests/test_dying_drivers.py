@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from tiny import CONFIG, short
 from clsplat.cli import main
 from clsplat.config import OptimiserConfig, TrainConfig
 from clsplat.device import context, known, rehearsal
-from clsplat.device.child import REGARDLESS, TIMEOUT
+from clsplat.device.child import REGARDLESS, TIMEOUT, Child
 from clsplat.device.context import Device
 from clsplat.device.program import build, variant_of
 from clsplat.device.shapes import shapes_in_turn
@@ -143,6 +144,38 @@ def test_a_program_without_kernels_is_built_anew(
     assert call("eval", scene, trained, tmp_path / "new") == 0
     assert "warning" not in capsys.readouterr().err
     assert len(numbers.read_text().splitlines()) > 5
+
+
+def test_what_failed_is_not_waited_for_twice(standing: Standing, monkeypatch: pytest.MonkeyPatch) -> None:
+    standing("abort", 1)
+    device = context.open_device()
+    with pytest.raises(DriverError, match="signal 6"):
+        device.kernels("scan")
+    monkeypatch.setattr(rehearsal._Process, "ask", lambda *_: pytest.fail("it was tried again"))
+    with pytest.raises(DriverError, match="signal 6"):
+        device.kernels("scan")
+
+
+def test_modules_of_the_folder_that_we_are_in_are_not_taken(
+    standing: Standing, scene: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scene that was downloaded may have a file of any name."""
+    for name in ("secrets", "numpy", "queue", "clsplat"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('taken from here')\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    standing("abort", ALWAYS)
+    assert call("eval", scene, trained, tmp_path / "new") == 0
+
+
+def test_a_child_ends_with_its_parent_and_is_heard_whatever_else_is_said(tmp_path: Path) -> None:
+    code = "import sys, time; from clsplat.device.child import *; end_with_parent(); sys.stdout.write('half a line'); "
+    code += "tell(said=1); time.sleep(600)"
+    child = Child([sys.executable, "-c", code])
+    assert child.receive(60) == {"said": 1}
+    assert child._process.stdin is not None
+    child._process.stdin.close()  # as the system does for a parent that is killed
+    assert child._process.wait(timeout=60) == 1
+    child.close()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a process that is killed has no status of its own there")

@@ -49,16 +49,25 @@ def regardless() -> bool:
 
 
 def tell(**values: object) -> None:
-    """Send a message from the child to its parent."""
-    print(MARK + json.dumps(values), flush=True)
+    """Send a message from the child to its parent, on a line of its own whatever a driver has printed."""
+    print(f"\n{MARK}{json.dumps(values)}", flush=True)
+
+
+def end_with_parent() -> None:
+    """In a child that is told nothing: end when the parent has gone, even where a driver hangs."""
+
+    def wait() -> None:
+        while os.read(0, 1 << 10):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 class Child:
     """A process that answers in lines of JSON. Ctrl-C does not reach it: it ends with its parent, or by `close`."""
 
     def __init__(self, command: Sequence[str]) -> None:
-        root = str(Path(__file__).resolve().parents[2])
-        path = os.pathsep.join(part for part in (root, os.environ.get("PYTHONPATH", "")) if part)
         self._process = subprocess.Popen(
             list(command),
             stdin=subprocess.PIPE,
@@ -67,7 +76,7 @@ class Child:
             text=True,
             encoding="utf-8",
             errors="replace",
-            env={**os.environ, "PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", REGARDLESS: "1"},
+            env={**os.environ, "PYTHONIOENCODING": "utf-8", REGARDLESS: "1"},
             **apart(),
         )
         self._lines: queue.Queue[str | None] = queue.Queue()
@@ -129,7 +138,8 @@ class Child:
     def close(self) -> None:
         """End the process."""
         self._process.kill()
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):  # one that hangs in the system cannot even be killed
+            self._process.wait(timeout=5)
         for reader in self._readers:
             reader.join(timeout=5)
         assert self._process.stdin is not None
@@ -146,5 +156,12 @@ class Child:
 
 
 def python_module(module: str, *words: str) -> list[str]:
-    """The command that runs a module of this package."""
-    return [sys.executable, "-m", module, *words]
+    """The command that runs a module of this package: this package, and nothing of the folder that we are in, as
+    `python -m` would take modules from there."""
+    root = str(Path(__file__).resolve().parents[2])
+    code = (
+        f"import sys; sys.path[:] = [part for part in sys.path if part]; root = {root!r}; "
+        "sys.path[:0] = [] if root in sys.path else [root]; "
+        f"import runpy; runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
+    )
+    return [sys.executable, "-c", code, *words]

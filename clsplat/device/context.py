@@ -119,7 +119,8 @@ class Device:
     def _built(self, stem: str, defines: Mapping[str, object]) -> Kernels:
         shape = {"LANES": self.shape.lanes, "ITEMS": self.shape.items}
         variant = variant_of(stem, {**shape, **defines}, self._options)
-        program, _ = build(self.context, self.cl_device, self.rehearsal.build(variant))
+        program, salt = build(self.context, self.cl_device, self.rehearsal.build(variant))
+        self.rehearsal.built(variant, salt)
         return Kernels(variant, program)
 
     def with_shape(self, **changes: int) -> Device:

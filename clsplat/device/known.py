@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 import warnings
 import zlib
 from collections.abc import Iterable, Mapping
@@ -110,12 +111,23 @@ def remember(
 
     A folder that cannot be written is a warning: everything is tried anew by the next process.
     """
+    with _LOCK:
+        _remember(device, shape, stages, kernels or {}, failed)
+
+
+_LOCK = threading.Lock()
+"""Several devices may be at work at once. Another process's entry may be lost, which is then tried anew."""
+
+
+def _remember(
+    device: cl.Device, shape: str, stages: Iterable[str], kernels: Mapping[str, str], failed: str | None
+) -> None:
     saved, key = _read(), driver_key(device)
     shapes = saved.get(key)
     known = entries(device).get(shape, Entry())
     entry: dict[str, object] = {
         "stages": sorted(known.stages | set(stages)),
-        "kernels": {**known.kernels, **(kernels or {})},
+        "kernels": {**known.kernels, **kernels},
     }
     failure = known.failed if failed is None else failed
     if failure:

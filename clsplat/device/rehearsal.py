@@ -23,7 +23,7 @@ import numpy as np
 import pyopencl as cl
 
 from clsplat.device import known
-from clsplat.device.child import Child, patience, python_module, regardless, tell
+from clsplat.device.child import REGARDLESS, Child, patience, python_module, regardless, tell
 from clsplat.device.program import Kernel, Variant, build
 from clsplat.device.shapes import caches_programs
 from clsplat.errors import DriverError, KernelBuildError
@@ -97,12 +97,14 @@ class Rehearsal:
     """What a driver has shown that it can build and launch, in one shape of the kernels, LANESxITEMS.
 
     In a process that is a trial itself, such as that of `clsplat.trust`, done has the names of what was built and
-    launched, and say, if given, is told each kernel that comes next.
+    launched, with the salt of `Variant.anew` that its text needed, and say, if given, is told each kernel that comes
+    next.
     """
 
     def __init__(self, device: cl.Device, index: int, shape: str) -> None:
         self._device, self._index, self._shape = device, index, shape
-        self.done: set[str] = set()
+        self.done: dict[str, str] = {}
+        self._failed: dict[str, str] = {}
         self.say: Callable[[str], None] | None = None
 
     def build(self, variant: Variant) -> Variant:
@@ -128,18 +130,23 @@ class Rehearsal:
                 text = _text(kernel.variant.anew(self._known.get(kernel.variant.digest, "")))
                 self._ask({"build": text, "launch": launch}, kernel.variant, kernel.name, name)
 
+    def built(self, variant: Variant, salt: str) -> None:
+        """Note the salt that this process's own build of the text took."""
+        if variant.digest in self.done:
+            self.done[variant.digest] = salt
+
     def _begin(self, what: str, name: str) -> None:
-        self.done.add(name)
+        self.done.setdefault(name, "")
         if self.say is not None:
             self.say(what)
 
     def fail(self, stem: str, name: str, trouble: str, *, lasting: bool = True) -> DriverError:
         """What to raise; lasting: remember too that the driver cannot be used in this shape."""
         text = f"{stem}.cl{f', {name},' if name else ''} {trouble}"
-        advice = "--device takes another device"
+        advice = f"--device takes another device, {REGARDLESS}=1 goes on regardless"
         if lasting and not regardless():
             known.remember(self._device, self._shape, failed=text)
-            advice = f"called again, another shape is taken if one works; {advice}"
+            advice = f"the next process takes another shape if one works; {advice}"
         driver = self._device.platform.version.split("  ")[0].strip()
         return DriverError(
             f"{self._device.name.strip()}, {driver}, kernels in the shape {self._shape}: {text}; {advice}"
@@ -151,11 +158,13 @@ class Rehearsal:
         return dict(known.entries(self._device).get(self._shape, known.Entry()).kernels)
 
     def _ask(self, message: dict[str, Any], variant: Variant, kernel: str, name: str) -> None:
+        if name in self._failed:
+            raise DriverError(self._failed[name])
         answer, ending, crashed = _process(self._index).ask(message)
-        if ending:
-            raise self.fail(variant.stem, kernel, f"the process that tried it {ending}", lasting=crashed)
-        if trouble := str(answer.get("trouble", "")):
-            raise self.fail(variant.stem, kernel, trouble)
+        if trouble := f"the process that tried it {ending}" if ending else str(answer.get("trouble", "")):
+            error = self.fail(variant.stem, kernel, trouble, lasting=crashed or not ending)
+            self._failed[name] = str(error)  # not to wait for it again
+            raise error
         self._known[name] = str(answer.get("salt", ""))
         if not answer.get("refused"):  # what is refused, with a reason, is refused here as well
             known.remember(self._device, self._shape, kernels={name: self._known[name]})

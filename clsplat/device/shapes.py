@@ -149,7 +149,7 @@ def shape_of(device: cl.Device) -> Shape:
     other = another_shape(device)
     if other is None:  # it is told when it fails again
         return wanted
-    _tell_once(instead(device, wanted, other, failed[wanted.label]))
+    tell_once(instead(device, wanted, other, failed[wanted.label]))
     return other
 
 
@@ -178,7 +178,8 @@ def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str
 
 
 @lru_cache(maxsize=8)
-def _tell_once(text: str) -> None:
+def tell_once(text: str) -> None:
+    """A warning, once in a process."""
     warnings.warn(text, stacklevel=2)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
-from clsplat.errors import CapacityError, InputError
+from clsplat.errors import ClsplatError
 from clsplat.viewer.look import Image, Look
 from clsplat.viewer.session import Level, Pose, Refinement, Share, fitted
 
@@ -97,7 +97,7 @@ class Viewing:
                 self._changed(watcher)
 
     def ask(self, key: int, job: Callable[[Model], None]) -> None:
-        """Have something done in the device's thread. InputError, CapacityError and OSError are told to them."""
+        """Have something done in the device's thread. ClsplatError and OSError are told to them."""
         with self._news:
             self._jobs.append((key, job))
             self._wake()
@@ -158,7 +158,7 @@ class Viewing:
             if key in self._watchers:
                 watcher.page.show(image, level, text)
             watcher.told = ""
-        except (InputError, CapacityError) as error:
+        except ClsplatError as error:
             if watcher.told != str(error):  # once is enough
                 watcher.page.tell(str(error))
             watcher.told = str(error)
@@ -171,7 +171,7 @@ class Viewing:
         watcher = self._watchers.get(key)
         try:
             job(model)
-        except (InputError, CapacityError, OSError) as error:
+        except (ClsplatError, OSError) as error:
             if watcher is not None:
                 watcher.page.tell(str(error))
 
