@@ -287,7 +287,7 @@ def note_kernels() -> None:
     real = launch._enqueue  # noqa: SLF001
 
     def noted(device: Device, kernel: Any, *rest: Any) -> None:
-        print(kernel.function_name, flush=True)
+        print(kernel.name, flush=True)
         real(device, kernel, *rest)
         device.finish()
 
@@ -307,7 +307,7 @@ def main(arguments: list[str]) -> int:
             raise SystemExit(f"{lanes} lanes: expected 1 or 8")
         stand_in(lanes)
     opened = Device(device, Shape(lanes=lanes, items=items, chunks=4))
-    print("probe_fma", flush=True)  # which opening a device runs
+    print("probe_fma", flush=True)  # which a device runs before its first kernel, where it has lanes
     if items == 1:
         opened.kind = "cpu"  # the launches too are then those of a CPU
     for part in (sorts, limits, frames, rendering, pictures, training):
