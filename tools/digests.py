@@ -214,7 +214,7 @@ def _in_a_process(job: Job, arrays: Path, scene: Path) -> Row:
 def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
     """Run on the `index`-th device, or with -1 on Rusticl's; print the digests and write the gradients.
 
-    scene: to train on, if any; "open" for a device that is only to be opened, which builds a kernel.
+    scene: to train on, if any; "open" for a device that is only to be opened, which launches a kernel.
     """
     from golden_frames import arrays_of, checksum, pictures_of, trained
 
@@ -224,7 +224,7 @@ def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
     found = next(d for d in all_devices() if d.platform.name == "rusticl") if index < 0 else all_devices()[index]
     device = Device(found).with_shape(lanes=lanes, items=items)
     if scene == Path("open"):
-        device.kernels("probe")
+        Device(found).kernels("probe")  # in the driver's own shape, whose vectors are probed by a launch
         return
     made = arrays_of(device)
     frame = [part for each in made.values() for name in ("image", "transmittance") for part in each[name]]
