@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What differs between systems in how processes are started and asked to end."""
+"""Differences between systems in how processes are started and asked to end."""
 
 from __future__ import annotations
 
@@ -24,6 +24,6 @@ def endings() -> tuple[signal.Signals, ...]:
 
 
 def reader_has_gone(error: OSError, *, windows: bool = sys.platform == "win32") -> bool:
-    """Whether a write failed as what reads our output has ended, as `| head` does. Windows says "invalid argument", and
+    """True if a write failed as what reads our output has ended, as `| head` does. Windows says "invalid argument", and
     as of any stream names no file."""
     return isinstance(error, BrokenPipeError) or (windows and error.errno == errno.EINVAL and error.filename is None)

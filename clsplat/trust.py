@@ -2,8 +2,8 @@
 """Whether a driver computes what it is asked to: the self-test in a process of its own, which a driver may take down,
 and the memory of what has passed it.
 
-What is remembered counts for one device, driver, kernel shape and set of kernels; `clsplat selftest` remembers nothing
-and asks nothing, it tests.
+What is remembered counts for one device, driver, kernel shape and set of kernels; `clsplat selftest` asks
+nothing of it: it tests, and forgets a failure where the test passes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from clsplat.device import known
 from clsplat.device.child import REGARDLESS, Child, patience, python_module, regardless
 from clsplat.device.context import Device, all_devices
-from clsplat.device.shapes import Shape, failures, instead, shapes_in_turn, tell_once, wanted_shape
+from clsplat.device.shapes import Shape, failures, instead, shapes_in_turn, wanted_shape
 from clsplat.errors import DeviceError, DriverError
 from clsplat.selftest_result import FORWARD, STAGES, TRAINING, Result
 
@@ -119,7 +119,7 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
                 failed[shape.label] = failure
                 continue
         if shape != given:
-            tell_once(instead(cl_device, given, shape, failed[given.label]))
+            known.tell_once(instead(cl_device, given, shape, failed[given.label]))
         return tried
     raise DriverError(
         f"{_name(device)}, kernels in the shape {given.label}: {failed[given.label]}; none of {', '.join(failed)} "

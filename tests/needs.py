@@ -21,7 +21,7 @@ SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[2] / "shar
 NODE_CACHE = Path(__file__).parents[1] / ".pytest_cache" / "node" / "node_modules"
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 PREFIX = "needs "
-"""What every reason of this kind begins with."""
+"""Beginning of every reason of this kind."""
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ try:
 except ClsplatError as error:
     sys.exit(str(error))
 """
-"""What `train` asks of a driver at its first use, of each driver in turn."""
+"""The question that `train` asks of a driver at its first use, of each driver in turn."""
 SCENE = """
 import sys
 from pathlib import Path
@@ -112,7 +112,7 @@ class Machine:
 
 @dataclass
 class Result:
-    """What became of a machine: seconds of each step that passed, and the trouble, or why it was not run."""
+    """The outcome of a machine: seconds of each step that passed, and the trouble, or why it was not run."""
 
     machine: Machine
     seconds: dict[str, float] = field(default_factory=dict)
@@ -200,7 +200,7 @@ def run_step(step: Step, wrap: Sequence[str], environment: dict[str, str], folde
 
 
 _RUNNING: set[subprocess.Popen[bytes]] = set()
-"""What Ctrl-C has to end: the terminal sends it to our own group alone."""
+"""Children that Ctrl-C has to end: the terminal sends it to our own group alone."""
 
 
 def wrong(step: Step, status: int | None, errors: str, output: str) -> str:
@@ -256,7 +256,7 @@ def ten_steps(folder: str, *, limit: float = TRAIN_LIMIT, status: int = 0, says:
 
 @dataclass(frozen=True)
 class Found:
-    """What there is to make machines of; empty where it is missing."""
+    """Means to make machines of; empty where it is missing."""
 
     pypi: bool
     intel: str
@@ -272,7 +272,7 @@ class Found:
 
 
 def look() -> Found:
-    """What this machine has."""
+    """The means that this machine has."""
     intel = Path(sys.prefix) / "lib" / "libintelocl.so"
     debian = os.environ.get(BESIDE, "")
     if not debian and (listed := SYSTEM_VENDORS / "pocl.icd").exists():

@@ -9,7 +9,7 @@ from clsplat.errors import DeviceError
 
 
 def driver_advice(system: str | None = None, machine: str | None = None) -> str:
-    """What to install, in a line without a full stop.
+    """Advice on what to install, in a line without a full stop.
 
     system, machine: as `platform.system` and `platform.machine` give them; this one's unless given.
     """

@@ -39,7 +39,7 @@ def make_room(environment: MutableMapping[str, str] = os.environ) -> Path | None
 
 
 def _can_be_made(folder: Path) -> bool:
-    """Whether files can be put there, once folders that are missing are made."""
+    """True if files can be put there, once folders that are missing are made."""
     for place in (folder, *folder.parents):
         if os.path.lexists(place):
             return place.is_dir() and os.access(place, os.W_OK | os.X_OK)

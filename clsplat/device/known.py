@@ -142,9 +142,10 @@ def _remember(
         atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
     except OSError as error:
         _unwritten[path] = saved
-        _tell_once(f"{path}: cannot be written ({error.strerror}), drivers are tested anew each time")
+        tell_once(f"{path}: cannot be written ({error.strerror}), drivers are tested anew each time")
 
 
 @lru_cache(maxsize=8)
-def _tell_once(text: str) -> None:
+def tell_once(text: str) -> None:
+    """A warning, once in a process."""
     warnings.warn(text, stacklevel=2)

@@ -94,7 +94,7 @@ def _process(index: int) -> _Process:
 
 
 class Rehearsal:
-    """What a driver has shown that it can build and launch, in one shape of the kernels, LANESxITEMS.
+    """Kernels that a driver has shown that it can build and launch, in one shape of the kernels, LANESxITEMS.
 
     In a process that is a trial itself, such as that of `clsplat.trust`, done has the names of what was built and
     launched, with the salt of `Variant.anew` that its text needed, and say, if given, is told each kernel that comes
@@ -141,7 +141,7 @@ class Rehearsal:
             self.say(what)
 
     def fail(self, stem: str, name: str, trouble: str, *, lasting: bool = True) -> DriverError:
-        """What to raise; lasting: remember too that the driver cannot be used in this shape."""
+        """The error to raise; lasting: remember too that the driver cannot be used in this shape."""
         text = f"{stem}.cl{f', {name},' if name else ''} {trouble}"
         advice = f"--device takes another device, {REGARDLESS}=1 goes on regardless"
         if lasting and not regardless():
@@ -154,7 +154,7 @@ class Rehearsal:
 
     @cached_property
     def _known(self) -> dict[str, str]:
-        """What is known to work, with the salt of `Variant.anew` that its text needs."""
+        """Names of what is known to work, with the salt of `Variant.anew` that its text needs."""
         return dict(known.entries(self._device).get(self._shape, known.Entry()).kernels)
 
     def _ask(self, message: dict[str, Any], variant: Variant, kernel: str, name: str) -> None:

@@ -8,7 +8,6 @@ import os
 import re
 import warnings
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import pyopencl as cl
@@ -149,7 +148,7 @@ def shape_of(device: cl.Device) -> Shape:
     other = another_shape(device)
     if other is None:  # it is told when it fails again
         return wanted
-    tell_once(instead(device, wanted, other, failed[wanted.label]))
+    known.tell_once(instead(device, wanted, other, failed[wanted.label]))
     return other
 
 
@@ -175,12 +174,6 @@ def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str
         f"{device.name.strip()}, {driver}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
         f"taken (clsplat selftest tries {wanted.label} anew)"
     )
-
-
-@lru_cache(maxsize=8)
-def tell_once(text: str) -> None:
-    """A warning, once in a process."""
-    warnings.warn(text, stacklevel=2)
 
 
 def _parsed(text: str, default: Shape) -> Shape | None:
