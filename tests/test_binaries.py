@@ -25,6 +25,7 @@ VARIANT = variant_of("probe", {"LANES": 4, "ITEMS": 1, "FMA_BY_CONTRACTION": Tru
 def fresh(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Device:
     """Each driver with an empty cache of ours, which it is said to want."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(binaries.FOLDER)
     monkeypatch.setattr(binaries, "wants_cache", lambda device: True)
     return Device(all_devices()[request.param])
 

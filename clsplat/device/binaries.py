@@ -28,9 +28,13 @@ TARGET = "CL_CONFIG_"
 """Variables that begin so tell Intel's runtime which processor to build for, and how."""
 
 
+FOLDER = "CLSPLAT_BINARIES"
+"""The variable that names another place."""
+
+
 def folder() -> Path:
     """The place of the files."""
-    return cache_folder() / "binaries"
+    return Path(os.environ.get(FOLDER) or cache_folder() / "binaries")
 
 
 def _processor() -> str:
