@@ -21,6 +21,7 @@ from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO
 
 from clsplat.errors import InputError
+from clsplat.process import try_lock
 
 TEMPORARY_SUFFIX = ".clsplat-tmp"
 MAX_DOCUMENT = 32 << 20
@@ -92,6 +93,20 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
     """Write `data` as the whole content of `path`; see `atomic_writer`."""
     with atomic_writer(path) as file:
         file.write(data)
+
+
+@contextmanager
+def locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
+    """Inside, no other process is inside with this file, which need not be there: what is locked is FILE.lock beside it.
+
+    The system lets go of a lock when its process ends. After so many seconds, or where the file system knows no locks,
+    it goes on without. Raises OSError where the folder cannot be written.
+    """
+    with path.with_name(f"{path.name}.lock").open("ab") as file:
+        until = time.monotonic() + seconds
+        while not try_lock(file.fileno()) and time.monotonic() < until:
+            time.sleep(0.01)
+        yield  # closing the file unlocks it
 
 
 def replace(source: Path, target: Path) -> None:
