@@ -97,7 +97,7 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextmanager
 def locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
-    """Inside, no other process is inside with this file, which need not be there: what is locked is FILE.lock beside it.
+    """Inside, no other process is inside with this file, which need not be there: FILE.lock beside it is locked.
 
     The system lets go of a lock when its process ends. After so many seconds, or where the file system knows no locks,
     it goes on without. Raises OSError where the folder cannot be written.

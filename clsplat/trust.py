@@ -171,8 +171,8 @@ def _check(report: Report, name: str, advice: str) -> None:
 
 
 def examine_device(index: int) -> Report:
-    """`examine` the whole, in the shape that is wanted of the device. Where that passes, and with it the kernel that failed
-    before, if it was one, the shape is used again."""
+    """`examine` the whole, in the shape that is wanted of the device. Where that passes, and with it the kernel that
+    failed before, if it was one, the shape is used again."""
     device = all_devices()[index]
     shape = wanted_shape(device)
     report = examine(index, shape)

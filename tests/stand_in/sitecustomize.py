@@ -3,8 +3,8 @@
 
 CLSPLAT_STAND_IN is HOW FIRST LAST FILE: the texts that are built are numbered from 1, as they are met for the first
 time, in FILE, a line of digest and options each, and those from FIRST to LAST come to a bad end: abort, hang, kill, as
-the system does where memory is short, or empty, a program without kernels. With launch it is kernels by name that are
-numbered, and a launch that aborts.
+the system does where memory is short, memory, as Python says it, or empty, a program without kernels. With launch it is
+kernels by name that are numbered, and a launch that aborts.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ def _misbehave(cl):
             time.sleep(600)
         if how == "kill":
             os.kill(os.getpid(), 9)
+        if how == "memory":
+            raise MemoryError
         return real_build(cl.Program(self._context, "typedef int nothing;"), ["-cl-std=CL1.2"])
 
     class Launched:
