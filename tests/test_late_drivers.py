@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import Capture, train
-from dying import ALWAYS, LATE, VERBS, Standing, call, error_of, forget, number_of
+from dying import ALWAYS, LATE, Standing, call, error_of, forget, number_of
 
 from clsplat import training
 from clsplat.cli import main
@@ -79,6 +79,31 @@ def test_nothing_is_lost(
         assert np.array_equal(getattr(whole, group), getattr(resumed, group)), group
 
 
+def test_an_epoch_that_has_just_begun(
+    scene: Path, tmp_path: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Contributions are of epochs: those of the last are put by where the next begins, in the middle of a step."""
+    density = replace(WITHOUT.density, min_contribution=0.5)
+    config, loaded = replace(WITHOUT, density=density), load_scene(scene)
+    whole = train_on(loaded, config, device=default_device)
+    run = Run.create(tmp_path / "run", config, scene=scene)
+    first = 1 + len(loaded.train_views)
+
+    def fails(trainer):
+        if trainer.step == first:
+            raise DriverError("it failed")
+        return np.zeros(3, np.float32)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training.Trainer, "_background_colour", fails)
+        with pytest.raises(DriverError):
+            train_on(loaded, config, device=default_device, run=run)
+    assert [number for number, _ in run.checkpoints()] == [first - 1]
+    resumed = train_on(loaded, config, device=default_device, run=Run.open(run.path), resume=True)
+    assert len(resumed) == len(whole)
+    assert np.array_equal(whole.means, resumed.means)
+
+
 def test_what_is_half_changed_is_not_kept(
     scene: Path, tmp_path: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,9 +144,6 @@ def test_the_checkpoint_of_a_late_failure_gives_the_same_bytes(
     assert main(["train", "-o", str(tmp_path / "run"), "--resume"]) == 0
     models = [(tmp_path / each / "model.ply").read_bytes() for each in ("whole", "run")]
     assert models[0] == models[1]
-
-
-BEHIND = {**VERBS, "eval": "eval {run}", "report": "report {run}"}
 
 
 @pytest.mark.slow
