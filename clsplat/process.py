@@ -10,11 +10,6 @@ import subprocess
 import sys
 from typing import Any
 
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
-
 
 def apart() -> dict[str, Any]:
     """Arguments of `subprocess.Popen` for a process that a Ctrl-C on this terminal does not reach."""
@@ -40,9 +35,13 @@ def try_lock(file: int) -> bool:
     system knows no locks."""
     try:
         if sys.platform == "win32":
+            import msvcrt
+
             os.lseek(file, 0, os.SEEK_SET)
             msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
         else:
+            import fcntl
+
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         return error.errno not in (errno.EAGAIN, errno.EACCES)
