@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import signal
 import subprocess
 import sys
@@ -28,21 +27,3 @@ def reader_has_gone(error: OSError, *, windows: bool = sys.platform == "win32") 
     """True if a write failed as what reads our output has ended, as `| head` does. Windows says "invalid argument", and
     as of any stream names no file."""
     return isinstance(error, BrokenPipeError) or (windows and error.errno == errno.EINVAL and error.filename is None)
-
-
-def try_lock(file: int) -> bool:
-    """Lock an open file until it is closed; False where another process has it locked. Does nothing where the file
-    system knows no locks."""
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            os.lseek(file, 0, os.SEEK_SET)
-            msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno not in (errno.EAGAIN, errno.EACCES)
-    return True

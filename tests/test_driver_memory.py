@@ -73,10 +73,15 @@ def test_a_lock_is_waited_for_and_not_for_ever(tmp_path: Path) -> None:
         order.append("first")
     other.join()
     assert order == ["first", "second"]
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "words.json.lock").write_bytes(b"of one that was killed")
+    os.utime(tmp_path / "words.json.lock", (0, 0))
     with locked(path):
+        assert (tmp_path / "words.json.lock").read_bytes() != b"of one that was killed"
+    with locked(path):  # held for longer than anybody waits
         begun = time.monotonic()
-        with locked(path, seconds=0.1):
-            assert 0.1 <= time.monotonic() - begun < 3
+        with locked(path, seconds=0.2):
+            assert time.monotonic() - begun < 10
 
 
 def test_what_could_not_be_written_is_written_later(elsewhere: Path) -> None:
@@ -128,7 +133,7 @@ def test_only_what_is_used_warns_and_names_what_is_taken(
     monkeypatch.setattr(trust, "_short_test", lambda tried, _: "as well" if tried.shape == second else "")
     with pytest.warns(UserWarning, match=f"shape {first.label} failed: it failed; {third.label} is taken") as told:
         trust.require(context.open_device()).kernels("scan")
-    assert len(told) == 1
+    assert sum("is taken" in str(each.message) for each in told) == 1
 
 
 def test_a_failure_is_forgotten_when_what_failed_works(

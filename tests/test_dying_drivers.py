@@ -140,7 +140,7 @@ def test_a_trial_that_there_is_no_memory_for_is_left_out(
     standing(how, 1)
     with pytest.warns(UserWarning, match="not enough memory to try every kernel") as told:
         context.open_device().kernels("scan")
-    assert len(told) == 1
+    assert sum("not enough memory" in str(each.message) for each in told) == 1
     assert not any(entry.failed or entry.kernels for entry in known.entries(default_device.cl_device).values())
     monkeypatch.setattr(rehearsal._Process, "ask", lambda *_: pytest.fail("it was tried again"))
     context.open_device()._built("scan", context.open_device()._fma[0])
