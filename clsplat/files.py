@@ -94,6 +94,42 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
         file.write(data)
 
 
+@contextmanager
+def locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
+    """Inside, no other process is inside with this file, which need not be there: FILE.lock beside it says so.
+
+    One that is older than so many seconds is of a process that was killed, and is taken away. Whoever has waited for
+    twice as long goes on without. Raises OSError where the folder cannot be written.
+    """
+    lock, token = path.with_name(f"{path.name}.lock"), secrets.token_bytes(8)
+    until = time.monotonic() + 2 * seconds
+    while not (ours := _take(lock, token)) and time.monotonic() < until:
+        with suppress(OSError):
+            if time.time() - lock.stat().st_mtime > seconds:
+                lock.unlink()
+        time.sleep(0.005)
+    try:
+        yield
+    finally:
+        if ours:
+            with suppress(OSError):  # it may have been taken away, and another's be there
+                if lock.read_bytes() == token:
+                    remove(lock)
+
+
+def _take(lock: Path, token: bytes) -> bool:
+    try:
+        with lock.open("xb") as file:
+            file.write(token)
+    except FileExistsError:
+        return False
+    except PermissionError:  # Windows says so of a file that is being removed
+        if not WINDOWS:
+            raise
+        return False
+    return True
+
+
 def replace(source: Path, target: Path) -> None:
     """Rename a file or a folder, in the place of a file that is there. Raises OSError."""
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from clsplat import layers
 from clsplat.camera import Camera
+from clsplat.device.child import abandon
 from clsplat.errors import InputError
 from clsplat.files import abandoned
 from clsplat.frames import output_paths
@@ -230,6 +231,9 @@ def run_tasks(
             if video is not None:
                 line.room.release()  # frames are handed out in order, so that the next one always has room
             on_done(record)
+    except KeyboardInterrupt:
+        abandon()  # a thread may wait for a driver that hangs
+        raise
     finally:
         line.stop.set()
         for _ in threads:

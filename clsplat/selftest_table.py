@@ -30,6 +30,8 @@ def selftest(verb: Selftest) -> int:
         if not verb.json:
             print(table(report))
             print(f"This driver {report.verdict}.", flush=True)
+            if report.remembered:
+                print(f"The shape is not used all the same: {report.remembered}.", flush=True)
     if verb.json:
         print(json.dumps([record(info, report) for info, report in zip(found, reports, strict=True)], indent=2))
     failed = [name_of(info) for info, report in zip(found, reports, strict=True) if report.failure]
@@ -53,6 +55,7 @@ def record(info: DeviceInfo, report: Report) -> dict[str, object]:
         **asdict(info),
         "trusted": not report.failure,
         "verdict": report.verdict,
+        "remembered": report.remembered,
         "build_seconds": report.build_seconds,
         "stages": stages,
     }

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import asdict, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from clsplat.camera import Camera
 from clsplat.config import TrainConfig
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
+from clsplat.device.launch import only_tried
 from clsplat.device.layout import SlotFields
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluate import background_colour
@@ -33,6 +35,7 @@ from clsplat.stages.density import (
     add_statistics,
     gather,
     new_statistics,
+    try_gather,
     widen,
 )
 from clsplat.stages.loss import Loss, loss
@@ -88,6 +91,21 @@ class Photographs:
         return self._held[index]
 
 
+_Moved = tuple[DeviceGaussians, DeviceGaussians, DeviceGaussians, DeviceGaussians]
+"""Parameters, gradients, first and second moments."""
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """A place in the work that a checkpoint can be taken of: steps done, the random generator's state, the views that
+    are left, and whether the next step's density control is done."""
+
+    step: int
+    rng: Mapping[str, Any]
+    queue: list[int]
+    controlled: bool
+
+
 class Trainer:
     """A model in training: parameters, moments, statistics and the random state, all of which a checkpoint holds.
 
@@ -112,6 +130,9 @@ class Trainer:
         self.rng = np.random.default_rng(self.config.seed)
         self.step = 0
         self.queue: list[int] = []
+        self.controlled = False
+        self._mark: _Mark | None = None
+        self._second_halves: set[tuple[object, ...]] = set()
         device, initial = self.device, self.given if self.given is not None else self._initial()
         self.origin = initial.origin
         self._make_plan(len(initial))
@@ -191,8 +212,12 @@ class Trainer:
         its Gaussians are split or made transparent, not just after.
         """
         config, device, work = self.config, self.device, self.rasterizer.work
+        self._note()
         self.mend()
-        self._control_density()
+        if not self.controlled:
+            self._control_density()
+            self.controlled = True
+        self._note()
         self.step += 1
         self._raise_sh_degree()
         view, factor = self._next_view(), self.sizes.factor(self.step)
@@ -225,8 +250,47 @@ class Trainer:
             self._add_statistics(self.statistics.rows(start, stop), view, camera, projected, screen)
             moved = (parameters, self.gradients, first, second)
             counted = (projected.tile_counts, self.rasterizer.found)
+            self._try_second_half(view, camera, projected, screen, moved)
+            self._mark = None
+            self._add_statistics(self.statistics.rows(start, stop), view, camera, projected, screen)
             adam(device, self.step, self.rates(), config.optimiser, *moved, *counted)
+        self.controlled = False
+        self._note()
         return result
+
+    def _note(self, *, begun: bool = False) -> None:
+        """From here on until something of the state is changed, `step_back` leads here. begun: the step's number has
+        risen."""
+        self._mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
+
+    def step_back(self) -> bool:
+        """After an error within a step: make the state that of its beginning, or of after its density control. Returns
+        whether that can be."""
+        mark = self._mark
+        if mark is None:
+            return False
+        self.step, self.queue, self.controlled = mark.step, list(mark.queue), mark.controlled
+        self.rng.bit_generator.state = mark.rng
+        return True
+
+    def _try_second_half(self, view: int, camera: Camera, projected: Projected, screen: Screen, moved: _Moved) -> None:
+        """Have every kernel rehearsed that changes the state, before the first does: a driver may fail in any."""
+        parameters, settings = moved[0], self.config.optimiser
+        key = (
+            parameters.count,
+            parameters.coefficients,
+            updates_sh_rest(settings, self.step),
+            self.step < self.config.density.stop,
+            screen.contributions is not None,
+        )
+        if key in self._second_halves:
+            return
+        with only_tried(self.device):
+            self._add_statistics(
+                self.statistics.rows(0, projected.tile_counts.shape[0]), view, camera, projected, screen
+            )
+            adam(self.device, self.step, self.rates(), settings, *moved, projected.tile_counts, self.rasterizer.found)
+        self._second_halves.add(key)
 
     def _add_statistics(
         self, statistics: DensityStatistics, view: int, camera: Camera, projected: Projected, screen: Screen
@@ -278,7 +342,9 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.queue:
             self.queue = [int(index) for index in self.rng.permutation(len(self.views))]
+            self._mark = None
             self.statistics = self.statistics.next_epoch()
+            self._note(begun=True)
         return self.queue.pop()
 
     def _background_colour(self) -> NDArray[np.float32]:
@@ -305,6 +371,7 @@ class Trainer:
         due, prunes = density.is_due(config, self.step), density.is_pruning_due(config, self.step)
         resets = density.is_reset_due(config, self.step, white=self.config.background == "white")
         self.mend(look=due or prunes or resets)
+        self._note()
         if due:
             self._densify()
         elif prunes:
@@ -356,6 +423,9 @@ class Trainer:
                 + (" or --density.min-contribution" if config.min_contribution > 0 else "")
             )
         gathers = self.plan.gathers
+        with only_tried(device):
+            try_gather(device, len(plan.rows), self.parameters)
+        self._mark = None
         self._make_plan(len(plan.rows))
         models = [self.parameters, self.first, self.second] if gathers and self.plan.gathers else self._take_down()
         statistics = self.statistics.moved(plan.rows, plan.fresh, densified=densified)
@@ -391,7 +461,7 @@ class Trainer:
             self._apply(remedy)
             arrays = self._arrays()
         state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(self.watch.patience)}
-        return arrays, state
+        return arrays, {**state, "controlled": True} if self.controlled else state
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
@@ -411,6 +481,7 @@ class Trainer:
         self.step = checkpoint.step
         self.rng.bit_generator.state = checkpoint.state["rng"]
         self.queue = list(checkpoint.state["queue"])
+        self.controlled, self._mark = bool(checkpoint.state.get("controlled", False)), None
         self.watch.patience = Patience(**checkpoint.state.get("patience", {}))
         self.watch.forget()
         del self.parameters, self.first, self.second, self.gradients, self.statistics

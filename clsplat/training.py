@@ -14,12 +14,14 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsplat.colour import photos_space
 from clsplat.config import TrainConfig
+from clsplat.device.child import TrialInterrupted
 from clsplat.device.context import Device, open_device
-from clsplat.errors import ClsplatError
+from clsplat.errors import ClsplatError, DriverError
 from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
@@ -100,6 +102,20 @@ class _Session:
             if not self.trainer.watch.patience.lost:
                 self.run.save_checkpoint(self.trainer.step, arrays, {**state, "seconds": self.seconds})
                 self.saved = self.trainer.step
+
+    def rescue(self) -> str:
+        """After a trial that failed or was interrupted: a checkpoint of the state that the step began with, if that is
+        whole. What was written, for the end of a sentence, or nothing."""
+        if self.run is None or not self.trainer.step_back():
+            return ""
+        try:
+            self.save()
+        except (ClsplatError, OSError, cl.Error) as error:
+            return f"; its checkpoint could not be written ({error})"
+        if not 0 < self.trainer.step <= self.saved:
+            return ""
+        resume = f"clsplat train -o {self.run.path} --resume"
+        return f"; the checkpoint of step {self.trainer.step} is written: {resume} goes on from it"
 
     def go_back(self) -> bool:
         """Tell what trouble there was; after too much of it go back to the last checkpoint, with smaller steps, and
@@ -247,6 +263,20 @@ class _Session:
             self.save()
 
 
+@contextmanager
+def _rescued(session: _Session) -> Iterator[None]:
+    """Nothing is lost of what was trained where a driver's trial ends it."""
+    try:
+        yield
+    except DriverError as error:
+        if written := session.rescue():
+            raise DriverError(f"{error}{written}") from error
+        raise
+    except TrialInterrupted:
+        session.rescue()
+        raise
+
+
 def train(
     scene: Scene,
     config: TrainConfig | None = None,
@@ -279,7 +309,7 @@ def train(
         session.resume()
     session.first_step = trainer.step
     session.tell_plan()
-    with _interruption() as interrupted:
+    with _rescued(session), _interruption() as interrupted:
         while True:
             while trainer.step < config.iterations and not interrupted():
                 if between is not None:

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from clsplat.device import known
+from clsplat.device import known, rehearsal
 from clsplat.device.child import REGARDLESS, Child, patience, python_module, regardless
 from clsplat.device.context import Device, all_devices
 from clsplat.device.shapes import Shape, failures, instead, shapes_in_turn, wanted_shape
@@ -25,7 +25,8 @@ from clsplat.selftest_result import FORWARD, STAGES, TRAINING, Result
 class Report:
     """What became of a device. build_seconds: None where the kernels were not built first; end: how the process ended
     before its work was done, in words, or empty; crashed: whether that was the driver's doing; kernels: those that were
-    built and launched, as `device.rehearsal` has them."""
+    built and launched, as `device.rehearsal` has them; remembered: a failure in this shape that has not been seen to
+    be gone, in words, or empty."""
 
     results: list[Result] = field(default_factory=list)
     build_seconds: float | None = None
@@ -33,6 +34,7 @@ class Report:
     crashed: bool = False
     wanted: tuple[str, ...] = STAGES
     kernels: dict[str, str] = field(default_factory=dict)
+    remembered: str = ""
 
     @property
     def failure(self) -> str:
@@ -104,7 +106,7 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
     if regardless():
         return device
     cl_device, given = device.cl_device, device.shape
-    failed = failures(cl_device)
+    failed, wanted = failures(cl_device), wanted_shape(cl_device)
     shapes = [shape for shape in (given, *shapes_in_turn(cl_device)) if shape.label not in failed]
     # where all have failed, the reason may be gone: the one that is wanted is tried anew
     told = False
@@ -119,7 +121,8 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
                 failed[shape.label] = failure
                 continue
         if shape != given:
-            known.tell_once(instead(cl_device, given, shape, failed[given.label]))
+            first = wanted if device.is_another and wanted.label in failed else given
+            known.tell_once(instead(cl_device, first, shape, failed[first.label]))
         return tried
     raise DriverError(
         f"{_name(device)}, kernels in the shape {given.label}: {failed[given.label]}; none of {', '.join(failed)} "
@@ -168,10 +171,25 @@ def _check(report: Report, name: str, advice: str) -> None:
 
 
 def examine_device(index: int) -> Report:
-    """`examine` the whole, in the shape that is wanted of the device; what had failed and passes is used again."""
+    """`examine` the whole, in the shape that is wanted of the device. Where that passes, and with it the kernel that
+    failed before, if it was one, the shape is used again."""
     device = all_devices()[index]
     shape = wanted_shape(device)
     report = examine(index, shape)
-    if not report.failure and shape.label in known.entries(device):
-        known.remember(device, shape.label, failed="")
+    entry = known.entries(device).get(shape.label, known.Entry())
+    if entry.failed and not report.failure:
+        report.remembered = _still(index, entry, report)
+        if not report.remembered:
+            known.remember(device, shape.label, failed="")
     return report
+
+
+def _still(index: int, entry: known.Entry, report: Report) -> str:
+    """Why a failure is not forgotten, or nothing."""
+    name, build = entry.trial.get("name"), entry.trial.get("build")
+    if not entry.trial or name in report.kernels:  # a stage of the test, or a kernel that it has launched
+        return ""
+    if build is None:
+        return f"{entry.failed}; this test does not come to it"
+    trouble = rehearsal.again(index, entry.trial)
+    return f"{entry.failed}; tried once more: {trouble}" if trouble else ""

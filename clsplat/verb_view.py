@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,6 +41,7 @@ TELL_EVERY = 0.5
 
 def view(verb: View) -> int:
     """A model in the browser, until Ctrl-C, which is the way to end it."""
+    from clsplat.device.child import TrialInterrupted
     from clsplat.device.context import open_device
     from clsplat.selftest_result import FORWARD
     from clsplat.trust import require
@@ -64,9 +65,10 @@ def view(verb: View) -> int:
     viewing = Viewing(model)
     with _until_stopped() as stopped, _serving(Server(viewing, world, address)) as server:
         _print_address(server)
-        while not stopped():
-            if not viewing.work():
-                viewing.wait(LONGEST_WAIT)
+        with suppress(TrialInterrupted):  # asked to end while a driver hung
+            while not stopped():
+                if not viewing.work():
+                    viewing.wait(LONGEST_WAIT)
     return 0
 
 

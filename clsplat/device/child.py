@@ -10,14 +10,16 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
-from contextlib import suppress
+import time
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import IO, Any
 
-from clsplat.errors import InputError
-from clsplat.process import apart
+from clsplat.errors import DriverError, InputError
+from clsplat.process import apart, endings
 
 MARK = "clsplat-child "
 """Beginning of a line that is meant for the parent; drivers print lines of their own."""
@@ -27,6 +29,12 @@ TIMEOUT = "CLSPLAT_DRIVER_TIMEOUT"
 REGARDLESS = "CLSPLAT_TRUST_DRIVER"
 KILL = 9
 """SIGKILL, which Windows has no name for."""
+LONGEST_WAIT = 0.5
+"""Seconds, so that a signal is seen to on systems where it does not end a wait."""
+
+
+class TrialInterrupted(KeyboardInterrupt):
+    """This process was asked to end while it waited for a driver's trial."""
 
 
 def patience() -> float:
@@ -64,21 +72,63 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
+@contextmanager
+def ending_at_once() -> Iterator[None]:
+    """Inside, what asks this process to end raises TrialInterrupted, after its own handler, which may only take note of
+    it. Nothing in other threads than the main one, which hears no signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        with suppress(KeyboardInterrupt):
+            before[number](number, frame)
+        raise TrialInterrupted
+
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, *endings())}
+    before = {int(each): handler for each, handler in handlers.items() if callable(handler)}
+    for each in before:
+        signal.signal(each, interrupt)
+    try:
+        yield
+    finally:
+        for each, handler in before.items():
+            if signal.getsignal(each) is interrupt:  # a handler may have put another one in its own place
+                signal.signal(each, handler)
+
+
+_alive: weakref.WeakSet[Child] = weakref.WeakSet()
+
+
+def abandon() -> None:
+    """End all of them at once, whoever waits for one: that raises TrialInterrupted."""
+    for child in list(_alive):
+        child.abandon()
+
+
 class Child:
-    """A process that answers in lines of JSON. Ctrl-C does not reach it: it ends with its parent, or by `close`."""
+    """A process that answers in lines of JSON. Ctrl-C does not reach it: it ends with its parent, or by `close`.
+
+    Raises DriverError where it cannot be started.
+    """
 
     def __init__(self, command: Sequence[str]) -> None:
-        self._process = subprocess.Popen(
-            list(command),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            env={**os.environ, "PYTHONIOENCODING": "utf-8", REGARDLESS: "1"},
-            **apart(),
-        )
+        self._abandoned = False
+        try:
+            self._process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                encoding="utf-8",
+                errors="replace",
+                env={**os.environ, "PYTHONIOENCODING": "utf-8", REGARDLESS: "1"},
+                **apart(),
+            )
+        except OSError as error:
+            raise DriverError(f"{command[0]}: {error.strerror}, {_NO_PYTHON}") from None
+        _alive.add(self)
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._errors: list[str] = []
         assert self._process.stdout is not None
@@ -109,12 +159,19 @@ class Child:
 
     def receive(self, seconds: float) -> dict[str, Any] | None:
         """The next message; None where the process has ended. Raises TimeoutError after so many seconds without one,
-        and ends the process."""
-        try:
-            line = self._lines.get(timeout=seconds)
-        except queue.Empty:
-            self._process.kill()
-            raise TimeoutError(f"did not come back within {seconds:g} s") from None
+        and ends the process, and TrialInterrupted."""
+        until = time.monotonic() + seconds
+        while True:
+            try:
+                line = self._lines.get(timeout=max(min(LONGEST_WAIT, until - time.monotonic()), 0.0))
+                break
+            except queue.Empty:
+                if time.monotonic() < until:
+                    continue
+                self._process.kill()
+                raise TimeoutError(f"did not come back within {seconds:g} s") from None
+        if self._abandoned:
+            raise TrialInterrupted
         if line is None:
             return None
         message: dict[str, Any] = json.loads(line)
@@ -135,8 +192,19 @@ class Child:
         status 1 or 2, and not by the system, which kills what takes too much memory."""
         return self._process.wait() not in (0, 1, 2, *(-number for number in (signal.SIGTERM, KILL)))
 
+    @property
+    def killed(self) -> bool:
+        """True if the system has ended it, as it does where memory is short."""
+        return self._process.wait() == -KILL
+
+    def abandon(self) -> None:
+        """End the process without waiting for that; who waits for an answer gets TrialInterrupted."""
+        self._abandoned = True
+        self._process.kill()
+
     def close(self) -> None:
         """End the process."""
+        _alive.discard(self)
         self._process.kill()
         with suppress(subprocess.TimeoutExpired):  # one that hangs in the system cannot even be killed
             self._process.wait(timeout=5)
@@ -155,9 +223,17 @@ class Child:
         self.close()
 
 
+_NO_PYTHON = (
+    "expected the Python that this process runs in, for a process of its own in which a driver is tried; "
+    f"{REGARDLESS}=1 goes on without"
+)
+
+
 def python_module(module: str, *words: str) -> list[str]:
     """The command that runs a module of this package: this package, and nothing of the folder that we are in, as
-    `python -m` would take modules from there."""
+    `python -m` would take modules from there. Raises DriverError where Python does not know its own file."""
+    if not sys.executable:  # as where another program has it built in
+        raise DriverError(f"sys.executable is empty, {_NO_PYTHON}")
     root = str(Path(__file__).resolve().parents[2])
     code = (
         f"import sys; sys.path[:] = [part for part in sys.path if part]; root = {root!r}; "

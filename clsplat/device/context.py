@@ -19,13 +19,22 @@ import pyopencl as cl
 
 from clsplat.device.advice import no_device
 from clsplat.device.buffers import allocate
+from clsplat.device.known import tell_once
 from clsplat.device.launch import launch_groups
 from clsplat.device.memory import Memory
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build, variant_of
 from clsplat.device.rehearsal import Rehearsal
-from clsplat.device.shapes import Shape, kind_of, shape_of
+from clsplat.device.shapes import (
+    Shape,
+    asked_shape,
+    compiles_by_size,
+    kind_of,
+    shape_of,
+    shape_text,
+    why_another,
+)
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError
 
@@ -62,10 +71,11 @@ def all_devices() -> list[cl.Device]:
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Every OpenCL device that is visible, GPUs and CPUs, in the order of their index."""
+    """Every OpenCL device that is visible, GPUs and CPUs, in the order of their index. Raises DeviceError for a
+    CLSPLAT_SHAPE that makes no sense for any."""
+    asked_shape()
     infos = []
     for index, device in enumerate(all_devices()):
-        shape = shape_of(device)
         infos.append(
             DeviceInfo(
                 index=index,
@@ -75,21 +85,28 @@ def list_devices() -> list[DeviceInfo]:
                 kind=kind_of(device),
                 compute_units=device.max_compute_units,
                 memory_bytes=device.global_mem_size,
-                shape=f"{shape.lanes} lanes x {shape.items} items",
+                shape=shape_text(device),
             )
         )
     return infos
 
 
 class Device:
-    """A device with its context, in-order queue, kernel shape and built kernels."""
+    """A device with its context, in-order queue, kernel shape and built kernels.
 
-    def __init__(self, device: cl.Device, shape: Shape | None = None, *, profile: bool = False) -> None:
+    why: the warning that this is not the shape that is wanted, told when the device is used; only_tries: a launch is
+    rehearsed, if it has to be, and not made (`launch.only_tried`).
+    """
+
+    def __init__(self, device: cl.Device, shape: Shape | None = None, *, profile: bool = False, why: str = "") -> None:
         self.cl_device = device
         self.name = device.name.strip()
         self.driver = device.platform.version.strip()
         self.kind = kind_of(device)
         self.shape = shape or shape_of(device)
+        self._why_another = why if shape else why_another(device, self.shape)
+        self.only_tries = False
+        self.compiles_by_size = compiles_by_size(device)
         self.max_allocation = int(device.max_mem_alloc_size)
         self.max_group = int(device.max_work_group_size)
         self.memory = Memory()
@@ -108,6 +125,8 @@ class Device:
 
     def kernels(self, stem: str, **defines: object) -> Kernels:
         """The kernels of `stem`.cl in this device's shape, built at the first call."""
+        if self._why_another:  # told by what is used, and not before the self-test may have chosen yet another
+            tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
             defines = {**{name: value for name, value in self._switches.items() if name in text}, **defines}
@@ -137,6 +156,11 @@ class Device:
         device = copy(self)
         device._switches = switches  # noqa: SLF001  # a copy of our own class
         return device
+
+    @property
+    def is_another(self) -> bool:
+        """Whether this shape was taken as the driver had failed in the one that is wanted."""
+        return bool(self._why_another)
 
     @property
     def switches(self) -> Mapping[str, object]:
@@ -217,7 +241,8 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 @lru_cache(maxsize=8)
 def _open(index: int, shape: Shape) -> Device:
-    return Device(all_devices()[index], shape)
+    why = why_another(all_devices()[index], shape)
+    return Device(all_devices()[index], shape, why=why)
 
 
 def open_device(selector: str | None = None, memory_limit: int | None = None) -> Device:

@@ -20,7 +20,7 @@ from typing import Any
 import pyopencl as cl
 
 from clsplat.device.source import kernel_root, kernel_source
-from clsplat.files import atomic_write, parse_json
+from clsplat.files import atomic_write, locked, parse_json
 
 BREAK = "CLSPLAT_BREAK_KERNEL"
 """For the tests of `clsplat selftest` alone: STEM: WORDS => WORDS replaces words of one kernel's text, as a driver that
@@ -32,11 +32,13 @@ MOST = 16
 @dataclass(frozen=True)
 class Entry:
     """One driver in one shape. stages: those of the self-test that passed; kernels: what has been built and launched,
-    as `rehearsal` names it, with the salt that its text needs; failed: how the driver failed, or empty."""
+    as `rehearsal` names it, with the salt that its text needs; failed: how the driver failed, or empty; trial: what
+    it failed in, if that was a single kernel: its name, and what `Rehearsal.again` needs to try it."""
 
     stages: frozenset[str] = frozenset()
     kernels: Mapping[str, str] = field(default_factory=dict)
     failed: str = ""
+    trial: Mapping[str, Any] = field(default_factory=dict)
 
 
 def cache_folder() -> Path:
@@ -72,25 +74,57 @@ def _entry(value: object) -> Entry:
     if not isinstance(value, dict):
         return Entry()
     stages, kernels, failed = value.get("stages", []), value.get("kernels", {}), value.get("failed", "")
+    trial = value.get("trial", {})
     if not (isinstance(stages, list) and isinstance(kernels, dict) and isinstance(failed, str)):
         return Entry()
     if not all(isinstance(each, str) for each in (*stages, *kernels.values())):
         return Entry()
-    return Entry(frozenset(stages), kernels, failed)
+    return Entry(frozenset(stages), kernels, failed, trial if isinstance(trial, dict) else {})
 
 
-_unwritten: dict[Path, dict[str, Any]] = {}
-"""By file that cannot be written: what would be in it."""
+@dataclass(frozen=True)
+class _Addition:
+    """What `remember` adds to the entry of a driver and shape."""
+
+    driver: str
+    shape: str
+    stages: frozenset[str]
+    kernels: Mapping[str, str]
+    failed: str | None
+    trial: Mapping[str, Any]
+
+
+_unwritten: dict[Path, list[_Addition]] = {}
+"""By file: what could not be written yet."""
 
 
 def _read() -> dict[str, Any]:
-    if memory_path() in _unwritten:
-        return _unwritten[memory_path()]
+    """The file, with what is to be added to it."""
     try:
         saved = parse_json(memory_path().read_bytes())
     except (OSError, ValueError):
-        return {}
-    return saved if isinstance(saved, dict) else {}
+        saved = {}
+    if not isinstance(saved, dict):
+        saved = {}
+    for addition in _unwritten.get(memory_path(), []):
+        _add(saved, addition)
+    return saved
+
+
+def _add(saved: dict[str, Any], addition: _Addition) -> None:
+    shapes = saved.pop(addition.driver, None)
+    shapes = shapes if isinstance(shapes, dict) else {}
+    known = _entry(shapes.get(addition.shape))
+    entry: dict[str, object] = {
+        "stages": sorted(known.stages | addition.stages),
+        "kernels": {**known.kernels, **addition.kernels},
+    }
+    new = addition.failed is not None
+    if failed := addition.failed if new else known.failed:
+        entry["failed"] = failed
+        if trial := addition.trial if new else known.trial:
+            entry["trial"] = trial
+    saved[addition.driver] = {**shapes, addition.shape: entry}
 
 
 def entries(device: cl.Device) -> dict[str, Entry]:
@@ -106,42 +140,34 @@ def remember(
     stages: Iterable[str] = (),
     kernels: Mapping[str, str] | None = None,
     failed: str | None = None,
+    trial: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add to what is known of the driver in a shape, LANESxITEMS. failed: None leaves as it is what is said of it.
+    """Add to what is known of the driver in a shape, LANESxITEMS. failed: None leaves as it is what is said of it;
+    trial: as `Entry` has it.
 
-    A folder that cannot be written is a warning: everything is tried anew by the next process.
+    A folder that cannot be written is a warning; while it cannot, everything is tried anew by the next process.
     """
+    addition = _Addition(driver_key(device), shape, frozenset(stages), kernels or {}, failed, trial or {})
     with _LOCK:
-        _remember(device, shape, stages, kernels or {}, failed)
+        _remember(addition)
 
 
 _LOCK = threading.Lock()
-"""Several devices may be at work at once. Another process's entry may be lost, which is then tried anew."""
+"""Several devices may be at work at once."""
 
 
-def _remember(
-    device: cl.Device, shape: str, stages: Iterable[str], kernels: Mapping[str, str], failed: str | None
-) -> None:
-    saved, key = _read(), driver_key(device)
-    shapes = saved.get(key)
-    known = entries(device).get(shape, Entry())
-    entry: dict[str, object] = {
-        "stages": sorted(known.stages | set(stages)),
-        "kernels": {**known.kernels, **kernels},
-    }
-    failure = known.failed if failed is None else failed
-    if failure:
-        entry["failed"] = failure
-    saved.pop(key, None)
-    saved[key] = {**(shapes if isinstance(shapes, dict) else {}), shape: entry}
-    for oldest in list(saved)[:-MOST]:
-        del saved[oldest]
+def _remember(addition: _Addition) -> None:
     path = memory_path()
+    _unwritten.setdefault(path, []).append(addition)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
+        with locked(path):
+            saved = _read()
+            for oldest in list(saved)[:-MOST]:
+                del saved[oldest]
+            atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
+        del _unwritten[path]
     except OSError as error:
-        _unwritten[path] = saved
         tell_once(f"{path}: cannot be written ({error.strerror}), drivers are tested anew each time")
 
 

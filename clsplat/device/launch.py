@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from math import prod
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,19 @@ if TYPE_CHECKING:
 _LOCAL = 64
 """Work-items a group where they do not co-operate: enough for a GPU's wave, short enough for a CPU's chunk."""
 _WORD = 0xFFFFFFFF
+_MANY = 1 << 16
+"""Items along an axis from which on PoCL compiles a kernel anew."""
+
+
+@contextmanager
+def only_tried(device: Device) -> Iterator[None]:
+    """Inside, the launches of this device are rehearsed where they have to be, and not made: what comes of a driver's
+    failure is then nothing that is half done."""
+    device.only_tries = True
+    try:
+        yield
+    finally:
+        device.only_tries = False
 
 
 def _value(argument: Any) -> Any:
@@ -39,20 +53,37 @@ def _type(value: Any) -> Any:
     return value.dtype if isinstance(value, np.generic) else None
 
 
+def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None) -> str:
+    """A name for what else than the kernel decides what a driver compiles for a launch; empty for the usual.
+
+    The sizes of groups themselves are not in it: an image's width is one, and each would be a trial.
+    """
+    if not device.compiles_by_size:
+        return ""
+    return " of any groups" * (local is None) + " of many items" * (max(size) >= _MANY)
+
+
 def _first(
-    device: Device, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, values: Sequence[Any]
+    device: Device,
+    kernel: Kernel,
+    size: tuple[int, ...],
+    local: tuple[int, ...] | None,
+    values: Sequence[Any],
+    form: str,
 ) -> None:
     """Tell the types of the kernel's arguments, and see that the driver can launch it. Raises DriverError."""
     types = [_type(value) for value in values]
     most = kernel.most_items(device.cl_device) if tells_group_sizes(device.cl_device) else device.max_group
     if local is not None and prod(local) > most:
         raise device.rehearsal.fail(
-            kernel.variant.stem, kernel.name, f"has {prod(local)} items in a group, where the driver allows it {most}"
+            kernel.variant,
+            kernel.name,
+            f"has {prod(local)} items in a group, where the driver allows it {most}",
         )
     typed = [value if of is None else np.dtype(of).type(value) for of, value in zip(types, values, strict=True)]
-    device.rehearsal.launch(kernel, size, local, typed)
+    device.rehearsal.launch(kernel, size, local, typed, form)
     kernel.cl_kernel.set_scalar_arg_dtypes(types)
-    kernel.tried = True
+    kernel.tried.add(form)
 
 
 _UPDATED = {
@@ -69,9 +100,12 @@ def _enqueue(
     device: Device, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: tuple[Any, ...]
 ) -> None:
     values = [_value(argument) for argument in arguments]
-    first = not kernel.tried
+    form = form_of(device, size, local)
+    first = form not in kernel.tried
     if first:
-        _first(device, kernel, size, local, values)
+        _first(device, kernel, size, local, values, form)
+    if device.only_tries:
+        return
     try:
         event = kernel.cl_kernel(device.queue, size, local, *values)
         if first and device.rehearsal.say is not None:  # so that what was told last is what a driver fails in

@@ -43,11 +43,12 @@ class Variant:
 def variant_of(stem: str, defines: Mapping[str, object], options: str) -> Variant:
     """`stem`.cl with these defines. Raises InputError for a CLSPLAT_BREAK_KERNEL that makes no sense."""
     flags = [f"-D{name}" if value is True else f"-D{name}={value}" for name, value in sorted(defines.items())]
-    return Variant(stem, _broken(stem, kernel_source(stem)), (*flags, *options.split()))
+    return Variant(stem, text_of(stem), (*flags, *options.split()))
 
 
-def _broken(stem: str, source: str) -> str:
-    """The source, or what BREAK makes of it. Raises InputError where that makes no sense."""
+def text_of(stem: str) -> str:
+    """The source of a kernel file, or what BREAK makes of it. Raises InputError where that makes no sense."""
+    source = kernel_source(stem)
     wanted = os.environ.get(BREAK)
     if not wanted:
         return source
@@ -102,15 +103,16 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
 class Kernel:
     """A kernel that has been built.
 
-    tried: it is known that the driver can launch it, and the types of its scalars have been told to OpenCL's wrapper,
-    as each would else cost 10 microseconds a launch.
+    tried: the forms of launch (`launch.form_of`) of which it is known that the driver can do them. With the first of
+    them the types of the kernel's scalars have been told to OpenCL's wrapper, as each would else cost 10 microseconds
+    a launch.
     """
 
     def __init__(self, variant: Variant, kernel: Any) -> None:
         self.variant = variant
         self.name: str = kernel.function_name
         self.cl_kernel = kernel
-        self.tried = False
+        self.tried: set[str] = set()
 
     def most_items(self, device: cl.Device) -> int:
         """Work-items that the driver allows a group of this kernel."""

@@ -15,7 +15,7 @@ import faulthandler
 import json
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -23,8 +23,8 @@ import numpy as np
 import pyopencl as cl
 
 from clsplat.device import known
-from clsplat.device.child import REGARDLESS, Child, patience, python_module, regardless, tell
-from clsplat.device.program import Kernel, Variant, build
+from clsplat.device.child import REGARDLESS, Child, ending_at_once, patience, python_module, regardless, tell
+from clsplat.device.program import Kernel, Variant, build, text_of
 from clsplat.device.shapes import caches_programs
 from clsplat.errors import DriverError, KernelBuildError
 
@@ -47,35 +47,50 @@ class _Process:
         self._timer: threading.Timer | None = None
 
     def ask(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
-        """The answer; or none, how the process ended, and whether that was the driver's doing."""
+        """The answer; how the process ended, if it did, and whether that was the driver's doing. Raises
+        TrialInterrupted, and DriverError where there can be no such process."""
         with self._lock:
             if self._timer is not None:
                 self._timer.cancel()
-            if self._child is None:
-                self._child = Child(python_module("clsplat.device.rehearsal", str(self._index)))
-            seconds = patience()
-            self._child.send({**message, "seconds": seconds})
             try:
-                answer, ending, crashed = self._child.receive(seconds), "", True
-                if answer is None:
-                    ending, crashed = self._child.ending(), self._child.crashed
-            except TimeoutError as error:
-                answer, ending, crashed = None, str(error), True
+                with ending_at_once():
+                    answer, ending, crashed = self._asked(message)
             except BaseException:
                 self._end()
                 raise
-            if answer is None:
+            if ending:
                 self._end()
-                return {}, ending, crashed
+                return answer, ending, crashed
             self._timer = threading.Timer(IDLE, self.close)
             self._timer.daemon = True
             self._timer.start()
             return answer, "", False
 
+    def _asked(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
+        if self._child is None:
+            self._child = Child(python_module("clsplat.device.rehearsal", str(self._index)))
+        seconds = patience()
+        self._child.send({**message, "seconds": seconds})
+        try:
+            answer = self._child.receive(seconds)
+        except TimeoutError as error:
+            return {}, str(error), True
+        if answer is not None:
+            return answer, "", False
+        return {"memory": self._child.killed}, self._child.ending(), self._child.crashed
+
     def close(self) -> None:
         """End it; the next question starts another."""
         with self._lock:
             self._end()
+
+    def end(self) -> None:
+        """End it with this process, which waits for no trial."""
+        if (child := self._child) is not None:
+            child.abandon()
+        if self._lock.acquire(timeout=1.0):
+            self._end()
+            self._lock.release()
 
     def _end(self) -> None:
         if self._child is not None:
@@ -89,7 +104,7 @@ _processes: dict[int, _Process] = {}
 def _process(index: int) -> _Process:
     if index not in _processes:
         _processes[index] = _Process(index)
-        atexit.register(_processes[index].close)
+        atexit.register(_processes[index].end)
     return _processes[index]
 
 
@@ -117,10 +132,15 @@ class Rehearsal:
         return variant.anew(self._known[variant.digest])
 
     def launch(
-        self, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: Sequence[Any]
+        self,
+        kernel: Kernel,
+        size: tuple[int, ...],
+        local: tuple[int, ...] | None,
+        arguments: Sequence[Any],
+        form: str = "",
     ) -> None:
-        """See that the kernel can be launched. Raises DriverError."""
-        name = f"{kernel.variant.digest} {kernel.name}"
+        """See that the kernel can be launched in this form (`launch.form_of`). Raises DriverError."""
+        name = f"{kernel.variant.digest} {kernel.name}{form}"
         if regardless():
             self._begin(f"{kernel.variant.stem}.cl, {kernel.name}", name)
         elif name not in self._known:
@@ -140,12 +160,26 @@ class Rehearsal:
         if self.say is not None:
             self.say(what)
 
-    def fail(self, stem: str, name: str, trouble: str, *, lasting: bool = True) -> DriverError:
-        """The error to raise; lasting: remember too that the driver cannot be used in this shape."""
-        text = f"{stem}.cl{f', {name},' if name else ''} {trouble}"
+    def fail(
+        self,
+        variant: Variant,
+        kernel: str,
+        trouble: str,
+        *,
+        lasting: bool = True,
+        name: str = "",
+        message: Mapping[str, Any] | None = None,
+    ) -> DriverError:
+        """The error to raise; lasting: remember too that the driver cannot be used in this shape; name and message: of
+        the trial that failed, if it was one."""
+        text = f"{variant.stem}.cl{f', {kernel},' if kernel else ''} {trouble}"
         advice = f"--device takes another device, {REGARDLESS}=1 goes on regardless"
         if lasting and not regardless():
-            known.remember(self._device, self._shape, failed=text)
+            trial: dict[str, Any] = {"name": name or f"{variant.digest} {kernel}"}
+            if message is not None:
+                trial["build"] = {"stem": variant.stem, "options": variant.options}
+                trial.update({key: value for key, value in message.items() if key != "build"})
+            known.remember(self._device, self._shape, failed=text, trial=trial)
             advice = f"the next process takes another shape if one works; {advice}"
         driver = self._device.platform.version.split("  ")[0].strip()
         return DriverError(
@@ -161,13 +195,34 @@ class Rehearsal:
         if name in self._failed:
             raise DriverError(self._failed[name])
         answer, ending, crashed = _process(self._index).ask(message)
-        if trouble := f"the process that tried it {ending}" if ending else str(answer.get("trouble", "")):
-            error = self.fail(variant.stem, kernel, trouble, lasting=crashed or not ending)
+        if answer.get("memory"):  # no sign of a bad driver, and no reason to try it at every launch
+            self._known[name] = ""
+            known.tell_once(
+                f"{self._device.name.strip()}: not enough memory to try every kernel in a process of its own before it "
+                "is used here"
+            )
+            return
+        if trouble := _trouble(answer, ending):
+            error = self.fail(variant, kernel, trouble, lasting=crashed or not ending, name=name, message=message)
             self._failed[name] = str(error)  # not to wait for it again
             raise error
         self._known[name] = str(answer.get("salt", ""))
         if not answer.get("refused"):  # what is refused, with a reason, is refused here as well
             known.remember(self._device, self._shape, kernels={name: self._known[name]})
+
+
+def again(index: int, trial: Mapping[str, Any]) -> str:
+    """Try once more what failed (`known.Entry.trial`) on the `index`-th device; how it fails now, or nothing. Raises
+    what a trial that is none of ours raises."""
+    given = trial["build"]
+    variant = Variant(given["stem"], text_of(given["stem"]), tuple(given["options"]))
+    message = {"build": _text(variant), **{key: trial[key] for key in ("launch",) if key in trial}}
+    answer, ending, _ = _process(index).ask(message)
+    return "not enough memory to try it" if answer.get("memory") else _trouble(answer, ending)
+
+
+def _trouble(answer: Mapping[str, Any], ending: str) -> str:
+    return f"the process that tried it {ending}" if ending else str(answer.get("trouble", ""))
 
 
 def _text(variant: Variant) -> dict[str, Any]:
@@ -209,7 +264,7 @@ class _Stage:
         self._queue = cl.CommandQueue(self._context)
         self._kernels: dict[str, dict[str, Any]] = {}
 
-    def answer(self, message: dict[str, Any]) -> dict[str, str]:
+    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
         """Build, and launch if asked for."""
         text = message["build"]
         variant = Variant(text["stem"], text["source"], tuple(text["options"]))
@@ -222,7 +277,9 @@ class _Stage:
                     return {"trouble": "has no kernels when it comes from the driver's cache"}
             if "launch" in message:
                 self._launch(self._kernels[variant.digest], **message["launch"])
-        except (KernelBuildError, cl.MemoryError) as error:
+        except (MemoryError, cl.MemoryError):
+            return {"memory": True}
+        except KernelBuildError as error:
             return {"refused": str(error)[:300]}
         except DriverError:
             return {"trouble": "has no kernels when the driver has built it"}

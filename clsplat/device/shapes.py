@@ -79,6 +79,11 @@ def caches_programs(device: cl.Device) -> bool:
     return _pocl_version(device) is not None
 
 
+def compiles_by_size(device: cl.Device) -> bool:
+    """True for a driver that compiles a kernel anew for a group of another size, and for launches from 65,536 items."""
+    return _pocl_version(device) is not None
+
+
 def wants_cache(device: cl.Device) -> bool:
     """True for a driver that is known to build everything anew in each process, and to load its binaries again:
     Intel's runtime for CPUs. Other drivers have a cache of their own, or have not been tried."""
@@ -115,18 +120,25 @@ def candidates(device: cl.Device) -> list[Shape]:
     return [default, *(shape for shape in others if shape != default)]
 
 
+def asked_shape() -> str:
+    """CLSPLAT_SHAPE, or nothing. Raises DeviceError where that makes no sense."""
+    text = os.environ.get("CLSPLAT_SHAPE", "")
+    if text and _parsed(text, Shape(1, 1, 1)) is None:
+        raise DeviceError(f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16")
+    return text
+
+
 def wanted_shape(device: cl.Device) -> Shape:
     """The shape that CLSPLAT_SHAPE asks for, or that was tuned, or the default. Raises DeviceError for a CLSPLAT_SHAPE
     that makes no sense, or that the device has no room for."""
     default = default_shape(device)
-    text = os.environ.get("CLSPLAT_SHAPE")
+    text = asked_shape()
     if not text:
         text = saved_shapes().get(_key(device), "")
         shape = _parsed(text, default)
         return default if shape is None or shape.items > most_items(device) else shape
     shape = _parsed(text, default)
-    if shape is None:
-        raise DeviceError(f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16")
+    assert shape is not None, "it has been looked at"
     name, most = device.name.strip(), device.max_work_group_size
     if shape.items > most:
         raise DeviceError(f"CLSPLAT_SHAPE={text}: {name} has at most {most} items in a work-group")
@@ -146,16 +158,29 @@ def failures(device: cl.Device) -> dict[str, str]:
 
 
 def shape_of(device: cl.Device) -> Shape:
-    """The shape that a device gets which is opened without another: `wanted_shape`, or, with a warning, the first other
-    one where the driver has failed in that before. Raises DeviceError as `wanted_shape`."""
+    """The shape that a device gets which is opened without another: `wanted_shape`, or the first other one where the
+    driver has failed in that before. Raises DeviceError as `wanted_shape`."""
+    wanted = wanted_shape(device)
+    if wanted.label not in failures(device):
+        return wanted
+    return another_shape(device) or wanted  # with none left it is told when it fails again
+
+
+def why_another(device: cl.Device, shape: Shape) -> str:
+    """The warning that this shape is taken, as the driver has failed in the one that is wanted; or nothing."""
     wanted, failed = wanted_shape(device), failures(device)
-    if wanted.label not in failed:
-        return wanted
-    other = another_shape(device)
-    if other is None:  # it is told when it fails again
-        return wanted
-    known.tell_once(instead(device, wanted, other, failed[wanted.label]))
-    return other
+    if shape == wanted or wanted.label not in failed:
+        return ""
+    return instead(device, wanted, shape, failed[wanted.label])
+
+
+def shape_text(device: cl.Device) -> str:
+    """As devices are listed: the shape, or that the device cannot take what CLSPLAT_SHAPE asks for."""
+    try:
+        shape = shape_of(device)
+    except DeviceError:
+        return f"too small for CLSPLAT_SHAPE={asked_shape()}"
+    return f"{shape.lanes} lanes x {shape.items} items"
 
 
 def shapes_in_turn(device: cl.Device) -> list[Shape]:

@@ -199,6 +199,14 @@ def _gather_on_host(rows: NDArray[np.uint32], source: HostGaussians) -> HostGaus
     return replace(source, count=len(rows), arrays=arrays)
 
 
+def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
+    """Launch what `gather` does, on arrays that are there already and of no use afterwards; for `launch.only_tried`."""
+    if isinstance(source, DeviceGaussians):
+        array, kernel = source["opacity_logits"], device.kernels("density").gather_rows
+        few = min(count, source.count)
+        launch_items(device, kernel, few, few, 1, array, array, array)
+
+
 def gather(device: Device, rows: NDArray[np.uint32], source: AnyGaussians) -> AnyGaussians:
     """New arrays, where the source is, of which row j is row rows[j] of the source, or zeros at NO_ROW. Parameters and
     moments alike."""

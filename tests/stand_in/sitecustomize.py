@@ -3,8 +3,8 @@
 
 CLSPLAT_STAND_IN is HOW FIRST LAST FILE: the texts that are built are numbered from 1, as they are met for the first
 time, in FILE, a line of digest and options each, and those from FIRST to LAST come to a bad end: abort, hang, kill, as
-the system does where memory is short, or empty, a program without kernels. With launch it is kernels by name that are
-numbered, and a launch that aborts.
+the system does where memory is short, memory, as Python says it, or empty, a program without kernels. With launch it is
+kernels by name that are numbered, and a launch that aborts.
 """
 
 from __future__ import annotations
@@ -28,6 +28,22 @@ def _numbered(text: str, name: str, file: Path) -> int:
     return known.index(line) + 1
 
 
+def _die(words):
+    print(f"driver ERROR: {words}", file=sys.stderr, flush=True)
+    os.abort()
+
+
+def _end_badly(how):
+    if how == "abort":
+        _die("cannot select")
+    if how == "hang":
+        time.sleep(600)
+    if how == "kill":
+        os.kill(os.getpid(), 9)
+    if how == "memory":
+        raise MemoryError
+
+
 def _misbehave(cl):
     how, first, last, file = os.environ["CLSPLAT_STAND_IN"].split(" ", 3)
     real_build, real_kernels = cl.Program.build, cl.Program.all_kernels
@@ -35,10 +51,6 @@ def _misbehave(cl):
 
     def is_doomed(text, name):
         return int(first) <= _numbered(text, name, Path(file)) <= int(last)
-
-    def die(words):
-        print(f"driver ERROR: {words}", file=sys.stderr, flush=True)
-        os.abort()
 
     def build(self, options=(), *args, **kwargs):
         if not hasattr(self, "_source"):
@@ -48,12 +60,7 @@ def _misbehave(cl):
             built = real_build(self, options, *args, **kwargs)
             texts[built] = text
             return built
-        if how == "abort":
-            die("cannot select")
-        if how == "hang":
-            time.sleep(600)
-        if how == "kill":
-            os.kill(os.getpid(), 9)
+        _end_badly(how)
         return real_build(cl.Program(self._context, "typedef int nothing;"), ["-cl-std=CL1.2"])
 
     class Launched:
@@ -64,7 +71,7 @@ def _misbehave(cl):
 
         def __call__(self, *arguments):
             if is_doomed(self._text, self._kernel.function_name):
-                die("cannot generate code")
+                _die("cannot generate code")
             return self._kernel(*arguments)
 
         def __getattr__(self, name):

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drivers that misbehave (`stand_in/sitecustomize.py`), and the calls that meet them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from calls import Capture
+from drivers import KEPT
+from tiny import short
+
+from clsplat.cli import main
+from clsplat.config import OptimiserConfig
+from clsplat.device import context, known, rehearsal
+from clsplat.device.child import REGARDLESS
+
+ALWAYS = 10**6
+"""More texts than are ever built."""
+Standing = Callable[..., Path]
+
+
+@pytest.fixture
+def standing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Standing:
+    """A driver that is not known yet. Called with HOW, FIRST and LAST it begins to misbehave."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv(REGARDLESS)
+    monkeypatch.delenv("CLSPLAT_SHAPE", raising=False)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).with_name("stand_in")))
+    numbers = tmp_path / "numbers"
+
+    def misbehave(how: str, first: int, last: int = ALWAYS) -> Path:
+        monkeypatch.setenv("CLSPLAT_STAND_IN", f"{how} {first} {last} {numbers}")
+        forget()
+        return numbers
+
+    yield misbehave
+    forget()
+
+
+def forget() -> None:
+    """Begin as a new process: no kernels are built, and none are tried by one that has the driver of before."""
+    for process in rehearsal._processes.values():
+        process.close()
+    context._open.cache_clear()
+    known.tell_once.cache_clear()
+
+
+VERBS = {
+    "train": "train {scene} -o {new} --iterations 3",
+    "eval": "eval {run}",
+    "render": "render {run} --cameras {scene} -o {new}/####.exr --channels rgb,alpha,depth",
+    "view": "view {run} --port 0",
+    "bench": "bench --gaussians 300 --size 64x48 --repeat 1",
+    "tune": "tune",
+    "selftest": "selftest --device {device}",
+    "convert": "convert {run} {new}.ply --prune-contribution 0.01 --cameras {scene}",
+    "demo": "demo -o {new}",
+}
+
+
+def call(verb: str, scene: Path, run: Path, new: Path) -> int:
+    given = {"scene": scene, "run": run, "new": new, "device": min(KEPT)}
+    return main([word.format(**given) for word in VERBS[verb].split()])
+
+
+def error_of(capsys: Capture) -> str:
+    """The one line of error."""
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    (line,) = [line for line in said.splitlines() if line.startswith("clsplat: error: ")]
+    assert said.splitlines()[-1] == line
+    return line
+
+
+LATE = replace(
+    short(iterations=16, checkpoint_every=5), optimiser=OptimiserConfig(means_rate_steps=400, sh_rest_every=3)
+)
+"""Kernels of it are built and launched for the first time after ten steps and more: rows move, SH is left out."""
+
+
+def number_of(name: str, numbers: Path) -> int:
+    """Of the first text or kernel of this name."""
+    return next(number for number, line in enumerate(numbers.read_text().splitlines(), 1) if name in line)
