@@ -247,7 +247,6 @@ class Trainer:
                 fields=fields,
                 sh_rest=updates_sh_rest(config.optimiser, self.step),
             )
-            self._add_statistics(self.statistics.rows(start, stop), view, camera, projected, screen)
             moved = (parameters, self.gradients, first, second)
             counted = (projected.tile_counts, self.rasterizer.found)
             self._try_second_half(view, camera, projected, screen, moved)
