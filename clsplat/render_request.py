@@ -13,7 +13,7 @@ import clsplat
 from clsplat import render_job
 from clsplat.camera import Camera
 from clsplat.cli import Render
-from clsplat.colour import Colours, recorded_space
+from clsplat.colour import CHROMATICITIES, Colours, recorded_space
 from clsplat.config import RasterizerConfig
 from clsplat.errors import InputError
 from clsplat.files import digest
@@ -89,6 +89,10 @@ def read_job(verb: Render) -> Job:
     gaussians = Gaussians.load(model)
     recorded = recorded_space(model)
     colours = Colours(options.pictures.colour, recorded)
+    extension = Path(verb.output).suffix.lower()
+    colours.check_file(verb.output, extension, VIDEO)
+    if extension == ".exr" and colours.is_linear(colours.output) and colours.output not in CHROMATICITIES:
+        warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
     attributes["clsplat:colorspace"] = colours.output
     options = replace(options, attributes=attributes, recorded=recorded)

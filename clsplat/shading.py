@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.camera import Camera
-from clsplat.colour import INTEROP
+from clsplat.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.config import RasterizerConfig
 from clsplat.errors import DriverError, InputError
 from clsplat.framing import COLOUR, Layers, framed
@@ -108,11 +108,12 @@ def header(task: Task, options: RenderOptions) -> Header:
     camera = picture_camera(task, options)
     matrices = camera_matrices(camera)
     attributes = {**options.attributes, "clsplat:frame": task.number}
+    space = str(attributes.get("clsplat:colorspace", SRGB))
     if task.path.suffix.lower() != ".exr":
-        return Header(attributes, matrices)
-    if name := INTEROP.get(str(attributes.get("clsplat:colorspace"))):
+        return Header(attributes, matrices, is_srgb=space == SRGB)
+    if "clsplat:colorspace" in attributes and (name := INTEROP.get(space)):
         attributes["colorInteropID"] = name
-    return Header(attributes, matrices, camera.window)
+    return Header(attributes, matrices, camera.window, chromaticities=CHROMATICITIES.get(space, ()))
 
 
 class FrameShader:
