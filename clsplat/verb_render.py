@@ -59,7 +59,7 @@ def _run(job: Job) -> int:
     try:
         with (
             FrameProgress(len(tasks), verb.progress, lines=lines) as progress,
-            render_job.open_video(tasks, verb.video) as video,
+            render_job.open_video(tasks, job.video) as video,
         ):
 
             def done(record: Record) -> None:

@@ -250,6 +250,26 @@ def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
         assert index == 5 or errors[0] < errors[1]
 
 
+@pytest.mark.needs("av")
+def test_a_video_has_the_rate_of_its_cameras(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    import av
+
+    document = json.loads(Path(shot[2]).read_text())
+    (tmp_path / "cameras.json").write_text(json.dumps({**document, "fps": 29.97}))
+    own = [*shot[:2], str(tmp_path / "cameras.json")]
+    for name, flags, rate in (("own", "", "30000/1001"), ("asked", "--video.fps 25", "25")):
+        assert render(own, tmp_path, flags, f"{name}.mp4") == 0
+        with av.open(str(tmp_path / f"{name}.mp4")) as container:
+            assert str(container.streams.video[0].average_rate) == rate
+        capsys.readouterr()
+        assert render(own, tmp_path, f"{flags} --dry-run", f"{name}.mp4") == 0
+        assert f"video     {rate} frames a second" in capsys.readouterr().out
+    (tmp_path / "cameras.json").write_text(json.dumps({**document, "fps": 1e9}))
+    assert render(own, tmp_path, "", "fast.mp4") == 2
+    assert "has 1e+09 frames a second, expected 0.01 to 1000; give --video.fps" in error_line(capsys)
+    assert render(own, tmp_path, "--frames 1", "fast.exr") == 0, "which has no rate"
+
+
 def test_strips(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     flags = f"--width {20 * WIDTH} --frames 2 --channels rgb,alpha,depth --max-device-mem"
     plenty, little = (f"{flags} {size}" for size in ("1GiB", "4MiB"))
