@@ -216,7 +216,8 @@ class Render:
     """Bundle of rasterizer settings; the run's own, or the default's, if not given. A --rasterizer flag goes before
     it."""
     skip_existing: Flag = False
-    """Leave out frames whose file is there and can be read to its end, in this size and with these channels."""
+    """Leave out frames whose file is there and can be read to its end, of this size, these channels, this model and,
+    as far as it says so (EXR, PNG), made with these cameras and settings."""
     dry_run: Flag = False
     """Print what would be done, and do nothing: frames, sizes, channels, memory, files."""
     progress: Literal["auto", "json", "openjd", "none"] = "auto"

@@ -221,6 +221,17 @@ def is_whole(
         source.close()
 
 
+def attribute(path: Path, name: str) -> Any:
+    """The value of an attribute of a file's first part, None where it has none or is no picture."""
+    source = oiio.ImageInput.open(native_name(path))
+    if source is None:
+        oiio.geterror()
+        return None
+    value = source.spec().getattribute(name)
+    source.close()
+    return value
+
+
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
     grouped: dict[str, list[str]] = {}
     for name in names:

@@ -11,7 +11,7 @@ from clsplat import render_job
 from clsplat.frames import ranges
 from clsplat.framing import COLOUR, crop, finer, on_tiles, renderer_channels
 from clsplat.picture_config import FPS
-from clsplat.render_request import Job
+from clsplat.render_request import Job, frames_there
 from clsplat.shading import picture_camera
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class DevicePlan:
 def dry_run(job: Job) -> int:
     """Print the plan. Raises DeviceError, and CapacityError where a frame does not fit."""
     verb, tasks, options = job.verb, job.tasks, job.options
-    there = render_job.complete(tasks, options) if verb.skip_existing else set()
+    there = frames_there(job)
     plans = [] if job.on_farm else [plan_of(job, device) for device in job.devices]
     if job.verb.json:
         print(json.dumps(document(job, there, plans), indent=2))

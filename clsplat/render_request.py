@@ -17,6 +17,7 @@ from clsplat.colour import CHROMATICITIES, Colours, recorded_space
 from clsplat.config import RasterizerConfig
 from clsplat.errors import InputError
 from clsplat.files import digest
+from clsplat.frame_settings import digest_of
 from clsplat.framing import finer
 from clsplat.gaussians import Gaussians
 from clsplat.layers import VIDEO, Encoding, check_format, parse_channels
@@ -96,10 +97,24 @@ def read_job(verb: Render) -> Job:
         warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
     attributes["clsplat:colorspace"] = colours.output
-    options = replace(options, attributes=attributes, recorded=recorded)
+    options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(rasterizer))
     spaces = (colours.model, colours.output)
     video = _video(verb, whole)
     return Job(verb, options, rasterizer, model, gaussians, tasks, devices, limit, spaces, video)
+
+
+def frames_there(job: Job) -> set[int]:
+    """The numbers of the frames that `--skip-existing` leaves out, with a warning of those whose files do not say with
+    which settings they were made."""
+    if not job.verb.skip_existing:
+        return set()
+    there = render_job.complete(job.tasks, job.options)
+    if unknown := render_job.untold([task for task in job.tasks if task.number in there]):
+        warn(
+            f"--skip-existing: {len(unknown)} of the frames that are there do not say how they were made, such as "
+            f"{unknown[0]}: they are kept, whatever their cameras, precision and other settings are"
+        )
+    return there
 
 
 def _video(verb: Render, shot: Shot) -> VideoConfig:

@@ -223,6 +223,53 @@ def test_another_colour_space_is_not_what_is_wanted(shot: list[str], tmp_path: P
     assert spec.getattribute("clsplat:colorspace") == "ACEScg"
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        *("--exr half", "--parts several", "--compression none", "--background white", "--shutter-angle 90", "moved"),
+        *("--aperture 0.1 --focus 4", "--supersample 2", "--model-colorspace ACEScg --colorspace sRGB"),
+        *("--rasterizer.sh-degree-limit 0", "nothing", "--quality 50", "--samples 3"),
+    ],
+)
+def test_a_frame_of_other_settings_is_not_what_is_wanted(
+    change: str, shot: list[str], tmp_path: Path, capsys: Capture
+) -> None:
+    """Of a still camera: only the last three change no frame."""
+    key = {"frame": 1, "position": [0, 0, -4], "world_from_cam": [1, 0, 0, 0], "fov_x": 60}
+    other = {**key, "position": [1e-3, 0, -4]} if change == "moved" else key
+    kept = change in ("nothing", "--quality 50", "--samples 3")
+    names = []
+    for index, keys in enumerate(([key], [other])):
+        document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
+        names.append(tmp_path / f"{index}.json")
+        names[-1].write_text(json.dumps(document))
+    first, second = ([*shot[:2], str(name)] for name in names)
+    flags = "--channels rgb,depth" if change == "--parts several" else ""
+    assert render(first, tmp_path, flags) == 0
+    before = (tmp_path / "a.0001.exr").stat().st_mtime_ns
+    more = f"{flags} {'' if change in ('moved', 'nothing') else change} --skip-existing"
+    assert render(second, tmp_path, more) == 0
+    assert ((tmp_path / "a.0001.exr").stat().st_mtime_ns == before) == kept
+    written = (tmp_path / "a.0001.exr").stat().st_mtime_ns
+    assert render(second, tmp_path, more) == 0
+    assert (tmp_path / "a.0001.exr").stat().st_mtime_ns == written
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_frames_that_do_not_say_how_they_were_made(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    assert render(shot, tmp_path, "", "a.####.jpg") == 0
+    assert capsys.readouterr().err == ""
+    for more in ("", "--dry-run"):
+        assert render(shot, tmp_path, f"--skip-existing --quality 5 {more}", "a.####.jpg") == 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("clsplat: warning: --skip-existing: 4 of the frames that are there do not say how")
+        assert "a.0001.jpg: they are kept, whatever their cameras, precision and other settings are" in line
+    assert render(shot, tmp_path, "", "a.####.png") == 0
+    assert "clsplat:settings" in " ".join(png_chunks(tmp_path / "a.0001.png"))
+    assert render(shot, tmp_path, "--skip-existing --bits 16", "a.####.png") == 0
+    assert png_chunks(tmp_path / "a.0001.png")["IHDR"][8] == 16, "bits"
+
+
 @pytest.mark.needs("av")
 def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     import av
