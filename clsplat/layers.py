@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera, Window
-from clsplat.config import Compression, ExrDepth, Parts
+from clsplat.config import EXR_DEPTH, Compression, ExrDepth, Parts
 from clsplat.errors import InputError
 from clsplat.files import native_name
 from clsplat.images import image_size, steps_of, unassociate, write_spec
@@ -68,7 +68,7 @@ DEEP = ("R", "G", "B", "A", "Z", "ZBack")
 class Encoding:
     """How pictures are encoded. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
 
-    depth: ExrDepth = "half"
+    depth: ExrDepth = EXR_DEPTH
     parts: Parts = "one"
     compression: Compression = "zip"
     bits: int = 8

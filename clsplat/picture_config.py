@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of pictures (docs/pictures.md): with `config`, every default there is. Nothing slow is imported here, as the
+"""Settings of pictures (docs/pictures.md), each default once, as in `config`. Nothing slow is imported here, as the
 command line is made from them."""
 
 from __future__ import annotations

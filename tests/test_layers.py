@@ -94,7 +94,7 @@ def test_exr(parts: Any, depth: Any, tmp_path: Path) -> None:
 
 
 def test_parts_have_names_and_formats(tmp_path: Path) -> None:
-    write_layers(tmp_path / "a.exr", everything(), Encoding(parts="several"))
+    write_layers(tmp_path / "a.exr", everything(), Encoding("half", parts="several"))
     _, specs = read(tmp_path / "a.exr")
     names = [spec.get_string_attribute("oiio:subimagename") for spec in specs]
     assert names == ["rgba", "depth", "median", "first", "N", "P", "forward", "count", "id"]
@@ -163,7 +163,7 @@ def test_a_window(tmp_path: Path) -> None:
 
 def test_what_a_half_cannot_hold_is_its_largest(tmp_path: Path) -> None:
     layers = {"rgb": np.full((4, 4, 3), 1e9, np.float32), "depth": np.full((4, 4), 1e9, np.float32)}
-    write_layers(tmp_path / "a.exr", layers)
+    write_layers(tmp_path / "a.exr", layers, Encoding("half"))
     found, _ = read(tmp_path / "a.exr")
     assert (found["R"] == 65504).all()
     assert (found["Z"] == 1e9).all()

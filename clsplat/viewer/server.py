@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.config import HOST, PORT
 from clsplat.errors import InputError, plain
 from clsplat.viewer.session import Start, read_pose
 from clsplat.viewer.viewing import Viewing
@@ -56,8 +57,8 @@ class World:
 class Address:
     """Where the server listens, and the folder for paths that are saved, None for none."""
 
-    host: str = "127.0.0.1"
-    port: int = 8080
+    host: str = HOST
+    port: int = PORT
     paths: Path | None = None
 
     def check(self) -> None:
