@@ -24,6 +24,9 @@ from tyro.conf import Positional, arg, subcommand
 from clsplat.cli_models import Compare, Convert, Device, Flag, Folder, Host, Info, Memory, Report, View
 from clsplat.config import (
     DEMO_ITERATIONS,
+    EXR_DEPTH,
+    HOST,
+    PORT,
     PRESETS,
     Compression,
     ExrDepth,
@@ -113,9 +116,9 @@ class Train:
     If not given: all that the device has."""
     view: Flag = False
     """Show the model as it grows on a page in the browser, where training can be paused too (see clsplat view)."""
-    host: Host = "127.0.0.1"
+    host: Host = HOST
     """Address that the page is served at: this machine alone, unless another is given."""
-    port: int = 8080
+    port: int = PORT
     """Port of the page; 0 is any that is free."""
     paths: Folder = None
     """Folder in which the page may save camera paths; they can be downloaded without it."""
@@ -188,7 +191,7 @@ class Render:
     alpha: Flag = False
     """Write alpha too, as --channels rgb,alpha does, and no background: premultiplied in EXR and TIFF, straight in
     PNG."""
-    exr: ExrDepth = "float"
+    exr: ExrDepth = EXR_DEPTH
     """Floats of 16 or 32 bits in EXR, for colour, alpha and normals; depths, positions and motion are always of 32."""
     parts: Parts = "one"
     """EXR files of one part, or of one for colour with alpha and one for each other channel."""
@@ -216,7 +219,8 @@ class Render:
     """Bundle of rasterizer settings; the run's own, or the default's, if not given. A --rasterizer flag goes before
     it."""
     skip_existing: Flag = False
-    """Leave out frames whose file is there and can be read to its end, in this size and with these channels."""
+    """Leave out frames whose file is there and can be read to its end, of this size, these channels, this model and,
+    as far as it says so (EXR, PNG), made with these cameras and settings."""
     dry_run: Flag = False
     """Print what would be done, and do nothing: frames, sizes, channels, memory, files."""
     progress: Literal["auto", "json", "openjd", "none"] = "auto"

@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from clsplat.config import HOST, PORT, TEST_EVERY
+
 Flag = Annotated[bool, FlagCreatePairsOff]
 Device = Annotated[str | None, arg(metavar="DEVICE")]
 Memory = Annotated[str | None, arg(metavar="SIZE")]
@@ -29,9 +31,9 @@ class View:
     """Folder with the scene, for its cameras and photos; the one the run was trained on if not given."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians; as the run has it, or black."""
-    host: Host = "127.0.0.1"
+    host: Host = HOST
     """Address that the page is served at: this machine alone, unless another is given."""
-    port: int = 8080
+    port: int = PORT
     """Port of the page; 0 is any that is free."""
     paths: Folder = None
     """Folder in which the page may save camera paths; they can be downloaded without it."""
@@ -105,7 +107,7 @@ class Convert:
     """Leave out SH beyond this degree, 0 to 3."""
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None
     """Measure PSNR on this scene's held-out views before and after, and of the two renders against each other."""
-    test_every: int = 8
+    test_every: int = TEST_EVERY
     """Every n-th view of --scene by name is held out; 0: all its views are measured."""
     resolution: int = 0
     """Longest image side for --scene; 0: the images' size up to 1600."""

@@ -43,6 +43,18 @@ INTEROP = {
 }
 """What EXR's attribute colorInteropID calls spaces (Color Interop Forum, "Color Space Encodings for Texture Assets",
 https://github.com/AcademySoftwareFoundation/ColorInterop)."""
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
+_ACES_WHITE, _D65 = (0.32168, 0.33767), (0.3127, 0.3290)
+CHROMATICITIES: dict[str, tuple[float, ...]] = {
+    LINEAR: (*_REC709, *_D65),
+    "ACEScg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, *_ACES_WHITE),
+    "ACES2065-1": (0.73470, 0.26530, 0.0, 1.0, 0.00010, -0.0770, *_ACES_WHITE),
+    "Linear P3-D65": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65),
+    "Linear Rec.2020": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65),
+    "Linear AdobeRGB": (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65),
+}
+"""x and y of red, green, blue and white, of linear spaces, for EXR files: AP1 and AP0 by SMPTE ST 2065-1 and
+the Academy's S-2014-004, the others by their own standards."""
 _LINEAR_PHOTOS = (".exr", ".hdr")
 
 
@@ -101,6 +113,28 @@ class Colours:
         spaces = {self.model, self.light, self.output}
         if LINEAR in spaces and spaces - _NAMES.keys():
             self._ocio_name(LINEAR)
+
+    def is_linear(self, space: str) -> bool:
+        """Whether one of the job's spaces has no curve."""
+        return space == LINEAR or (space != SRGB and bool(self._config.isColorSpaceLinear(space)))
+
+    def has_rec709(self, space: str) -> bool:
+        """Whether one of the job's spaces has Rec.709's primaries and white, whatever its curve is."""
+        if space in _NAMES:
+            return True
+        light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]], np.float32)
+        found = self.convert(light, None, LINEAR, space)[0]
+        one, rest = found[:3][np.eye(3, dtype=bool)], found[:3][~np.eye(3, dtype=bool)]
+        return bool(np.allclose(rest, 0, atol=2e-3) and np.allclose([*one, *found[3]], found[3, 0], atol=2e-3))
+
+    def check_file(self, path: str, extension: str, video: str) -> None:
+        """Raise InputError where a file of that extension would be shown in other colours than it holds: whole numbers
+        of light in linear values, and a video, whose extension is `video`, that is not in Rec.709."""
+        advice = "write .exr, or give --colorspace sRGB"
+        if extension != ".exr" and self.is_linear(self.output):
+            raise InputError(f"{path}: its colours would be {self.output}, which is linear, expected sRGB; {advice}")
+        if extension == video and not self.has_rec709(self.output):
+            raise InputError(f"{path}: its colours would be {self.output}, expected sRGB's primaries; {advice}")
 
     @property
     def _config(self) -> Any:

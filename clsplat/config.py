@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every default lives here, once: these dataclasses are the command line, the `config.toml` and the help.
+"""Settings of the rasterizer and of training, each default once: these dataclasses are the command line, the
+`config.toml` and the help. What several verbs, or a verb and the package, have beside them has its default here too.
 
 The training defaults are those of the paper's authors' 2024 code, with the paper's resolution warm-up.
 """
@@ -19,6 +20,10 @@ Schedule = Literal["paper", "short"]
 Growth = Literal["paper", "budget"]
 Parts = Literal["one", "several"]
 ExrDepth = Literal["half", "float"]
+EXR_DEPTH: ExrDepth = "float"
+TEST_EVERY = 8
+HOST, PORT = "127.0.0.1", 8080
+"""Where the viewer listens."""
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
 
 _Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
@@ -280,7 +285,7 @@ class TrainConfig:
     place of --warmup; 0 goes by --warmup."""
     resolution: int = 0
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
-    test_every: int = 8
+    test_every: int = TEST_EVERY
     """Every n-th view by name is held out, the first too; 0 holds out none. A data set's own split goes first."""
     random_points: int = 100_000
     """Initial Gaussians where a scene has no points."""

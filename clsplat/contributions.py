@@ -34,7 +34,9 @@ def largest_contributions(
     config = config or RasterizerConfig()
     for camera in cameras:
         if camera.projection not in ("perspective", "orthographic"):
-            raise InputError(f"contributions to {camera.projection} cameras are not known, expected perspective ones")
+            raise InputError(
+                f"contributions to {camera.projection} cameras are not known, expected perspective or orthographic ones"
+            )
     alpha_alone = drop_sh(gaussians, 0)  # colour does not matter
     plan = plan_step(device, len(gaussians), 1, cameras, config, fields=FIELDS, agreement=False)
     rasterizer = Rasterizer(device, config)
@@ -48,7 +50,7 @@ def largest_contributions(
         frame = rasterizer.forward(model, camera, background)
         image_gradient = rasterizer.work.array("image_gradient", frame.blended.image.shape)
         image_gradient.fill(0.0)
-        slots = rasterizer.pair_gradients(frame, image_gradient, fields=FIELDS)
+        slots = rasterizer.pair_gradients(frame, image_gradient, fields=FIELDS, contributions_alone=True)
         for start, stop, (part,) in parts(rasterizer.work, model):
             projected = frame.projected.rows(start, stop)
             of = (frame, projected, slots.rows(start, stop), gradients)

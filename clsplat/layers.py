@@ -3,7 +3,7 @@
 
 EXR names follow the OpenEXR documentation ("Technical introduction", layers): R G B A Z, N.x N.y N.z, P.x P.y P.z,
 forward.u forward.v. Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
-vectors, p_camera = p_world M, with the camera looking along -z, x right, y up.
+vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standard attributes (ImfStandardAttributes.h).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera, Window
-from clsplat.config import Compression, ExrDepth, Parts
+from clsplat.config import EXR_DEPTH, Compression, ExrDepth, Parts
 from clsplat.errors import InputError
 from clsplat.files import native_name
 from clsplat.images import image_size, steps_of, unassociate, write_spec
@@ -50,8 +50,6 @@ LAYERS: dict[str, Layer] = {
 }
 """Every channel that `--channels` takes, in the order of a file."""
 
-_MATRICES = {"worldToCamera": "worldtocamera", "worldToNDC": "worldtoscreen"}
-"""OpenImageIO's names of them."""
 HALF_MAX = np.float32(65504)
 _PNG_LEVEL, _PNG_FILTER = 1, 0x40
 """Each pixel from the mean of the two beside it, rather than the best of five filters for each row. A fifth of the time
@@ -70,7 +68,7 @@ DEEP = ("R", "G", "B", "A", "Z", "ZBack")
 class Encoding:
     """How pictures are encoded. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
 
-    depth: ExrDepth = "half"
+    depth: ExrDepth = EXR_DEPTH
     parts: Parts = "one"
     compression: Compression = "zip"
     bits: int = 8
@@ -79,12 +77,15 @@ class Encoding:
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """What goes into the file beside pixels; window: None where the picture is the display window."""
+    """What goes into the file beside pixels; window: None where the picture is the display window; chromaticities: x
+    and y of red, green, blue and white, none where they are not known; is_srgb: whether the colours are sRGB's."""
 
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
     matrices: Mapping[str, Float64] = field(default_factory=dict)
     window: Window | None = None
     pixel_aspect: float = 1.0
+    chromaticities: Sequence[float] = ()
+    is_srgb: bool = True
 
 
 def parse_channels(text: str) -> tuple[str, ...]:
@@ -113,29 +114,31 @@ def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> 
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
-    """worldToCamera and worldToNDC of row vectors, for a camera that has an image plane; none for others.
+    """worldToCamera and worldToNDC of row vectors, as OpenEXR defines them, for a camera that has an image plane; none
+    for others.
 
-    The camera looks along -z, y is up. NDC: x and y from -1 to 1 over the display window; z from -1 at the near plane
-    to 1 at infinity, or of an orthographic camera at its far plane; if that has none, 1 more a world unit.
+    In the camera's space x is right, y up and z along the view, a left-handed frame. NDC: (0, 0) is the upper left
+    corner of the display window, (1, 1) the lower right one; z, of which OpenEXR says nothing, is 0 at the near plane
+    and 1 at infinity, or of an orthographic camera at its far plane; if that has none, 1 more a world unit.
     """
     if camera.projection not in ("perspective", "orthographic"):
         return {}
     to_camera = np.eye(4)
-    flip = np.diag([1.0, -1.0, -1.0])
+    flip = np.diag([1.0, -1.0, 1.0])
     to_camera[:3, :3] = (flip @ camera.rotation).T
     to_camera[3, :3] = flip @ camera.translation
     display = camera.window or camera
-    centre = np.array([2 * camera.cx / display.width - 1, 1 - 2 * camera.cy / display.height])
+    centre = camera.cx / display.width, camera.cy / display.height
     projection = np.zeros((4, 4))
-    projection[0, 0] = 2 * camera.fx / display.width
-    projection[1, 1] = 2 * camera.fy / display.height
-    if camera.projection == "perspective":  # w = -z
-        projection[2] = [*-centre, -1.0, -1.0]
-        projection[3, 2] = -2 * camera.near
+    projection[0, 0] = camera.fx / display.width
+    projection[1, 1] = -camera.fy / display.height
+    if camera.projection == "perspective":  # w = z
+        projection[2] = [*centre, 1.0, 1.0]
+        projection[3, 2] = -camera.near
     else:
-        along = 2 / (camera.far - camera.near) if np.isfinite(camera.far) else 1.0
-        projection[2, 2] = -along
-        projection[3] = [*centre, -1.0 - along * camera.near, 1.0]
+        along = 1 / (camera.far - camera.near) if np.isfinite(camera.far) else 1.0
+        projection[2, 2] = along
+        projection[3] = [*centre, -along * camera.near, 1.0]
     return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
 
 
@@ -218,6 +221,17 @@ def is_whole(
         source.close()
 
 
+def attribute(path: Path, name: str) -> Any:
+    """The value of an attribute of a file's first part, None where it has none or is no picture."""
+    source = oiio.ImageInput.open(native_name(path))
+    if source is None:
+        oiio.geterror()
+        return None
+    value = source.spec().getattribute(name)
+    source.close()
+    return value
+
+
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
     grouped: dict[str, list[str]] = {}
     for name in names:
@@ -278,6 +292,8 @@ def _picture(
     spec = _spec(whole, oiio.UINT8 if bits == 8 else oiio.UINT16, header)
     spec.channelnames = ("R", "G", "B", "A")[: whole.shape[2]]
     if extension == ".png":
+        if not header.is_srgb:  # else OpenImageIO says so in the chunks sRGB, gAMA and cHRM
+            spec.attribute("oiio:ColorSpace", "unknown")
         spec.attribute("oiio:UnassociatedAlpha", 1)
         spec.attribute("png:compressionLevel", _PNG_LEVEL)
         spec.attribute("png:filter", _PNG_FILTER)
@@ -308,7 +324,7 @@ def deep_spec(width: int, height: int, header: Header) -> Any:
 
 def _add_matrices(spec: Any, header: Header) -> None:
     for name, matrix in header.matrices.items():
-        spec.attribute(_MATRICES.get(name, name), oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
+        spec.attribute(name, oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
 
 
 def _add_header(spec: Any, header: Header) -> None:
@@ -318,6 +334,8 @@ def _add_header(spec: Any, header: Header) -> None:
         spec.full_width, spec.full_height = header.window.width, header.window.height
     if header.pixel_aspect != 1.0:
         spec.attribute("PixelAspectRatio", float(header.pixel_aspect))
+    if header.chromaticities:
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(header.chromaticities))
     spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes
     for name, value in header.attributes.items():
         spec.attribute(name, value)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of pictures (docs/pictures.md): with `config`, every default there is. Nothing slow is imported here, as the
+"""Settings of pictures (docs/pictures.md), each default once, as in `config`. Nothing slow is imported here, as the
 command line is made from them."""
 
 from __future__ import annotations
@@ -206,12 +206,17 @@ class DeepConfig:
             raise InputError(f"--deep.far {self.far}: expected more than --deep.near {self.near}")
 
 
+FPS = 24.0
+"""Frames a second of a video where neither a flag nor the cameras' file says another rate."""
+
+
 @dataclass(frozen=True)
 class VideoConfig:
     """How a video is encoded."""
 
-    fps: float = 24.0
-    """Frames a second."""
+    fps: float | None = None
+    """Frames a second; if not given the rate of the cameras' file, or 24 where that has none. 23.976, 29.97 and
+    their like are 24000/1001, 30000/1001 and so on."""
     crf: int = 18
     """Quality: 0 is the best, 51 the worst, 18 about the least that shows no loss."""
     preset: str = "medium"
@@ -219,7 +224,7 @@ class VideoConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        if not 0.01 <= self.fps <= 1000:
+        if self.fps is not None and not 0.01 <= self.fps <= 1000:
             raise InputError(f"--video.fps {self.fps}: expected 0.01 to 1000 frames a second")
         if not 0 <= self.crf <= 51:
             raise InputError(f"--video.crf {self.crf}: expected 0 to 51")

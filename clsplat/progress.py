@@ -101,15 +101,22 @@ class TrainProgress:
 
 
 class StageProgress:
-    """For work in named stages: call it with the stage and the fraction done, or None where that is unknown."""
+    """For work in named stages: call it with the stage and the fraction done, or None where that is unknown.
 
-    def __init__(self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+    after: seconds in which nothing is said, for work that is mostly quick."""
+
+    def __init__(
+        self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic, after: float = 0.0
+    ) -> None:
         self.stream = stream if stream is not None else sys.stderr
         self.clock = clock
         self.stage, self.printed_at = "", clock()
+        self.silent_until = self.printed_at + after
 
     def __call__(self, stage: str, fraction: float | None = None) -> None:
         now = self.clock()
+        if now < self.silent_until:
+            return
         if stage != self.stage or now - self.printed_at >= PLAIN_INTERVAL or fraction == 1.0:
             text = stage if fraction is None else f"{stage} {100 * fraction:.0f} %"
             print(text, file=self.stream, flush=True)

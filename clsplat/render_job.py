@@ -27,10 +27,11 @@ from clsplat.camera import Camera
 from clsplat.device.child import abandon
 from clsplat.errors import InputError
 from clsplat.files import abandoned
+from clsplat.frame_settings import SETTINGS
 from clsplat.frames import output_paths
 from clsplat.paths import Shot
 from clsplat.picture_config import DEEP_STRIP_FLOATS, STRIP_PIXELS, SamplingConfig, VideoConfig
-from clsplat.shading import RenderOptions, Shaded, Shader, Task, header, picture_camera
+from clsplat.shading import RenderOptions, Shaded, Shader, Task, header, picture_camera, settings_digest
 from clsplat.shutter import camera_after, stretches
 
 if TYPE_CHECKING:
@@ -130,8 +131,9 @@ def remove_temporaries(tasks: Sequence[Task]) -> None:
 
 
 def is_complete(task: Task, options: RenderOptions) -> bool:
-    """Whether the frame's file is there: of its size, channels and model, and readable to its end."""
+    """Whether the frame's file is there: of its size, channels, model and settings, and readable to its end."""
     told = {name: value for name, value in options.attributes.items() if name in WHAT_IT_IS}
+    told[SETTINGS] = settings_digest(task, options)
     camera, deep = picture_camera(task, options), options.deep is not None
     return layers.is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, told, deep=deep)
 
@@ -144,6 +146,13 @@ def complete(tasks: Sequence[Task], options: RenderOptions) -> set[int]:
             for task, whole in zip(tasks, pool.map(lambda task: is_complete(task, options), tasks), strict=True)
             if whole
         }
+
+
+def untold(tasks: Sequence[Task]) -> list[Path]:
+    """Those of the tasks' files that do not say with which settings they were made."""
+    with ThreadPoolExecutor(MOST_WRITERS) as pool:
+        said = pool.map(lambda task: layers.attribute(task.path, SETTINGS), tasks)
+        return [task.path for task, value in zip(tasks, said, strict=True) if value is None]
 
 
 def stamp(path: Path) -> tuple[int, ...] | None:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from clsplat import render_job
 from clsplat.frames import ranges
 from clsplat.framing import COLOUR, crop, finer, on_tiles, renderer_channels
-from clsplat.render_request import Job
+from clsplat.picture_config import FPS
+from clsplat.render_request import Job, frames_there
 from clsplat.shading import picture_camera
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ class DevicePlan:
 def dry_run(job: Job) -> int:
     """Print the plan. Raises DeviceError, and CapacityError where a frame does not fit."""
     verb, tasks, options = job.verb, job.tasks, job.options
-    there = render_job.complete(tasks, options) if verb.skip_existing else set()
+    there = frames_there(job)
     plans = [] if job.on_farm else [plan_of(job, device) for device in job.devices]
     if job.verb.json:
         print(json.dumps(document(job, there, plans), indent=2))
@@ -41,6 +42,10 @@ def dry_run(job: Job) -> int:
     cameras = [picture_camera(task, options) for task in tasks]
     print(f"frames    {len(tasks)}: {ranges([task.number for task in tasks])}; {', '.join(_sizes(cameras))}")
     print(f"files     {tasks[0].path}" + (f" to {tasks[-1].path}" if tasks[-1].path != tasks[0].path else ""))
+    if job.is_video:
+        from clsplat.video import rate_of
+
+        print(f"video     {rate_of(job.video.fps or FPS)} frames a second")
     deep = f" in {options.deep.bins} slices by depth" if options.deep else ""
     print(f"channels  {', '.join(options.channels)}{deep}")
     model, output = job.spaces
@@ -80,6 +85,7 @@ def document(job: Job, there: set[int], plans: list[DevicePlan]) -> dict[str, An
         "colorspace": output,
         "samples": options.pictures.sampling.samples if options.pictures.sampling.on else 1,
         "supersample": options.pictures.framing.supersample,
+        **({"fps": job.video.fps or FPS} if job.is_video else {}),
         "frames": frames,
         "devices": [
             {

@@ -13,15 +13,16 @@ import clsplat
 from clsplat import render_job
 from clsplat.camera import Camera
 from clsplat.cli import Render
-from clsplat.colour import Colours, recorded_space
+from clsplat.colour import CHROMATICITIES, Colours, recorded_space
 from clsplat.config import RasterizerConfig
 from clsplat.errors import InputError
 from clsplat.files import digest
+from clsplat.frame_settings import digest_of
 from clsplat.framing import finer
 from clsplat.gaussians import Gaussians
 from clsplat.layers import VIDEO, Encoding, check_format, parse_channels
 from clsplat.memory import parse_bytes
-from clsplat.paths import choose_shot
+from clsplat.paths import Shot, choose_shot
 from clsplat.picture_config import ColourConfig, DeepConfig, PictureConfig, VideoConfig
 from clsplat.runs import model_file
 from clsplat.shading import RenderOptions, Task, picture_camera
@@ -32,7 +33,7 @@ Colour = tuple[float, float, float]
 @dataclass(frozen=True)
 class Job:
     """What a call means. devices: selectors, None for the usual one; spaces: the model's colour space and that of the
-    pictures."""
+    pictures; video: how it is encoded, with its rate."""
 
     verb: Render
     options: RenderOptions
@@ -43,6 +44,7 @@ class Job:
     devices: tuple[str | None, ...]
     memory_limit: int | None
     spaces: tuple[str, str]
+    video: VideoConfig
 
     @property
     def digest(self) -> str:
@@ -89,10 +91,43 @@ def read_job(verb: Render) -> Job:
     gaussians = Gaussians.load(model)
     recorded = recorded_space(model)
     colours = Colours(options.pictures.colour, recorded)
+    extension = Path(verb.output).suffix.lower()
+    colours.check_file(verb.output, extension, VIDEO)
+    if extension == ".exr" and colours.is_linear(colours.output) and colours.output not in CHROMATICITIES:
+        warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
     attributes["clsplat:colorspace"] = colours.output
-    options = replace(options, attributes=attributes, recorded=recorded)
-    return Job(verb, options, rasterizer, model, gaussians, tasks, devices, limit, (colours.model, colours.output))
+    options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(rasterizer))
+    spaces = (colours.model, colours.output)
+    video = _video(verb, whole)
+    return Job(verb, options, rasterizer, model, gaussians, tasks, devices, limit, spaces, video)
+
+
+def frames_there(job: Job) -> set[int]:
+    """The numbers of the frames that `--skip-existing` leaves out, with a warning of those whose files do not say with
+    which settings they were made."""
+    if not job.verb.skip_existing:
+        return set()
+    there = render_job.complete(job.tasks, job.options)
+    if unknown := render_job.untold([task for task in job.tasks if task.number in there]):
+        warn(
+            f"--skip-existing: {len(unknown)} of the frames that are there do not say how they were made, such as "
+            f"{unknown[0]}: they are kept, whatever their cameras, precision and other settings are"
+        )
+    return there
+
+
+def _video(verb: Render, shot: Shot) -> VideoConfig:
+    """The video's settings, with the rate of the shot where no other is asked for. Raises InputError."""
+    video = verb.video if verb.video.fps is not None or shot.fps is None else replace(verb.video, fps=shot.fps)
+    if Path(verb.output).suffix.lower() == VIDEO and video is not verb.video:
+        try:
+            video.check()
+        except InputError:
+            raise InputError(
+                f"{verb.cameras}: has {shot.fps:g} frames a second, expected 0.01 to 1000; give --video.fps"
+            ) from None
+    return video
 
 
 def _options(verb: Render) -> RenderOptions:
@@ -218,21 +253,20 @@ def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Ca
             across = round(camera.width * (down / camera.height if down else scale))
         if down is None:
             down = round(camera.height * (across / camera.width if width else scale))
-        if (across, down) == (camera.width, camera.height):
-            return camera
-        if width and height and camera.projection != "equirectangular":
-            return reshaped(camera, width, height)
-        return camera.resized(max(1, across), max(1, down))
+        return reshaped(camera, max(1, across), max(1, down))
 
     return resize
 
 
 def reshaped(camera: Camera, width: int, height: int) -> Camera:
-    """The camera in another size. Where that has another shape, the vertical angle of view stays and so do the pixels'
-    proportions: the picture shows more or less to the left and right."""
-    scale = height / camera.height
-    if abs(width - camera.width * scale) <= 1:  # but for rounding the same shape
+    """The camera in another size. Where that has another shape, if by rounding alone, the vertical angle of view stays
+    and so do the pixels' proportions: the picture shows more or less to the left and right. So all sizes of one shape
+    show the same. A panorama shows all around in any shape."""
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    if width * camera.height == height * camera.width or camera.projection == "equirectangular":
         return camera.resized(width, height)
+    scale = height / camera.height
     middle = 0.5 * width + (camera.cx - 0.5 * camera.width) * scale
     fx, fy, cy = camera.fx * scale, camera.fy * scale, camera.cy * scale
     return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=middle, cy=cy)

@@ -258,10 +258,19 @@ class Rasterizer:
         project_grad(device, *of, fields=fields, sh_rest=sh_rest)
         return screen
 
-    def pair_gradients(self, frame: Frame, image_gradient: DeviceArray, *, fields: SlotFields = PLAIN_SLOTS) -> Slots:
+    def pair_gradients(
+        self,
+        frame: Frame,
+        image_gradient: DeviceArray,
+        *,
+        fields: SlotFields = PLAIN_SLOTS,
+        contributions_alone: bool = False,
+    ) -> Slots:
         """The gradient of blending: of every pair, or with several bands their sums by Gaussian. Raises InputError for
-        another projection than perspective, which has none."""
-        if (kind := frame.camera.projection) != "perspective":
+        another projection than perspective, which has none; contributions_alone: nothing but them is taken from it, and
+        an orthographic camera's splats have them too."""
+        known = ("perspective", "orthographic") if contributions_alone else ("perspective",)
+        if (kind := frame.camera.projection) not in known:
             raise InputError(f"a gradient is asked for of a camera that is {kind}, expected a perspective one")
         device, work, projected = self.device, self.work, frame.projected
         sums = None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from clsplat import colmap, transforms
 from clsplat.camera import Camera
+from clsplat.config import TEST_EVERY
 from clsplat.errors import InputError, plain
 from clsplat.images import downscale, find_images, image_size, name_all, read_image, require_images
 from clsplat.transforms import Frame
@@ -184,7 +185,7 @@ def load_scene(
     path: str | Path,
     *,
     resolution: int = 0,
-    test_every: int = 8,
+    test_every: int = TEST_EVERY,
     images: str | Path | None = None,
     work_dir: Path | None = None,
     progress: Progress | None = None,

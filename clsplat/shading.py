@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsplat.camera import Camera
-from clsplat.colour import INTEROP
+from clsplat.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.config import RasterizerConfig
 from clsplat.errors import DriverError, InputError
+from clsplat.frame_settings import SETTINGS, digest_of, encoding_of
 from clsplat.framing import COLOUR, Layers, framed
 from clsplat.layers import VIDEO, Encoding, Header, camera_matrices
 from clsplat.picture_config import DeepConfig, PictureConfig
@@ -56,7 +57,8 @@ class Task:
 @dataclass(frozen=True)
 class RenderOptions:
     """What every frame of a job has in common. channels: of `layers.LAYERS`; attributes: of the file's header;
-    pictures: what is made of a frame; recorded: the model's colour space; deep: slices of a deep picture, or None."""
+    pictures: what is made of a frame; recorded: the model's colour space; deep: slices of a deep picture, or None;
+    drawn: digest of the rasterizer's settings."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -65,6 +67,7 @@ class RenderOptions:
     pictures: PictureConfig = field(default_factory=PictureConfig)
     recorded: str = "sRGB"
     deep: DeepConfig | None = None
+    drawn: str = ""
 
 
 def as_it_is(layers: Layers) -> Layers:
@@ -103,16 +106,33 @@ def camera_after(task: Task, options: RenderOptions) -> Camera | None:
     return task.after if middle == 0 or task.after is None else task.at(middle + 1)
 
 
+def settings_digest(task: Task, options: RenderOptions) -> str:
+    """Of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer."""
+    extension, pictures = task.path.suffix.lower(), options.pictures
+    cameras = [picture_camera(task, options)]
+    if "motion" in options.channels and (after := camera_after(task, options)) is not None:
+        cameras.append(after)
+    if pictures.sampling.moves:
+        opens, closes = pictures.sampling.shutter
+        cameras += [task.at(opens + (closes - opens) * part / 4) for part in range(5)]
+    sampling = pictures.sampling if pictures.sampling.on else None
+    made = (options.channels, options.background, options.recorded, options.deep, options.drawn)
+    return digest_of(
+        cameras, made, encoding_of(options.encoding, extension), pictures.colour, pictures.framing, sampling
+    )
+
+
 def header(task: Task, options: RenderOptions) -> Header:
-    """Frame, model, version and colour space; the matrices of a camera that has them; in EXR the window."""
+    """Frame, model, version, settings and colour space; the matrices of a camera that has them; in EXR the window."""
     camera = picture_camera(task, options)
     matrices = camera_matrices(camera)
-    attributes = {**options.attributes, "clsplat:frame": task.number}
+    attributes = {**options.attributes, "clsplat:frame": task.number, SETTINGS: settings_digest(task, options)}
+    space = str(attributes.get("clsplat:colorspace", SRGB))
     if task.path.suffix.lower() != ".exr":
-        return Header(attributes, matrices)
-    if name := INTEROP.get(str(attributes.get("clsplat:colorspace"))):
+        return Header(attributes, matrices, is_srgb=space == SRGB)
+    if "clsplat:colorspace" in attributes and (name := INTEROP.get(space)):
         attributes["colorInteropID"] = name
-    return Header(attributes, matrices, camera.window)
+    return Header(attributes, matrices, camera.window, chromaticities=CHROMATICITIES.get(space, ()))
 
 
 class FrameShader:

@@ -20,12 +20,15 @@ from clsplat.formats import format_of, format_of_name, load, model_path, save
 from clsplat.gaussians import MAX_SH_DEGREE, Float32, Float64, Gaussians
 from clsplat.memory import parse_bytes
 from clsplat.model_info import model_info, size, text
+from clsplat.progress import StageProgress
 from clsplat.runs import is_run, model_file
 
 if TYPE_CHECKING:
     from clsplat.rendering import Renderer
     from clsplat.scene import View
 
+QUICK = 2.0
+"""Seconds that writing a file may take without a word."""
 MAX_MATRIX = 1 << 16
 """Bytes of a file with a matrix."""
 
@@ -53,7 +56,8 @@ def convert(verb: Convert) -> int:
     if verb.drop_sh is not None:
         edited = edit.drop_sh(edited, verb.drop_sh)
     space = colour.recorded_space(source)
-    save(verb.target, edited, comments=() if space == colour.SRGB else (colour.comment(space),))
+    comments = () if space == colour.SRGB else (colour.comment(space),)
+    save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK))
     if space != colour.recorded_space(verb.target):
         _warn(f"{verb.target}: {written_by.NAME} has no place for the colour space, which is {space}")
     read = load(verb.target)
@@ -210,7 +214,6 @@ def compared(background: str, views: Sequence[View], before: list[Float32], afte
 
 
 def _views(verb: Convert) -> list[View]:
-    from clsplat.progress import StageProgress
     from clsplat.scene import load_scene
 
     assert verb.scene is not None

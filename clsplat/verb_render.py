@@ -21,7 +21,7 @@ from clsplat.cli import Render
 from clsplat.process import endings
 from clsplat.progress import FrameProgress
 from clsplat.render_job import Record
-from clsplat.render_request import Job, read_job, warn
+from clsplat.render_request import Job, frames_there, read_job, warn
 from clsplat.shading import Task, open_shader
 
 if TYPE_CHECKING:
@@ -52,14 +52,14 @@ def _run(job: Job) -> int:
             signal.signal(each, _interrupt)
     render_job.make_folders(tasks)
     render_job.remove_temporaries(tasks)
-    there = render_job.complete(tasks, options) if verb.skip_existing else set()
+    there = frames_there(job)
     records: dict[int, Record] = {}
     lines = sys.stdout if not verb.json else sys.stderr if verb.progress in ("json", "openjd") else None
     start = time.monotonic()
     try:
         with (
             FrameProgress(len(tasks), verb.progress, lines=lines) as progress,
-            render_job.open_video(tasks, verb.video) as video,
+            render_job.open_video(tasks, job.video) as video,
         ):
 
             def done(record: Record) -> None:

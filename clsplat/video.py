@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import native_name, replace, temporary_name
 from clsplat.layers import VIDEO
-from clsplat.picture_config import VideoConfig
+from clsplat.picture_config import FPS, VideoConfig
 
 _LUMA = (0.2126, 0.7152, 0.0722)
 _BLUE, _RED = np.float32(2 * (1 - 0.0722)), np.float32(2 * (1 - 0.2126))
@@ -60,6 +60,16 @@ def yuv420(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
     chroma = 0.25 * (left + chroma[:, :, 1::2]) + 0.5 * chroma[:, :, 0::2]
     flat = np.concatenate([(16 + 219 * luma).ravel(), (128 + 224 * chroma).ravel()])
     return np.asarray(np.rint(flat).reshape(-1, luma.shape[1]), np.uint8)
+
+
+def rate_of(fps: float) -> Fraction:
+    """Frames a second as a file has them: those of television, which are said in two or three decimals, in 1001ths."""
+    whole = round(fps * 1.001)
+    ntsc = Fraction(1000 * whole, 1001)
+    near = 5e-3 if whole % 24 == 0 or whole % 30 == 0 else 1e-4
+    if fps != round(fps) and abs(float(ntsc) - fps) < near:
+        return ntsc
+    return Fraction(fps).limit_denominator(1001)
 
 
 def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
@@ -126,7 +136,7 @@ class VideoWriter:
         import av
 
         config = self._config
-        rate = Fraction(config.fps).limit_denominator(1001)
+        rate = rate_of(FPS if config.fps is None else config.fps)
         self._container = av.open(native_name(self._temporary), "w", format="mp4", options={"movflags": "+faststart"})
         # one thread a core, but the same bytes whatever their number
         parameters = "threads=4:sliced-threads=0" + (":mbtree=0" if min(width, height) < SMALL else "")

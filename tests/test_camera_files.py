@@ -324,7 +324,7 @@ def test_motion_stays_in_a_projection(tmp_path: Path) -> None:
 
 def test_a_far_plane_is_told_of(tmp_path: Path) -> None:
     path = write(tmp_path / "shot.json", own(far=20))
-    assert choose_shot(path).warnings == (f"{path}: its far plane (20) is not applied",)
+    assert choose_shot(path).warnings == (f"{path}: not applied: far plane (20)",)
     assert choose_shot(write(path, own())).warnings == ()
 
 

@@ -174,11 +174,30 @@ def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_
 
 
 def test_a_size_of_another_shape_keeps_the_pixels_square() -> None:
-    """And the vertical angle of view; where the shape is but rounded, the angles of both axes."""
+    """And the vertical angle of view; where the shape is but rounded, too."""
     before = replace(camera(40, 80), fx=50.0, fy=51.0, cx=22.0, cy=30.0)
     wide = resizer(160, 40, 1.0)(before)
     assert (wide.width, wide.height, wide.fx, wide.fy, wide.cx, wide.cy) == (160, 40, 25.0, 25.5, 81.0, 15.0)
     near = resizer(21, 40, 1.0)(before)
-    assert (near.fx, near.fy) == (pytest.approx(50 * 21 / 40), 25.5)
+    assert (near.fx, near.fy, near.cx) == (25.0, 25.5, 10.5 + (22 - 20) / 2)
     panorama = replace(before, projection="equirectangular")
     assert resizer(160, 40, 1.0)(panorama).fx == pytest.approx(200), "that shows all around"
+
+
+def test_all_sizes_of_a_shape_show_the_same() -> None:
+    """Of a camera whose own shape they have but for rounding, however they are asked for."""
+    before = replace(camera(996, 748), fx=900.0, fy=901.0, cx=500.0, cy=370.0)
+    found = [
+        resizer(width, height, scale)(before)
+        for width, height, scale in (
+            (320, 240, 1.0), (640, 480, 1.0), (1280, 960, 1.0), (4000, 3000, 1.0), (320, None, 1.0), (None, 240, 1.0),
+        )
+    ]  # fmt: skip
+    assert all(3 * each.width == 4 * each.height for each in found)
+    views = [
+        (each.fx / each.width, each.fy / each.height, each.cx / each.width, each.cy / each.height) for each in found
+    ]
+    np.testing.assert_allclose(views, [views[0]] * len(views), rtol=1e-12)
+    assert all(each.fx / each.fy == pytest.approx(900 / 901) for each in found), "pixels are square as they were"
+    exact = resizer(None, None, 0.25)(before)
+    assert exact.fx == before.resized(249, 187).fx, "the same shape is a pure scaling"

@@ -130,3 +130,24 @@ def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> 
     assert Run.open(run).config == wanted, "flags go before the bundles, which go together"
     assert main(["train", "-o", str(run), "--resume", *short]) == 2
     assert "--schedule short and --resume" in capsys.readouterr().err
+
+
+def test_a_setting_that_two_places_have_has_one_default() -> None:
+    import inspect
+
+    from clsplat.cli import Render, Train
+    from clsplat.cli_models import Convert, View
+    from clsplat.layers import Encoding
+    from clsplat.scene import load_scene
+    from clsplat.viewer.server import Address
+
+    def default(owner: type, name: str) -> object:
+        return next(field.default for field in fields(owner) if field.name == name)
+
+    assert [default(each, "port") for each in (Train, View, Address)] == [8080] * 3
+    assert [default(each, "host") for each in (Train, View, Address)] == ["127.0.0.1"] * 3
+    held_out = inspect.signature(load_scene).parameters["test_every"].default
+    assert [default(each, "test_every") for each in (TrainConfig, Convert)] == [held_out] * 2 == [8] * 2
+    names = {"exr": "depth", "parts": "parts", "compression": "compression", "bits": "bits", "quality": "quality"}
+    for flag, name in names.items():
+        assert default(Render, flag) == default(Encoding, name), flag

@@ -100,6 +100,21 @@ def test_pruning_by_contribution_leaves_what_the_cameras_see(scene: Path, tmp_pa
     assert found["scene"]["least_between"] > 60, "what adds less than a hundredth of a pixel is not seen"
 
 
+def test_pruning_by_contribution_to_an_orthographic_shot(tmp_path: Path, capsys: Capture) -> None:
+    seen = hidden_model()
+    beside = edit.transform(seen, np.array([[1, 0, 0, 50], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+    edit.merge([seen, beside]).save(tmp_path / "both.ply")
+    key = {"frame": 1, "position": [0, 0, -4], "world_from_cam": [1, 0, 0, 0], "pixel_size": 0.05}
+    document = {"clsplat_cameras": 1, "width": 64, "height": 48, "projection": "orthographic", "keys": [key]}
+    (tmp_path / "shot.json").write_text(json.dumps(document))
+    prune = ["--prune-contribution", 0.01, "--cameras", tmp_path / "shot.json"]
+    assert convert(tmp_path / "both.ply", tmp_path / "part.ply", *prune) == 0
+    kept = Gaussians.load(tmp_path / "part.ply")
+    assert 0 < len(kept) <= len(seen)
+    assert np.abs(kept.means).max() < 25
+    assert capsys.readouterr().err == ""
+
+
 def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     source, target = tmp_path / "model.ply", tmp_path / "moved.compressed.ply"
     hidden_model().save(source)

@@ -171,7 +171,7 @@ def test_a_file(tmp_path: Path) -> None:
 def test_halves_and_a_window(tmp_path: Path) -> None:
     camera = crop(scenes.tilted_camera(71, 50), 5, 3, 40, 30)
     header = Header(window=Window(5, 3, 71, 50))
-    path, gaussians, _ = made(tmp_path, camera, encoding=Encoding(compression="piz"), header=header)
+    path, gaussians, _ = made(tmp_path, camera, encoding=Encoding("half", compression="piz"), header=header)
     spec, pixels = read(path)
     assert (spec.x, spec.y, spec.width, spec.height, spec.full_width, spec.full_height) == (5, 3, 40, 30, 71, 50)
     assert [str(kind) for kind in spec.channelformats] == ["half"] * 4 + ["float"] * 2

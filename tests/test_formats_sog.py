@@ -170,6 +170,25 @@ def test_palettes() -> None:
     assert not one.any() and not one[label].any()
 
 
+def test_a_palette_far_from_zero_is_as_good() -> None:
+    """Squared distances of numbers around 50 have no digits left in float32."""
+    vectors = np.random.default_rng(5).normal(0, 0.01, (3000, 9)).astype(np.float32)
+    errors = []
+    for offset in (0, 50):
+        moved = vectors + np.float32(offset)
+        entries, labels = palette(moved, 1024)
+        errors.append(np.square(moved - entries[labels]).mean())
+    assert errors[1] < 1.5 * errors[0]
+
+
+def test_writing_tells_how_far_it_is(tmp_path: Path) -> None:
+    told: list[tuple[str, float | None]] = []
+    sog.write(tmp_path / "a.sog", lopsided(300), progress=lambda stage, part: told.append((stage, part)))
+    parts = [part for _, part in told]
+    assert {stage for stage, _ in told} == {"SOG: 256 sets of SH coefficients for 300 Gaussians"}
+    assert parts[0] == 0 and parts == sorted(parts) and len(parts) > 8 and 0.5 < parts[-1] <= 1
+
+
 def test_damaged_files(tmp_path: Path) -> None:
     path = tmp_path / "model.sog"
     sog.write(path, lopsided(8, degree=1))

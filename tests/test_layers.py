@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from headers import exr_attributes
 from numpy.typing import NDArray
 from scenes import tilted_camera
 
@@ -93,7 +94,7 @@ def test_exr(parts: Any, depth: Any, tmp_path: Path) -> None:
 
 
 def test_parts_have_names_and_formats(tmp_path: Path) -> None:
-    write_layers(tmp_path / "a.exr", everything(), Encoding(parts="several"))
+    write_layers(tmp_path / "a.exr", everything(), Encoding("half", parts="several"))
     _, specs = read(tmp_path / "a.exr")
     names = [spec.get_string_attribute("oiio:subimagename") for spec in specs]
     assert names == ["rgba", "depth", "median", "first", "N", "P", "forward", "count", "id"]
@@ -113,10 +114,13 @@ def test_the_header(tmp_path: Path) -> None:
     assert spec.getattribute("clsplat:frame") == 7
     assert spec.get_string_attribute("compression") == "piz"
     assert spec.get_float_attribute("PixelAspectRatio") == 2.0
-    for name, own in (("worldToCamera", "worldtocamera"), ("worldToNDC", "worldtoscreen")):
-        np.testing.assert_allclose(
-            np.reshape(spec.getattribute(own), (4, 4)), header.matrices[name], rtol=1e-6, atol=1e-6
-        )
+    found = exr_attributes(tmp_path / "a.exr")
+    for name, matrix in header.matrices.items():
+        kind, data = found[name]
+        assert kind == "m44f"
+        np.testing.assert_allclose(np.frombuffer(data, "<f4").reshape(4, 4), matrix, rtol=1e-6, atol=1e-6)
+    assert sorted(header.matrices) == ["worldToCamera", "worldToNDC"]
+    assert "worldToScreen" not in found and "chromaticities" not in found
 
 
 def test_matrices_put_a_point_on_its_pixel() -> None:
@@ -126,13 +130,13 @@ def test_matrices_put_a_point_on_its_pixel() -> None:
     pixel = camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy
     matrices = camera_matrices(camera)
     in_camera = np.append(point, 1) @ matrices["worldToCamera"]
-    np.testing.assert_allclose(in_camera, [p[0], -p[1], -p[2], 1], rtol=1e-12)
+    np.testing.assert_allclose(in_camera, [p[0], -p[1], p[2], 1], rtol=1e-12)
     clip = np.append(point, 1) @ matrices["worldToNDC"]
     ndc = clip[:3] / clip[3]
-    np.testing.assert_allclose((0.5 + 0.5 * ndc[0]) * WIDTH, pixel[0], rtol=1e-12)
-    np.testing.assert_allclose((0.5 - 0.5 * ndc[1]) * HEIGHT, pixel[1], rtol=1e-12)
-    near = np.array([0, 0, -camera.near, 1]) @ np.linalg.inv(matrices["worldToCamera"]) @ matrices["worldToNDC"]
-    np.testing.assert_allclose(near[2] / near[3], -1.0, atol=1e-9)
+    np.testing.assert_allclose(ndc[0] * WIDTH, pixel[0], rtol=1e-12)
+    np.testing.assert_allclose(ndc[1] * HEIGHT, pixel[1], rtol=1e-12)
+    near = np.array([0, 0, camera.near, 1]) @ np.linalg.inv(matrices["worldToCamera"]) @ matrices["worldToNDC"]
+    np.testing.assert_allclose(near[2] / near[3], 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("far", [np.inf, 20.0])
@@ -143,9 +147,9 @@ def test_matrices_of_an_orthographic_camera(far: float) -> None:
     pixels, depths = pixel_from_world(camera, points)
     ndc = np.concatenate([points, np.ones((2, 1))], axis=1) @ matrices["worldToNDC"]
     np.testing.assert_allclose(ndc[:, 3], 1, rtol=1e-12)
-    np.testing.assert_allclose((0.5 + 0.5 * ndc[:, 0]) * WIDTH, pixels[:, 0], rtol=1e-12)
-    np.testing.assert_allclose((0.5 - 0.5 * ndc[:, 1]) * HEIGHT, pixels[:, 1], rtol=1e-12)
-    wanted = -1 + (depths - 0.5) * (2 / 19.5 if far == 20.0 else 1)
+    np.testing.assert_allclose(ndc[:, 0] * WIDTH, pixels[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(ndc[:, 1] * HEIGHT, pixels[:, 1], rtol=1e-12)
+    wanted = (depths - 0.5) * (1 / 19.5 if far == 20.0 else 1)
     np.testing.assert_allclose(ndc[:, 2], wanted, rtol=1e-12)
     assert camera_matrices(replace(camera, projection="fisheye")) == {}
 
@@ -159,7 +163,7 @@ def test_a_window(tmp_path: Path) -> None:
 
 def test_what_a_half_cannot_hold_is_its_largest(tmp_path: Path) -> None:
     layers = {"rgb": np.full((4, 4, 3), 1e9, np.float32), "depth": np.full((4, 4), 1e9, np.float32)}
-    write_layers(tmp_path / "a.exr", layers)
+    write_layers(tmp_path / "a.exr", layers, Encoding("half"))
     found, _ = read(tmp_path / "a.exr")
     assert (found["R"] == 65504).all()
     assert (found["Z"] == 1e9).all()

@@ -107,3 +107,12 @@ def test_stages_are_told_apart() -> None:
 
 def test_durations() -> None:
     assert [duration(s) for s in (0, 59.6, 61, 3600, 36061)] == ["0:00", "1:00", "1:01", "1:00:00", "10:01:01"]
+
+
+def test_what_is_quick_is_not_told() -> None:
+    stream, now = io.StringIO(), [0.0]
+    progress = StageProgress(stream, lambda: now[0], after=2.0)
+    for time, part in ((0.0, 0.0), (1.9, 0.4), (2.1, 0.5), (3.0, 0.6), (12.5, 0.9)):
+        now[0] = time
+        progress("palette", part)
+    assert stream.getvalue().splitlines() == ["palette 50 %", "palette 90 %"]

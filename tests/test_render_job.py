@@ -205,7 +205,7 @@ def test_the_loop_writes_every_frame_once(tmp_path: Path) -> None:
     source = oiio.ImageInput.open(done[0].path)
     assert source.spec().getattribute("clsplat:frame") == done[0].frame
     assert source.spec().getattribute("clsplat:model") == "abc"
-    assert source.spec().getattribute("worldtoscreen") is not None
+    assert source.spec().getattribute("worldToNDC") is not None
 
 
 def test_frames_that_wait_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,9 +123,9 @@ def test_render(name: str, tmp_path: Path) -> None:
 def centres(found: dict[str, NDArray[np.float32]], spec: Any) -> NDArray[np.float64]:
     """Where the picture shows the corners' balls (8, 2), in pixels; as large at every depth. The header's matrix tells
     where to look."""
-    to_ndc = np.reshape(spec.getattribute("worldtoscreen"), (4, 4))
+    to_ndc = np.reshape(spec.getattribute("worldToNDC"), (4, 4))
     ndc = np.concatenate([CORNERS, np.ones((8, 1))], axis=1) @ to_ndc
-    wanted = np.stack([(0.5 + 0.5 * ndc[:, 0]) * WIDTH, (0.5 - 0.5 * ndc[:, 1]) * HEIGHT], axis=1)
+    wanted = ndc[:, :2] * [WIDTH, HEIGHT]
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     got, areas = [], []
     for at in wanted:

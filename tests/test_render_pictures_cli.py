@@ -13,6 +13,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from calls import Capture, error_line
+from headers import exr_attributes, png_chunks
 from tiny import HEIGHT, WIDTH, hidden_model
 
 from clsplat.cli import main
@@ -222,6 +223,53 @@ def test_another_colour_space_is_not_what_is_wanted(shot: list[str], tmp_path: P
     assert spec.getattribute("clsplat:colorspace") == "ACEScg"
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        *("--exr half", "--parts several", "--compression none", "--background white", "--shutter-angle 90", "moved"),
+        *("--aperture 0.1 --focus 4", "--supersample 2", "--model-colorspace ACEScg --colorspace sRGB"),
+        *("--rasterizer.sh-degree-limit 0", "nothing", "--quality 50", "--samples 3"),
+    ],
+)
+def test_a_frame_of_other_settings_is_not_what_is_wanted(
+    change: str, shot: list[str], tmp_path: Path, capsys: Capture
+) -> None:
+    """Of a still camera: only the last three change no frame."""
+    key = {"frame": 1, "position": [0, 0, -4], "world_from_cam": [1, 0, 0, 0], "fov_x": 60}
+    other = {**key, "position": [1e-3, 0, -4]} if change == "moved" else key
+    kept = change in ("nothing", "--quality 50", "--samples 3")
+    names = []
+    for index, keys in enumerate(([key], [other])):
+        document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
+        names.append(tmp_path / f"{index}.json")
+        names[-1].write_text(json.dumps(document))
+    first, second = ([*shot[:2], str(name)] for name in names)
+    flags = "--channels rgb,depth" if change == "--parts several" else ""
+    assert render(first, tmp_path, flags) == 0
+    before = (tmp_path / "a.0001.exr").stat().st_mtime_ns
+    more = f"{flags} {'' if change in ('moved', 'nothing') else change} --skip-existing"
+    assert render(second, tmp_path, more) == 0
+    assert ((tmp_path / "a.0001.exr").stat().st_mtime_ns == before) == kept
+    written = (tmp_path / "a.0001.exr").stat().st_mtime_ns
+    assert render(second, tmp_path, more) == 0
+    assert (tmp_path / "a.0001.exr").stat().st_mtime_ns == written
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_frames_that_do_not_say_how_they_were_made(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    assert render(shot, tmp_path, "", "a.####.jpg") == 0
+    assert capsys.readouterr().err == ""
+    for more in ("", "--dry-run"):
+        assert render(shot, tmp_path, f"--skip-existing --quality 5 {more}", "a.####.jpg") == 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("clsplat: warning: --skip-existing: 4 of the frames that are there do not say how")
+        assert "a.0001.jpg: they are kept, whatever their cameras, precision and other settings are" in line
+    assert render(shot, tmp_path, "", "a.####.png") == 0
+    assert "clsplat:settings" in " ".join(png_chunks(tmp_path / "a.0001.png"))
+    assert render(shot, tmp_path, "--skip-existing --bits 16", "a.####.png") == 0
+    assert png_chunks(tmp_path / "a.0001.png")["IHDR"][8] == 16, "bits"
+
+
 @pytest.mark.needs("av")
 def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     import av
@@ -247,6 +295,26 @@ def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
         lumas = [16 + 219 * np.clip(image, 0, 1) @ [0.2126, 0.7152, 0.0722] for image in means]
         errors = [np.abs(frame[:HEIGHT] - luma).mean() for luma in lumas]
         assert index == 5 or errors[0] < errors[1]
+
+
+@pytest.mark.needs("av")
+def test_a_video_has_the_rate_of_its_cameras(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    import av
+
+    document = json.loads(Path(shot[2]).read_text())
+    (tmp_path / "cameras.json").write_text(json.dumps({**document, "fps": 29.97}))
+    own = [*shot[:2], str(tmp_path / "cameras.json")]
+    for name, flags, rate in (("own", "", "30000/1001"), ("asked", "--video.fps 25", "25")):
+        assert render(own, tmp_path, flags, f"{name}.mp4") == 0
+        with av.open(str(tmp_path / f"{name}.mp4")) as container:
+            assert str(container.streams.video[0].average_rate) == rate
+        capsys.readouterr()
+        assert render(own, tmp_path, f"{flags} --dry-run", f"{name}.mp4") == 0
+        assert f"video     {rate} frames a second" in capsys.readouterr().out
+    (tmp_path / "cameras.json").write_text(json.dumps({**document, "fps": 1e9}))
+    assert render(own, tmp_path, "", "fast.mp4") == 2
+    assert "has 1e+09 frames a second, expected 0.01 to 1000; give --video.fps" in error_line(capsys)
+    assert render(own, tmp_path, "--frames 1", "fast.exr") == 0, "which has no rate"
 
 
 def test_strips(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
@@ -288,6 +356,44 @@ def test_the_plan(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     assert not (tmp_path / "new").exists()
 
 
+def test_headers_tell_the_truth_of_colours(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    """Red, green, blue and white as the standards have them (SMPTE ST 2065-1, S-2014-004, Rec.709)."""
+    white, d65 = (0.32168, 0.33767), (0.3127, 0.3290)
+    wanted = {
+        "ACEScg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, *white),
+        "ACES2065-1": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, *white),
+        "lin_rec709": (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *d65),
+    }
+    for space, values in wanted.items():
+        assert render(shot, tmp_path, f"--frames 2 --colorspace {space}") == 0
+        kind, data = exr_attributes(tmp_path / "a.0002.exr")["chromaticities"]
+        assert kind == "chromaticities"
+        np.testing.assert_allclose(np.frombuffer(data, "<f4"), values, rtol=1e-6, err_msg=space)
+    assert "warning" not in capsys.readouterr().err
+    for flags, there in (("", True), ("--colorspace Rec.1886_Rec.709_-_Display", False)):
+        words = [word.replace("_", " ") for word in f"--frames 2 {flags}".split()]
+        assert main(["render", *shot, "-o", str(tmp_path / "a.####.png"), "--progress", "none", *words]) == 0
+        chunks = png_chunks(tmp_path / "a.0002.png")
+        assert [name in chunks for name in ("sRGB", "gAMA", "cHRM")] == [there] * 3
+
+
+def test_matrices_in_the_header_are_those_of_openexr(shot: list[str], tmp_path: Path) -> None:
+    """A point ahead of the camera by its definitions: z of the camera's space is along the view, y is up; in NDC (0, 0)
+    is the upper left corner, (1, 1) the lower right one."""
+    assert render(shot, tmp_path, "--frames 1") == 0
+    found = exr_attributes(tmp_path / "a.0001.exr")
+    assert "worldToScreen" not in found
+    to_camera, to_ndc = (np.frombuffer(found[name][1], "<f4").reshape(4, 4) for name in ("worldToCamera", "worldToNDC"))
+    assert {found[name][0] for name in ("worldToCamera", "worldToNDC")} == {"m44f"}
+    focal = 0.5 / np.tan(np.radians(30))  # of the width
+    for right, down, ahead in ((0.0, 0.0, 2.0), (0.4, 0.3, 5.0)):
+        point = np.array([-0.5 + right, down, -4 + ahead, 1])
+        np.testing.assert_allclose(point @ to_camera, [right, -down, ahead, 1], atol=1e-6)
+        x, y, _, w = point @ to_ndc
+        wanted = 0.5 + focal * right / ahead, 0.5 + focal * down / ahead * WIDTH / HEIGHT
+        np.testing.assert_allclose([x / w, y / w], wanted, atol=1e-6)
+
+
 @pytest.mark.needs("distributed")
 def test_everything_on_a_farm(shot: list[str], tmp_path: Path) -> None:
     import distributed
@@ -327,6 +433,15 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--alpha", "a.#.jpg", "a JPG cannot hold alpha"),
         ("--skip-existing", "a.mp4", "--skip-existing: a video is written as a whole"),
         ("--video.crf 99", "a.mp4", "--video.crf 99: expected 0 to 51"),
+        ("--colorspace ACEScg", "a.#.png", "its colours would be ACEScg, which is linear, expected sRGB; write .exr"),
+        ("--colorspace lin_rec709 --bits 16", "a.#.tif", "would be lin_rec709, which is linear, expected sRGB"),
+        (
+            "--model-colorspace ACEScg",
+            "a.#.jpg",
+            "would be ACEScg, which is linear, expected sRGB; write .exr, or give",
+        ),
+        ("--colorspace ACEScg", "a.mp4", "its colours would be ACEScg, which is linear, expected sRGB"),
+        ("--colorspace ACEScct", "a.mp4", "its colours would be ACEScct, expected sRGB's primaries; write .exr, or"),
     ]
     for flags, pattern, message in cases:
         assert render(shot, tmp_path / "new", flags, pattern) == 2, flags

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -81,10 +82,17 @@ def test_chroma_is_where_it_belongs() -> None:
     assert (white[:2] == 235).all() and (white[2:] == 128).all()
 
 
-def test_film_rates(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mp4", frames(3, 32, 32), VideoConfig(fps=23.976))
-    rate = read(tmp_path / "a.mp4")[1].average_rate
-    assert abs(float(rate) - 23.976) < 1e-4
+@pytest.mark.parametrize(
+    ("said", "meant"),
+    [
+        *((23.976, (24000, 1001)), (23.98, (24000, 1001)), (29.97, (30000, 1001)), (47.952, (48000, 1001))),
+        *((59.94, (60000, 1001)), (119.88, (120000, 1001)), (24000 / 1001, (24000, 1001)), (14.985, (15000, 1001))),
+        *((24, (24, 1)), (12.5, (25, 2)), (29.5, (59, 2)), (0.1, (1, 10)), (1000, (1000, 1)), (None, (24, 1))),
+    ],
+)
+def test_film_rates(said: float | None, meant: tuple[int, int], tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", frames(3, 32, 32), VideoConfig(fps=said))
+    assert read(tmp_path / "a.mp4")[1].average_rate == Fraction(*meant)
 
 
 def test_the_same_bytes_twice_and_smaller_at_less_quality(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import sys
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from viewer_browser import clsplat
 
 from clsplat.cli import Train, main, parse
 from clsplat.runs import Run
-from clsplat.viewer.server import Address
+from clsplat.viewer.server import Address, refused
 
 require("viser")
 
@@ -114,39 +115,96 @@ def test_no_path_is_served(url: str, path: str) -> None:
     assert found.value.code in (400, 404)
 
 
-@pytest.mark.parametrize(
-    ("origin", "let_in"),
-    [
-        (None, True),
-        ("http://localhost:8080", True),
-        ("http://127.0.0.1", True),
-        ("http://[::1]:9", True),
-        ("https://example.org", False),
-        ("http://localhost.example.org", False),
-        ("http://127.0.0.1.example.org:8080", False),
-        ("null", False),
-    ],
-)
-def test_pages_of_other_sites_are_refused(url: str, origin: str | None, let_in: bool) -> None:
+async def connected(url: str, *messages: str | bytes, origin: str | None = None, host: str | None = None) -> None:
+    """Open the socket as a page does, send this and wait for the server to end it, if there is anything to send."""
     from viser import __version__
     from websockets.asyncio.client import connect
+    from websockets.exceptions import ConnectionClosed
+
+    port = int(url.rsplit(":", 1)[1])
+    async with connect(
+        f"ws://{host or f'127.0.0.1:{port}'}/",
+        origin=origin,  # type: ignore[arg-type]
+        subprotocols=[f"viser-v{__version__}"],  # type: ignore[list-item]
+        open_timeout=20,
+        host="127.0.0.1",
+        port=port,
+        max_size=None,
+    ) as connection:
+        for message in messages:
+            await connection.send(message)
+        with pytest.raises(ConnectionClosed) if messages else nullcontext():
+            while messages:
+                await asyncio.wait_for(connection.recv(), 20)
+
+
+@pytest.mark.parametrize(
+    ("origin", "host", "let_in"),
+    [
+        (None, "localhost:{port}", True),
+        (None, "127.0.0.1", True),
+        (None, "[::1]:{port}", True),
+        (None, "example.org:{port}", False),  # a name that has been led to this machine
+        (None, "localhost.example.org", False),
+        ("http://localhost:{port}", "localhost:{port}", True),
+        ("http://127.0.0.1:{port}", "127.0.0.1:{port}", True),
+        ("http://LOCALHOST:9000", "localhost:9000", True),  # through a tunnel
+        ("http://localhost:5173", "localhost:{port}", False),
+        ("http://127.0.0.1", "127.0.0.1:{port}", False),
+        ("http://localhost:{port}", "127.0.0.1:{port}", False),
+        ("https://example.org", "localhost:{port}", False),
+        ("http://example.org:{port}", "example.org:{port}", False),
+        ("http://127.0.0.1.example.org:8080", "127.0.0.1:{port}", False),
+        ("null", "localhost:{port}", False),
+        ("", "localhost:{port}", False),
+    ],
+)
+def test_pages_of_other_servers_are_refused(url: str, origin: str | None, host: str, let_in: bool) -> None:
     from websockets.exceptions import InvalidStatus
 
-    async def attempt() -> None:
-        async with connect(
-            url.replace("http", "ws", 1),
-            origin=origin,  # type: ignore[arg-type]
-            subprotocols=[f"viser-v{__version__}"],  # type: ignore[list-item]
-            open_timeout=20,
-        ):
-            pass
-
+    port = url.rsplit(":", 1)[1]
+    origin, host = origin if origin is None else origin.format(port=port), host.format(port=port)
     if let_in:
-        asyncio.run(attempt())
+        asyncio.run(connected(url, origin=origin, host=host))
         return
     with pytest.raises(InvalidStatus) as found:
-        asyncio.run(attempt())
+        asyncio.run(connected(url, origin=origin, host=host))
     assert found.value.response.status_code == 403
+
+
+def test_who_is_let_in_elsewhere() -> None:
+    """A server for others is known by any name, but not to the pages of others."""
+    from websockets.datastructures import Headers
+
+    def of(**headers: str) -> str:
+        return refused(Headers(**headers), local=False)
+
+    assert of(Host="render7:8080") == of(Host="render7:8080", Origin="http://render7:8080") == ""
+    assert "pages of other servers" in of(Host="render7:8080", Origin="http://render7:9090")
+    assert "one Host" in of(Origin="http://render7:8080")
+
+
+@posix
+def test_what_makes_no_sense_is_a_line(model: Path) -> None:
+    with clsplat("view", str(model)) as (url, process):
+        for request in (
+            b"\x00\xff\r\n\r\n",
+            b"POST / HTTP/1.1\r\n\r\n",
+            b"GET / HTTP/1.1\r\n\r\n",
+            b"GET / HTTP/9\r\n\r\n",
+        ):
+            with socket.create_connection(("127.0.0.1", int(url.rsplit(":", 1)[1])), timeout=10) as talk:
+                talk.sendall(request)
+                talk.recv(100)
+        for message in ("text", b"\xff\xfe", b"\x92\x01\x02", b"\x81\xa4type\xa4Nope"):
+            asyncio.run(connected(url, message))
+        asyncio.run(connected(url))
+        process.send_signal(2)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (0, "")
+    lines = err.splitlines()
+    assert len(lines) == 4, "one for each message"
+    assert all(line.startswith("clsplat: warning: a page sent what makes no sense here: ") for line in lines)
 
 
 @posix

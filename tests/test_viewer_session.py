@@ -16,6 +16,7 @@ from systems import links
 from tiny import cameras
 
 from clsplat.errors import InputError
+from clsplat.images import steps_of
 from clsplat.paths import choose_shot
 from clsplat.viewer.look import (
     LARGEST_OPACITY,
@@ -312,6 +313,15 @@ def test_edits() -> None:
     assert_equal(model, before)
 
 
+def test_colours_are_rounded_as_in_a_png() -> None:
+    """Next to half steps float32 and float64 differ."""
+    halves = np.float32((np.arange(255) + 0.5) / 255)
+    values = np.concatenate([np.nextafter(halves, np.float32(side)) for side in (0, 1)] + [halves])
+    image = np.repeat(values, 3).reshape(1, -1, 3)
+    assert len(values) == 765
+    np.testing.assert_array_equal(colour_picture(image), steps_of([image], 8))
+
+
 def test_pictures() -> None:
     image = np.array([[[0.0, 0.5, 1.0], [np.nan, -1.0, 2.0]]], np.float32)
     assert colour_picture(image).tolist() == [[[0, 128, 255], [0, 0, 255]]]
@@ -353,6 +363,29 @@ def test_a_recorded_path_is_read_by_render(tmp_path: Path) -> None:
         np.testing.assert_allclose(camera.position, wanted.position, atol=1e-9)
         np.testing.assert_allclose(camera.rotation, wanted.rotation, atol=1e-9)
         assert (camera.width, camera.height, camera.fy) == (320, 200, pytest.approx(wanted.fy))
+
+
+def test_a_recorded_key_is_seen_to_the_last_bit(tmp_path: Path) -> None:
+    """The camera of a screenshot is that of the exported path at that key, also between others and far out."""
+    rng = np.random.default_rng(0)
+    poses = []
+    for _ in range(40):
+        pose = read_pose(
+            rng.normal(size=4), rng.normal(size=3), rng.uniform(0.2, 2), (801, 603), 1e5 * rng.normal(size=3)
+        )
+        assert pose is not None
+        poses.append(pose)
+    recorder = Recorder()
+    for pose in poses:
+        recorder.add(pose)
+    (tmp_path / "path.json").write_text(recorder.document((1280, 720), apart=0.5))
+    shot = choose_shot(tmp_path / "path.json").only(",".join(str(1 + 12 * index) for index in range(40)))
+    for pose, camera in zip(poses, shot.cameras, strict=True):
+        wanted = pose.camera(1280, 720)
+        for name in ("fx", "fy", "cx", "cy", "near"):
+            assert getattr(camera, name) == getattr(wanted, name), name
+        np.testing.assert_array_equal(camera.rotation, wanted.rotation)
+        np.testing.assert_array_equal(camera.translation, wanted.translation)
 
 
 def test_a_closed_loop_has_as_many_frames_as_a_turn(tmp_path: Path) -> None:

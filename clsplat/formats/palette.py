@@ -3,16 +3,21 @@
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 Float32 = NDArray[np.float32]
 
 SAMPLES = 1 << 16
 LLOYD_STEPS = 20
+TILE = 64
+"""Vectors, and centres, of products that are made at once."""
+SPREAD_ROWS, POWER_STEPS = 128, 30
+"""Vectors that the direction of most variance is taken from, and steps towards it."""
 
 
 def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
@@ -50,8 +55,11 @@ def nearest(entries: NDArray[np.floating], values: NDArray[np.floating]) -> NDAr
     return np.searchsorted((entries[1:] + entries[:-1]) / 2, values)
 
 
-def palette(vectors: Float32, size: int, iterations: int = 10) -> tuple[Float32, NDArray[np.int64]]:
-    """Up to `size` vectors, and which of them stands for each: (n, d) -> (size, d), (n,).
+def palette(
+    vectors: Float32, size: int, iterations: int = 10, progress: Callable[[float], None] = lambda part: None
+) -> tuple[Float32, NDArray[np.int64]]:
+    """Up to `size` vectors, and which of them stands for each: (n, d) -> (size, d), (n,). progress: hears what part of
+    them has been found.
 
     k-means in two levels: clusters, and in each of them a share of the palette by its squared error, so that the work
     is n d sqrt(size) and not n d size.
@@ -71,7 +79,8 @@ def palette(vectors: Float32, size: int, iterations: int = 10) -> tuple[Float32,
     shares = np.floor(weights / max(weights.sum(), 1e-30) * (size - coarse)).astype(np.int64) + 1
     centres, labels = [], np.empty(count, np.int64)
     used = 0
-    for rows, share in zip(members, shares, strict=True):
+    for index, (rows, share) in enumerate(zip(members, shares, strict=True)):
+        progress(index / len(members))
         if not len(rows):
             continue
         found, label = _k_means(vectors[rows], min(int(share), len(rows)), iterations)
@@ -84,20 +93,51 @@ def palette(vectors: Float32, size: int, iterations: int = 10) -> tuple[Float32,
 
 
 def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDArray[np.int64]]:
-    """SciPy's, on a sample where there are many, from a beginning spread along the direction of most variance."""
-    from scipy.cluster.vq import kmeans2, vq
-
+    """Lloyd's steps on a sample where there are many, from a beginning spread along the direction of most variance. A
+    centre that no vector is left for stays where it is."""
     if size <= 1 or not np.ptp(vectors, axis=0).any():
         return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
             len(vectors), np.int64
         )
-    sample = vectors[:: max(1, len(vectors) // max(SAMPLES, 8 * size))]
-    centred = sample - sample.mean(axis=0)
-    _, axes = np.linalg.eigh((centred.T @ centred).astype(np.float64))
-    order = np.argsort(centred @ axes[:, -1].astype(np.float32), kind="stable")
-    start = sample[order[((np.arange(size) + 0.5) / size * len(order)).astype(np.int64)]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of clusters that no vector is left in: they stay where they are
-        centres, _ = kmeans2(sample, start, iter=iterations, minit="matrix", missing="warn")
-    labels, _ = vq(vectors, centres, check_finite=False)
-    return centres.astype(np.float32), labels.astype(np.int64)
+    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # far from 0 float32 would have no digits left
+    centred = vectors - middle
+    sample = centred[:: max(1, len(vectors) // max(SAMPLES, 8 * size))]
+    order = np.argsort(np.einsum("ij,j->i", sample, _direction(sample)), kind="stable")
+    centres = sample[order[((np.arange(size) + 0.5) / size * len(order)).astype(np.int64)]]
+    before: NDArray[np.int64] | None = None
+    for _ in range(iterations):
+        labels = _nearest_centres(sample, centres)
+        if before is not None and np.array_equal(labels, before):
+            break
+        before = labels
+        rows = np.arange(len(labels) + 1)
+        members = sparse.csr_matrix((np.ones(len(labels), np.float32), labels, rows), shape=(len(labels), size))
+        count = np.bincount(labels, minlength=size).astype(np.float32)[:, None]
+        centres = np.where(count > 0, (members.T @ sample) / np.maximum(count, 1), centres)
+    return centres + middle, _nearest_centres(centred, centres)
+
+
+def _direction(vectors: Float32) -> Float32:
+    """(d,) of most variance of vectors around 0, by power iteration: near is enough."""
+    rows = vectors[:: max(1, len(vectors) // SPREAD_ROWS)][:SPREAD_ROWS]
+    spread = (rows.T @ rows).astype(np.float64)
+    axis = spread[np.diagonal(spread).argmax()]
+    for _ in range(POWER_STEPS):
+        axis = spread @ (axis / max(np.linalg.norm(axis), 1e-300))
+    return np.asarray(axis / max(np.linalg.norm(axis), 1e-300), np.float32)
+
+
+def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
+    """By |c|^2 / 2 - v c, which is as far from v as half of the squared distance is. In tiles that are too small for a
+    library's threads: these wait for each other longer than they work, several times so on a busy machine."""
+    halves = np.float32(0.5) * np.einsum("ij,ij->i", centres, centres)
+    columns = [(slice(start, start + TILE), centres[start : start + TILE].T) for start in range(0, len(centres), TILE)]
+    labels = np.empty(len(vectors), np.int64)
+    scores = np.empty((TILE, len(centres)), np.float32)
+    for start in range(0, len(vectors), TILE):
+        rows = vectors[start : start + TILE]
+        found = scores[: len(rows)]
+        for at, part in columns:
+            np.matmul(rows, part, out=found[:, at])
+        labels[start : start + TILE] = np.subtract(halves, found, out=found).argmin(axis=1)
+    return labels

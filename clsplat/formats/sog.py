@@ -56,6 +56,8 @@ Bytes = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
+Progress = Callable[[str, float | None], None]
+
 META = "meta.json"
 MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
@@ -292,12 +294,19 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
     return result
 
 
-def write(path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool = False) -> None:
+def _no_progress(stage: str, part: float | None = None) -> None:
+    """Nobody listens."""
+
+
+def write(
+    path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool = False, progress: Progress = _no_progress
+) -> None:
     """Write version 2: a .sog archive, or a meta.json with its pictures beside it, which are there before it is.
 
     iterations: of k-means for the palette. sort: by place (Morton's order), so that the pictures compress better; the
-    Gaussians come back in that order. Means count from the world's origin: far from it they lose more. The same
-    Gaussians give the same values. Raises InputError for values that are not finite.
+    Gaussians come back in that order. progress: hears what is made, and what part of it is there. Means count from the
+    world's origin: far from it they lose more. The same Gaussians give the same values. Raises InputError for values
+    that are not finite.
     """
     gaussians.check()
     packing.require_finite(path, gaussians, writing=True)
@@ -306,7 +315,7 @@ def write(path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool 
     with tempfile.TemporaryDirectory(prefix="clsplat-sog-") as name:
         folder = Path(name)
         order = packing.morton_order(gaussians.means) if sort else slice(None)
-        meta = _pictures(folder, gaussians, order, iterations)
+        meta = _pictures(folder, gaussians, order, iterations, progress)
         text = json.dumps(meta, separators=(",", ":")).encode()
         files = sorted(folder.iterdir())
         if path.name.lower().endswith(".json"):
@@ -322,7 +331,7 @@ def write(path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool 
                 archive.writestr(zipfile.ZipInfo(each.name), each.read_bytes())
 
 
-def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int) -> dict[str, Any]:
+def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, progress: Progress) -> dict[str, Any]:
     """Write them, and give meta.json."""
     count = len(gaussians)
     width = 4 * math.ceil(math.sqrt(count) / 4)
@@ -357,16 +366,24 @@ def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int) -
         "sh0": {"codebook": colour_codes.tolist(), "files": [colours]},
     }
     if gaussians.sh_degree:
-        meta["shN"] = _palette(folder, gaussians.sh[order, 1:], picture, iterations, gaussians.sh_degree)
+        rest = gaussians.sh[order, 1:]
+        meta["shN"] = _palette(folder, rest, picture, iterations, gaussians.sh_degree, progress)
     return meta
 
 
 def _palette(
-    folder: Path, rest: Float32, picture: Callable[[str, list[Bytes]], str], iterations: int, bands: int
+    folder: Path,
+    rest: Float32,
+    picture: Callable[[str, list[Bytes]], str],
+    iterations: int,
+    bands: int,
+    progress: Progress,
 ) -> dict[str, Any]:
     count, width = rest.shape[:2]
     size = min(MAX_PALETTE, 1 << (count.bit_length() - 1))
-    sets, labels = palette(rest.reshape(count, -1), size, iterations)
+    stage = f"SOG: {size:,} sets of SH coefficients for {count:,} Gaussians"
+    progress(stage, 0.0)
+    sets, labels = palette(rest.reshape(count, -1), size, iterations, lambda part: progress(stage, part))
     entries = codebook(sets)
     rows = -(-size // PALETTE_COLUMNS)
     table = np.zeros((rows * PALETTE_COLUMNS, width, 3), np.uint8)

@@ -60,7 +60,8 @@ def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
         tuple(
             Frame(number, camera, f"{number:04d}", None if fps is None else (number - numbers[0]) / fps)
             for number, camera in zip(numbers, cameras, strict=True)
-        )
+        ),
+        fps=fps,
     )
 
 

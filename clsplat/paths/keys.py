@@ -80,8 +80,13 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
     roll = np.zeros((len(at), 3))
     roll[:, 2] = values[:, 0]
     cam_from_world = (turned * Rotation.from_rotvec(roll)).inv().as_matrix()
+    # a key's own camera to the last bit: what is seen there is what was recorded
+    exact = {key.frame: key.camera for key in keys if key.roll == 0}
     cameras = []
     for index, (rotation, position) in enumerate(zip(cam_from_world, path, strict=True)):
+        if (own := exact.get(float(at[index]))) is not None:
+            cameras.append(own)
+            continue
         fx, fy = np.exp(values[index, 1:3])
         cameras.append(
             replace(

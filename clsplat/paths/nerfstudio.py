@@ -43,7 +43,8 @@ def read_camera_path(path: Path, document: dict[str, Any]) -> Shot:
     cameras = [
         _camera(Keys(path, f"key {index}", entry, {}), projection, width, height) for index, entry in enumerate(entries)
     ]
-    return Shot(numbered(cameras, fps=fps if fps and fps > 0 else None))
+    fps = fps if fps and fps > 0 else None
+    return Shot(numbered(cameras, fps=fps), fps=fps)
 
 
 def image_side(keys: Keys, key: str) -> int:

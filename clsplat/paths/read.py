@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 from clsplat.errors import InputError
@@ -65,11 +66,13 @@ def choose_shot(
 
         if (kind := shot.frames[0].camera.projection) not in ("perspective", "orthographic"):
             raise InputError(f"{cameras}: its cameras are {kind}, --path needs perspective or orthographic ones")
-        shot = Shot(numbered(PATHS[path](shot.cameras, COUNT if count is None else count)), shot.warnings)
+        made = numbered(PATHS[path](shot.cameras, COUNT if count is None else count))
+        shot = Shot(made, shot.warnings, unapplied=shot.unapplied)
     shot = shot if frames is None else shot.only(frames)
     far = min(frame.camera.far for frame in shot.frames)
-    if far < math.inf:
-        shot = Shot(shot.frames, (*shot.warnings, f"{cameras}: its far plane ({far:g}) is not applied"))
+    unapplied = (*((f"far plane ({far:g})",) if far < math.inf else ()), *shot.unapplied)
+    if unapplied:
+        shot = replace(shot, warnings=(*shot.warnings, f"{cameras}: not applied: {', '.join(unapplied)}"))
     return shot
 
 

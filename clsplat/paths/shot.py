@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from clsplat.camera import Camera
@@ -30,10 +30,13 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """frames: numbers rise; warnings: a line each, for the user."""
+    """frames: numbers rise; warnings: a line each, for the user; fps: frames a second, where the source says it;
+    unapplied: what the source has and no frame shows."""
 
     frames: tuple[Frame, ...]
     warnings: tuple[str, ...] = ()
+    fps: float | None = None
+    unapplied: tuple[str, ...] = ()
 
     @property
     def cameras(self) -> list[Camera]:
@@ -55,7 +58,7 @@ class Shot:
         warnings = self.warnings
         if missing:
             warnings += (f"--frames {text}: {len(missing)} of these frames do not exist; {have}",)
-        return Shot(tuple(frame for frame in self.frames if frame.number in asked), warnings)
+        return replace(self, frames=tuple(frame for frame in self.frames if frame.number in asked), warnings=warnings)
 
     def check(self, channels: Iterable[str] = ()) -> None:
         """Raises InputError where these channels are not defined: motion from one projection to another."""

@@ -27,6 +27,9 @@ ORTHOGRAPHIC_UNIT = 0.1
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
     """The frames of a stage's camera, from its start time code to its end, or the samples' where it has no range.
 
+    Its rate is the stage's timeCodesPerSecond, for which USD takes framesPerSecond where that alone is authored. What
+    is authored and not applied is in the shot's `unapplied`.
+
     size: width and height in pixels; one follows from the other by the first frame's aperture; if neither is given
     they are the stage's render settings'. The horizontal aperture fills the width, pixels are square. prim: path or
     name of the camera, if the stage has several. What USD warns of becomes the shot's warnings. Raises InputError for a
@@ -59,8 +62,44 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
             time = None if len(codes) == 1 or per_second <= 0 else (code - start) / per_second
             frames.append(Frame(code, _camera(f"{where} at {code}", camera, code, width, height), f"{code:04d}", time))
     # without the end of the line, where USD has the stage's address in memory
+    unapplied = _unapplied(stage, camera, codes)
     told = [each.commentary.split(" (instantiating")[0] for each in diagnostics.TakeUncoalescedDiagnostics()]
-    return Shot(tuple(frames), tuple(f"{path}: USD says: {' '.join(line.split())}" for line in told[:3]))
+    warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in told[:3])
+    return Shot(tuple(frames), warnings, per_second if 0 < per_second < math.inf else None, unapplied)
+
+
+def _unapplied(stage: Any, camera: Any, codes: list[int]) -> tuple[str, ...]:
+    """Attributes of the camera and of the stage's render settings that are authored, would change a frame and are not
+    applied: their names, with the first value."""
+    from pxr import UsdGeom, UsdRender
+
+    usual: dict[str, Any] = {
+        "fStop": 0.0,
+        "focusDistance": 0.0,
+        "shutter:open": 0.0,
+        "shutter:close": 0.0,
+        "exposure": 0.0,
+    }
+    usual |= {"clippingPlanes": (), "stereoRole": UsdGeom.Tokens.mono}
+    found = [_authored(camera.GetPrim(), name, value, codes) for name, value in usual.items()]
+    if settings := UsdRender.Settings.GetStageRenderSettings(stage):
+        usual = {"pixelAspectRatio": 1.0, "aspectRatioConformPolicy": None, "dataWindowNDC": (0, 0, 1, 1)}
+        found += [_authored(settings.GetPrim(), name, value, codes) for name, value in usual.items()]
+    return tuple(filter(None, found))
+
+
+def _authored(prim: Any, name: str, usual: Any, codes: list[int]) -> str:
+    """Name and value of the attribute where another than the usual one is authored, else ''."""
+    attribute = prim.GetAttribute(name)
+    if not attribute or not attribute.HasAuthoredValue():
+        return ""
+    for code in (codes[0], codes[-1], *attribute.GetTimeSamples()):
+        value = attribute.Get(code)
+        if isinstance(usual, tuple) and value is not None and tuple(value) != usual:
+            return name
+        if not isinstance(usual, tuple) and value not in (None, usual):
+            return f"{name} ({value:g})" if isinstance(value, float) else f"{name} ({value})"
+    return ""
 
 
 def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.gaussians import Gaussians
+from clsplat.images import steps_of
 
 Float32 = NDArray[np.float32]
 Image = NDArray[np.uint8]
@@ -90,8 +91,7 @@ def edited(gaussians: Gaussians, look: Look) -> Gaussians:
 
 def colour_picture(image: Float32) -> Image:
     """(H, W, 3) uint8 of a frame, with the bits that `clsplat render` writes to a PNG."""
-    levels = np.rint(np.clip(np.nan_to_num(image), 0, 1).astype(np.float64) * 255)
-    return np.ascontiguousarray(levels.astype(np.uint8))
+    return steps_of([image], 8)
 
 
 def alpha_picture(alpha: Float32) -> Image:

@@ -6,10 +6,12 @@ What is served are viser's own page and the messages of its web socket; no path 
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import functools
+import http
 import io
 import ipaddress
+import logging
 import os
 import re
 import socket
@@ -23,7 +25,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError
+from clsplat.config import HOST, PORT
+from clsplat.errors import InputError, plain
 from clsplat.viewer.session import Start, read_pose
 from clsplat.viewer.viewing import Viewing
 
@@ -31,8 +34,8 @@ if TYPE_CHECKING:
     from clsplat.scene import View
 
 Float64 = NDArray[np.float64]
-LOCAL = r"https?://(localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
-"""Where a page may come from that talks to a server for this machine alone."""
+LOCAL = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
+"""What a server for this machine alone may be asked for as."""
 FAR = 1000.0
 """viser's own far plane, of what it draws itself: cameras and boxes."""
 
@@ -54,8 +57,8 @@ class World:
 class Address:
     """Where the server listens, and the folder for paths that are saved, None for none."""
 
-    host: str = "127.0.0.1"
-    port: int = 8080
+    host: str = HOST
+    port: int = PORT
     paths: Path | None = None
 
     def check(self) -> None:
@@ -114,7 +117,7 @@ class Server:
 
         self.viewing, self.world, self.address = viewing, world, address
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # who has left is no news
-        with _quiet(), _origins(address):
+        with _quiet(), _guarded(address):
             self._server: Any = viser.ViserServer(host=address.host, port=address.port, label="clsplat", verbose=False)
         server = self._server
         server.request_share_url = lambda *_, **__: None  # a page may not ask for a tunnel out of this machine
@@ -190,17 +193,58 @@ def _quiet() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _origins(address: Address) -> Iterator[None]:
-    """Inside, a server for this machine alone refuses pages that other sites have made a browser on it open: viser has
-    no setting for that, the library it listens with has."""
-    if not address.local:
-        yield
-        return
+def _guarded(address: Address) -> Iterator[None]:
+    """Inside, a server refuses pages that are not its own, which a browser here may have open, and what makes no sense
+    ends its connection, with a line. viser has no setting for that, the library it listens with has."""
     from websockets.asyncio import server
 
     usual = server.serve
-    server.serve = functools.partial(usual, origins=[re.compile(LOCAL), None])  # type: ignore[misc, assignment]
+    log = logging.getLogger("clsplat.viewer")  # of its own: the usual one prints tracebacks of requests that are none
+    log.propagate = False
+    log.addHandler(logging.NullHandler())
+
+    def serve(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def asked(connection: Any, request: Any) -> Any:
+            if reason := refused(request.headers, local=address.local):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
+            return process_request(connection, request) if process_request else None
+
+        async def handled(connection: Any) -> None:
+            asyncio.get_running_loop().set_exception_handler(_tell)
+            try:
+                await handler(connection)
+            except Exception as error:  # noqa: BLE001  # whatever a message has led to
+                _tell(None, {"exception": error})
+                await connection.close(1007)
+
+        return usual(handled, *arguments, process_request=asked, logger=log, **options)
+
+    server.serve = serve  # type: ignore[misc, assignment]
     try:
         yield
     finally:
         server.serve = usual  # type: ignore[misc]
+
+
+def _tell(_: Any, context: dict[str, Any]) -> None:
+    """A line in place of a traceback; as asyncio has it for what goes wrong in its tasks."""
+    error = context.get("exception")
+    words = f"{type(error).__name__}: {error}" if error is not None else str(context.get("message", ""))
+    told = plain(" ".join(words.split()))[:200].rstrip(": ")
+    print(f"clsplat: warning: a page sent what makes no sense here: {told}", file=sys.stderr)
+
+
+def refused(headers: Any, *, local: bool) -> str:
+    """Why a request is not answered, '' if it is: it comes from a page that is not this server's, or, of a server for
+    this machine alone, asks for another name, as when a foreign name has been led here.
+
+    Ports count, but not which: a tunnel (ssh -L) may have led another one here. A request without an origin is from no
+    page."""
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+    if len(hosts) != 1 or len(origins) > 1:
+        return "expected one Host, and at most one Origin"
+    if local and not re.fullmatch(LOCAL, hosts[0]):
+        return "this server is for its machine alone, as localhost"
+    if origins and re.sub("^https?://", "", origins[0].lower()) != hosts[0].lower():
+        return "pages of other servers are not let in"
+    return ""

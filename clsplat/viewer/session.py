@@ -55,10 +55,12 @@ class Pose:
     height: int
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
-        """Of the page's size or another; where that has another shape, the vertical angle is kept."""
+        """Of the page's size or another; where that has another shape, the vertical angle is kept. To the last bit as a
+        file of cameras has it (`Recorder.document`), which holds a quaternion and degrees."""
         across, down = width or self.width, height or self.height
-        focal = focal_length(self.fov, down)
-        turn = self.rotation.T
+        focal = focal_length(math.radians(math.degrees(self.fov)), down)
+        quaternion = quaternion_of(self.rotation)
+        turn = rotation_from_quaternion(quaternion / float(np.linalg.norm(quaternion))).T
         return Camera(across, down, focal, focal, across / 2, down / 2, turn, -turn @ self.position)
 
     def same(self, other: Pose | None) -> bool:
