@@ -34,7 +34,7 @@ from clsplat.config import (
     TrainConfig,
     bundled,
 )
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError, InputError, system_trouble
 from clsplat.picture_config import ColourConfig, DeepConfig, FramingConfig, SamplingConfig, VideoConfig
 from clsplat.process import reader_has_gone
 
@@ -490,6 +490,10 @@ def _unboxed(report: str) -> str:
 
 def one_line(error: BaseException) -> str:
     """The error's message without line breaks."""
+    if isinstance(error, OSError) and not isinstance(error, ClsplatError):
+        return system_trouble(error)
+    if isinstance(error, MemoryError) and not isinstance(error, ClsplatError):
+        return f"there is not enough main memory: {' '.join(str(error).split()) or 'the system gave no more'}"
     return " ".join(str(error).split()) or type(error).__name__
 
 

@@ -32,6 +32,7 @@ from clsplat.files import (
     parse_json,
     read_document,
     remove,
+    write_error,
 )
 from clsplat.gaussians import Gaussians
 
@@ -152,7 +153,7 @@ class Run:
             with open(self.metrics_path, "a", encoding="utf-8", newline="\n") as file:
                 file.write(line + "\n")
         except OSError as error:  # a full disk does not say which file it was
-            raise OSError(error.errno, error.strerror, str(self.metrics_path)) from None
+            raise write_error(self.metrics_path, error, needs=len(line) + 1) from None
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """The records of metrics.jsonl; a cut last line, as a crash leaves it, is left out."""
@@ -190,7 +191,7 @@ class Run:
         self.checkpoints_path.mkdir(parents=True, exist_ok=True)
         path = self.checkpoints_path / f"step-{step:07d}.npz"
         members: Arrays = {STATE_KEY: np.frombuffer(text.encode(), np.uint8), **arrays}
-        with atomic_writer(path) as file:
+        with atomic_writer(path, sum(array.nbytes + 512 for array in members.values())) as file:
             np.savez(file, allow_pickle=False, **members)
         earlier = [(s, p) for s, p in self.checkpoints() if s <= step]
         keep = {p for _, p in earlier[-KEPT_CHECKPOINTS:]}

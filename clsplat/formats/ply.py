@@ -173,8 +173,9 @@ def write(
     lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
     lines += [f"element {LOCAL} {count}", *(f"property float {name}" for name in POSITION)] if far else []
     lines += ["end_header", ""]
-    with atomic_writer(path) as file:
-        file.write("\n".join(lines).encode("ascii"))
+    head = "\n".join(lines).encode("ascii")
+    with atomic_writer(path, len(head) + 4 * count * (len(names) + (3 if far else 0))) as file:
+        file.write(head)
         for start in range(0, len(gaussians), BLOCK_ROWS):
             rows = slice(start, start + BLOCK_ROWS)
             sh = gaussians.sh[rows]

@@ -18,7 +18,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,7 +30,7 @@ from numpy.typing import NDArray
 
 from clsplat.edit import merge
 from clsplat.errors import InputError, plain
-from clsplat.files import atomic_writer, native_name, open_input
+from clsplat.files import atomic_writer, native_name, open_input, scratch_folder
 from clsplat.formats import conventions, packing
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
@@ -218,20 +217,29 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     from pxr import Usd, UsdUtils
 
     suffix = path.suffix.lower()
-    # USD may hold its file open for longer, which Windows does not remove
-    with tempfile.TemporaryDirectory(prefix="clsplat-usd-", ignore_cleanup_errors=True) as folder:
-        made = Path(folder) / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
+    with scratch_folder(4 * sum(array.size for array in _arrays(gaussians))) as folder:
+        made = folder / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
         stage = Usd.Stage.CreateNew(native_name(made))
         _author(stage, gaussians, up_axis, meters_per_unit)
         stage.GetRootLayer().Save()
         del stage
         if suffix == ".usdz":
-            package = Path(folder) / "gaussians.usdz"
+            package = folder / "gaussians.usdz"
             if not UsdUtils.CreateNewUsdzPackage(native_name(made), native_name(package)):
                 raise OSError(f"{path}: USD could not make the package")
             made = package
-        with atomic_writer(path) as file, made.open("rb") as source:
+        with atomic_writer(path, made.stat().st_size) as file, made.open("rb") as source:
             shutil.copyfileobj(source, file, 1 << 20)
+
+
+def _arrays(gaussians: Gaussians) -> tuple[Float32, ...]:
+    return (
+        gaussians.means,
+        gaussians.quaternions,
+        gaussians.log_scales,
+        gaussians.opacity_logits,
+        gaussians.sh,
+    )
 
 
 def _author(stage: Any, gaussians: Gaussians, up_axis: str, meters_per_unit: float) -> None:
