@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -22,7 +23,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 from scipy import sparse
 
-from clsplat.errors import ClsplatError, InputError, WriteError, plain
+from clsplat.errors import ClsplatError, InputError, WriteError, examples, plain, reason_of
 from clsplat.files import (
     is_file,
     native_name,
@@ -56,12 +57,59 @@ SIGNATURES = (
 HARMLESS = ("extraneous bytes",)
 
 
+COMPANION = (
+    r"(?:depths?|disp|disparity|normals?|alpha|albedo|masks?|matte|seg|segmentation|semantics?|confidence|conf|flow"
+    r"|edges?)"
+)
+_COMPANION_FOLDER = re.compile(rf"(?:\w+[_-])?{COMPANION}(?:[_-]\w+)?", re.IGNORECASE)
+_COMPANION_AFTER = re.compile(rf"[._-]?{COMPANION}(?:[._-]?(?:\d+|vis|map|raw|image))*", re.IGNORECASE)
+_COMPANION_BEFORE = re.compile(rf"(?:dynamic[._-])?{COMPANION}(?:[._-]map)?[._-]", re.IGNORECASE)
+_COLOUR = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE)
+
+
+def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) -> set[Path]:
+    """Those of `paths` that go with one of the pictures and are none: masks, depths, normals and the like.
+
+    By name: a picture's own with such a word behind it (r_0_depth_0001.png) or before it (mask_r_0.png), in place of
+    "color" (frame-1.color.jpg, frame-1.depth.png), or with .png behind its extension (COLMAP's masks); and whatever is
+    in a sub-folder of `folder` that is called by such a word.
+    """
+    pictures = list(pictures)
+
+    def is_beside(path: Path) -> bool:
+        inside = path.parent.relative_to(folder).parts if path.is_relative_to(folder) else ()
+        return any(_COMPANION_FOLDER.fullmatch(part) for part in inside)
+
+    folders = {picture.parent for picture in pictures}
+    others = [picture for picture in pictures if not is_beside(picture)]
+    pictures, alone = others or pictures, not others
+    names = {picture.name for picture in pictures}
+    stems = {picture.stem for picture in pictures} | names
+    stems |= {_COLOUR.sub("", stem) for stem in stems}
+    return {
+        path
+        for path in paths
+        if (is_beside(path) and not (path.parent in folders and (alone or path.stem not in stems)))
+        or _goes_with(path, names, stems)
+    }
+
+
+def _goes_with(path: Path, names: set[str], stems: set[str]) -> bool:
+    if path.stem in names and path.suffix.lower() == ".png":
+        return True
+    before = _COMPANION_BEFORE.match(path.stem)
+    if before and path.stem[before.end() :] in stems:
+        return True
+    return any(path.stem[:at] in stems and _COMPANION_AFTER.fullmatch(path.stem, at) for at in range(1, len(path.stem)))
+
+
 def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     """All pictures (by extension) under `folder`, if `deep` with its sub-folders, sorted; hidden files and folders are
-    left out. Links to folders are followed, to each folder once."""
+    left out, and links that lead nowhere. Links to folders are followed, to each folder once. Raises InputError for a
+    folder that cannot be read."""
     found: list[Path] = []
     seen: set[str] = set()
-    for root, folders, files in os.walk(folder, followlinks=True):
+    for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
         real = os.path.realpath(root)  # not the inode: some file systems of Windows number every folder 0
         if real in seen:
             folders.clear()
@@ -71,20 +119,21 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
         found += [
             path
             for path in (Path(root, name) for name in files)
-            if not path.name.startswith(".") and path.suffix.lower() in EXTENSIONS
+            if not path.name.startswith(".") and path.suffix.lower() in EXTENSIONS and is_file(path)
         ]
     return sorted(found)
+
+
+def cannot_be_searched(error: OSError) -> None:
+    """For `os.walk`, which else passes over a folder that it cannot read. Raises InputError."""
+    why = reason_of(error)
+    raise InputError(f"{error.filename}: cannot be searched for pictures: {why}; make it readable or move it away")
 
 
 def require_images(paths: Iterable[Path], listed_in: Path) -> None:
     """Raise InputError that names the files of `paths` that do not exist; `listed_in` is what lists them."""
     if missing := [path for path in paths if not is_file(path)]:
-        raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {name_all(missing)}")
-
-
-def name_all(paths: Sequence[Path]) -> str:
-    """The paths, for a message of one line; however many, as each has to be looked for."""
-    return ", ".join(str(path) for path in paths)
+        raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {examples(missing)}")
 
 
 def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
