@@ -215,6 +215,8 @@ class Render:
     preset: Annotated[Preset | None, arg(metavar="exact|default|fast")] = None
     """Bundle of rasterizer settings; the run's own, or the default's, if not given. A --rasterizer flag goes before
     it."""
+    overwrite: Flag = False
+    """Replace a video that is there. Pictures of frames are replaced in any case, but for --skip-existing."""
     skip_existing: Flag = False
     """Leave out frames whose file is there and can be read to its end, in this size and with these channels."""
     dry_run: Flag = False
@@ -259,6 +261,8 @@ class Bench:
     """Bundle of rasterizer settings; a --rasterizer flag goes before it."""
     plot: Annotated[Path | None, arg(metavar="FILE")] = None
     """Measure every setting of the rasterizer too, and plot run time against error: .svg or .png."""
+    overwrite: Flag = False
+    """Replace the plot that is there."""
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
@@ -393,7 +397,7 @@ def parse(arguments: Sequence[str]) -> Verb:
         default = replace(verb, config=config, overwrite=False, json=False, view=False)
         verb = _tyro(Train, arguments[1:], prog="clsplat train", default=default)
     elif isinstance(verb, Bench) and verb.preset != "default":
-        bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False)
+        bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False, overwrite=False)
         verb = _tyro(Bench, arguments[1:], prog="clsplat bench", default=bench)
     elif isinstance(verb, Render) and (verb.preset is not None or verb.model.is_dir()):
         from clsplat.formats import model_path
@@ -406,7 +410,7 @@ def parse(arguments: Sequence[str]) -> Verb:
             bundle = Run.open(verb.model).config.rasterizer
         if bundle != RasterizerConfig():
             unset: dict[str, Any] = dict.fromkeys(
-                ("alpha", "deep", "json", "skip_existing", "dry_run", "profile"), False
+                ("alpha", "deep", "json", "overwrite", "skip_existing", "dry_run", "profile"), False
             )
             render = replace(verb, rasterizer=bundle, **unset)
             verb = _tyro(Render, arguments[1:], prog="clsplat render", default=render)

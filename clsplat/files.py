@@ -68,6 +68,23 @@ def _is_abandoned(path: Path, token: str) -> bool:
     return time.time() - path.stat().st_mtime > ABANDONED
 
 
+def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
+    """Raise InputError where a file that is named to be written is there already, or is one of those that are read,
+    unless it may be replaced; where it is a folder, or has none to be in, in any case."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected the name of a file to write")
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such folder, expected one for {path.name}")
+    if overwrite or not (path.exists() or path.is_symlink()):
+        return
+    if any(source.exists() and path.exists() and source.samefile(path) for source in sources):
+        raise InputError(
+            f"{path}: is what is read, and would be replaced by what is made of it; name another file, or give "
+            "--overwrite to change it in place"
+        )
+    raise InputError(f"{path}: is there already; name another file, or give --overwrite to replace it")
+
+
 @contextmanager
 def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[BinaryIO]:
     """Open a binary file that takes the place of `path` when the block ends well, and never exists otherwise.

@@ -343,7 +343,7 @@ def _as_rgb(path: Path, pixels: Float32, spec: Any) -> Float32:
     else:
         others = [index for index in range(len(names)) if index != alpha]
         if len(others) not in (1, 3):
-            listed = ", ".join(spec.channelnames)
+            listed = examples(spec.channelnames)
             raise InputError(f"{path}: has the channels {listed}; expected grey or RGB, with alpha or without")
         colour = others * 3 if len(others) == 1 else others
     return pixels[:, :, [*colour, alpha] if alpha >= 0 else colour]

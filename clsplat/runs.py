@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import clsplat
 from clsplat.config import TrainConfig
-from clsplat.errors import ClsplatError, InputError, plain
+from clsplat.errors import ClsplatError, InputError, examples, plain
 from clsplat.files import (
     TEMPORARY_SUFFIX,
     atomic_write,
@@ -266,7 +266,7 @@ def _read_checkpoint(path: Path) -> Checkpoint:
     digests = record.get("sha256")  # runs of earlier versions have none
     if digests is not None:
         if not isinstance(digests, dict) or arrays.keys() != digests.keys():
-            other = ", ".join(sorted(arrays.keys() ^ set(digests)))[:200] if isinstance(digests, dict) else "no list"
+            other = examples(sorted(arrays.keys() ^ set(digests)))[:200] if isinstance(digests, dict) else "no list"
             raise ValueError(f"it has not the arrays it was written with ({other})")
         for name, array in arrays.items():
             if _digest(array) != digests[name]:

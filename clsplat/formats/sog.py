@@ -59,6 +59,8 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 META = "meta.json"
+PICTURES = ("means", "quats", "scales", "sh0", "shN")
+"""Beginnings of the pictures' names that are written."""
 MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
 LARGEST_TAG = 252
