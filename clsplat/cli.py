@@ -332,8 +332,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status = _run(arguments)
         sys.stdout.flush()  # here and not at the interpreter's end, where a reader that has gone would be a traceback
     except OSError as error:
-        if not reader_has_gone(error):
-            raise
+        if not reader_has_gone(error):  # a file that standard output goes to cannot be written
+            _tell(f"clsplat: error: standard output: {system_trouble(error)}")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return status
@@ -368,7 +368,7 @@ def _run(arguments: Sequence[str] | None) -> int:
                 raise
             if debug:
                 traceback.print_exc()
-            print(f"clsplat: error: {one_line(error)}", file=sys.stderr)
+            _tell(f"clsplat: error: {one_line(error)}")
             return error.exit_status if isinstance(error, ClsplatError) else 1
         except Exception as error:
             if debug or not type(error).__module__.startswith("pyopencl"):
@@ -426,7 +426,7 @@ def _tyro(kind: Any, arguments: Sequence[str], **options: Any) -> Any:
             return tyro.cli(kind, args=list(arguments), **options)
     except SystemExit as error:
         if error.code == 2:
-            print(f"clsplat: error: {_unboxed(report.getvalue())}", file=sys.stderr)
+            _tell(f"clsplat: error: {_unboxed(report.getvalue())}")
         else:
             sys.stderr.write(report.getvalue())
         raise
@@ -490,6 +490,12 @@ def _unboxed(report: str) -> str:
         else:
             words.append(text)
     return " ".join(" ".join(words).split()) or "the call is wrong, see clsplat --help"
+
+
+def _tell(line: str) -> None:
+    """On standard error, if that takes it: the status says the same."""
+    with contextlib.suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
 
 
 def one_line(error: BaseException) -> str:

@@ -177,6 +177,16 @@ def too_deep(path: Path) -> Path:
     return path
 
 
+def test_text_that_refers_to_others_is_tried_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "shot.usda"
+    path.write_text("#usda 1.0\n(\n    subLayers = [@damaged.usdc@]\n)\n")
+    monkeypatch.setattr(usd, "_lives", lambda *_: False)
+    for read in (usd.read, lambda each: read_shot(each, size=(64, 48))):
+        with pytest.raises(InputError, match=r"shot\.usda: USD's library crashes when it reads it; is it damaged"):
+            read(path)
+
+
+@pytest.mark.slow
 def test_text_that_leads_to_a_file_that_crashes_the_library(tmp_path: Path) -> None:
     too_deep(tmp_path / "damaged.usda")
     path = tmp_path / "shot.usda"
@@ -186,6 +196,7 @@ def test_text_that_leads_to_a_file_that_crashes_the_library(tmp_path: Path) -> N
             read(path)
 
 
+@pytest.mark.slow
 def test_cameras_that_crash_the_library(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"deep\.usda: USD's library crashes when it reads it"):
         read_shot(too_deep(tmp_path / "deep.usda"), size=(64, 48))
