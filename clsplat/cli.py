@@ -494,8 +494,10 @@ def _unboxed(report: str) -> str:
 
 def _tell(line: str) -> None:
     """On standard error, if that takes it: the status says the same."""
-    with contextlib.suppress(OSError):
+    try:
         print(line, file=sys.stderr, flush=True)
+    except OSError:  # what is left of it would make the interpreter end with a status of its own
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 def one_line(error: BaseException) -> str:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from clsplat import layers
 from clsplat.camera import Camera
-from clsplat.errors import InputError
+from clsplat.errors import InputError, reason_of
 from clsplat.files import abandoned
 from clsplat.frames import output_paths
 from clsplat.paths import Shot
@@ -118,7 +118,7 @@ def make_folders(tasks: Sequence[Task]) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+            raise InputError(f"{folder}: cannot be made: {reason_of(error)}") from None
 
 
 def remove_temporaries(tasks: Sequence[Task]) -> None:

@@ -147,7 +147,9 @@ def _check_video(verb: Render) -> None:
     if reason := video_missing():
         raise InputError(f"{verb.output}: {reason}")
     if verb.skip_existing:
-        raise InputError("--skip-existing: a video is written as a whole, expected a call without, or a file a frame")
+        raise InputError(
+            "--skip-existing: a video is written as a whole; leave the flag out, or write a picture for each frame"
+        )
 
 
 def _check_pictures(tasks: list[Task], options: RenderOptions) -> None:

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeVar, get_args, get_origin, get_type_hints
 from zipfile import ZIP_STORED, ZipFile
@@ -377,7 +378,9 @@ def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
         raise InputError(f"{path}: not readable as TOML ({error})") from None
     for key in document:
         if key not in ("clsplat", "scene", "train"):
-            raise InputError(f"{path}: unknown key {key!r}, expected clsplat, scene or train")
+            raise InputError(
+                f"{path}: has {key!r}, which is no setting; expected clsplat, scene and the tables of train"
+            )
     scene = document.get("scene")
     config = _from_table(TrainConfig, document.get("train", {}), path, "train")
     try:
@@ -396,12 +399,27 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str) -> T:
     values = {}
     for key, value in table.items():
         if key not in names:
-            raise InputError(f"{path}: unknown key '{where}.{key}', expected one of {', '.join(names)}")
+            raise InputError(f"{path}: [{where}] has {key!r}, which is no setting there; {_meant(key, where)}")
         if is_dataclass(types[key]):
             values[key] = _from_table(types[key], value, path, f"{where}.{key}")
         else:
             values[key] = _value(types[key], value, f"{path}: {where}.{key}")
     return cls(**values)
+
+
+def _meant(key: str, where: str) -> str:
+    """Where a setting of that name, or one like it, belongs."""
+    tables = {"train": TrainConfig} | {
+        f"train.{name}": kind for name, kind in get_type_hints(TrainConfig).items() if is_dataclass(kind)
+    }
+    places = {f.name: table for table, kind in reversed(tables.items()) for f in fields(kind)}
+    if key in places:
+        return f"it belongs to [{places[key]}]"
+    here = [name for name, table in places.items() if table == where]
+    near = get_close_matches(key, here, 1) or get_close_matches(key, places, 1)
+    if near:
+        return f"did you mean {near[0]!r} in [{places[near[0]]}]?"
+    return "take it out: was it written by another version?"
 
 
 def _value(kind: Any, value: Any, what: str) -> Any:
@@ -417,4 +435,5 @@ def _value(kind: Any, value: Any, what: str) -> Any:
         return float(value)
     elif type(value) is kind and not (kind is int and abs(value) >= 1 << 62):
         return value
-    raise InputError(f"{what} is {value!r}, expected {getattr(kind, '__name__', kind)}")
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+    raise InputError(f"{what} is {value!r}, expected {words.get(kind, 'a list of whole numbers')}")

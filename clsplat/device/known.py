@@ -20,6 +20,7 @@ from typing import Any
 import pyopencl as cl
 
 from clsplat.device.source import kernel_root, kernel_source
+from clsplat.errors import reason_of
 from clsplat.files import atomic_write, parse_json
 
 BREAK = "CLSPLAT_BREAK_KERNEL"
@@ -142,7 +143,7 @@ def _remember(
         atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
     except OSError as error:
         _unwritten[path] = saved
-        tell_once(f"{path}: cannot be written ({error.strerror}), drivers are tested anew each time")
+        tell_once(f"{path}: cannot be written ({reason_of(error)}), so that drivers are tested anew each time")
 
 
 @lru_cache(maxsize=8)

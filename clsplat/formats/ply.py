@@ -244,7 +244,9 @@ def read_header(file: BinaryIO, path: Path) -> Header:
                 case _:
                     raise ValueError
         except (ValueError, KeyError, IndexError):
-            raise InputError(f"{path}: PLY header has a line that is none: {' '.join(words)[:80]!r}") from None
+            raise InputError(
+                f"{path}: PLY header has a line that is of no PLY header: {' '.join(words)[:80]!r}"
+            ) from None
     raise InputError(f"{path}: PLY header is truncated or damaged (no line 'end_header')")
 
 
@@ -317,7 +319,7 @@ def _check_properties(vertex: Element, path: Path) -> int:
     rest = sum(name.startswith("f_rest_") for name in names)
     counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 2)]
     if rest not in counts:
-        raise InputError(f"{path}: PLY has {rest} f_rest properties, expected {', '.join(map(str, counts))}")
+        raise InputError(f"{path}: PLY has {rest} f_rest properties, expected {', '.join(map(str, counts))} (SH)")
     for index in range(rest):
         if f"f_rest_{index}" not in names:
             raise InputError(f"{path}: PLY lacks the property f_rest_{index}, though it has {rest} of f_rest")
