@@ -9,10 +9,13 @@ import sys
 
 def main() -> int:
     """Run the command line in `sys.argv`; returns the exit status."""
-    output = sys.stdout
-    if isinstance(output, io.TextIOWrapper) and output.errors == "strict":
-        output.reconfigure(errors="backslashreplace")  # a path may have letters that the stream's encoding lacks
     try:
+        from clsplat.process import fill_closed_streams
+
+        fill_closed_streams()
+        output = sys.stdout
+        if isinstance(output, io.TextIOWrapper) and output.errors == "strict":
+            output.reconfigure(errors="backslashreplace")  # a path may have letters that the stream's encoding lacks
         from clsplat.cli import main as run
 
         return run()

@@ -37,7 +37,7 @@ from clsplat.config import (
     TrainConfig,
     bundled,
 )
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError, InputError, system_trouble
 from clsplat.picture_config import ColourConfig, DeepConfig, FramingConfig, SamplingConfig, VideoConfig
 from clsplat.process import reader_has_gone
 
@@ -218,6 +218,8 @@ class Render:
     preset: Annotated[Preset | None, arg(metavar="exact|default|fast")] = None
     """Bundle of rasterizer settings; the run's own, or the default's, if not given. A --rasterizer flag goes before
     it."""
+    overwrite: Flag = False
+    """Replace a video that is there. Pictures of frames are replaced in any case, but for --skip-existing."""
     skip_existing: Flag = False
     """Leave out frames whose file is there and can be read to its end, of this size, these channels, this model and,
     as far as it says so (EXR, PNG), made with these cameras and settings."""
@@ -263,6 +265,8 @@ class Bench:
     """Bundle of rasterizer settings; a --rasterizer flag goes before it."""
     plot: Annotated[Path | None, arg(metavar="FILE")] = None
     """Measure every setting of the rasterizer too, and plot run time against error: .svg or .png."""
+    overwrite: Flag = False
+    """Replace the plot that is there."""
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
@@ -332,8 +336,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status = _run(arguments)
         sys.stdout.flush()  # here and not at the interpreter's end, where a reader that has gone would be a traceback
     except OSError as error:
-        if not reader_has_gone(error):
-            raise
+        if not reader_has_gone(error):  # a file that standard output goes to cannot be written
+            _tell(f"clsplat: error: standard output: {system_trouble(error)}")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return status
@@ -368,7 +372,7 @@ def _run(arguments: Sequence[str] | None) -> int:
                 raise
             if debug:
                 traceback.print_exc()
-            print(f"clsplat: error: {one_line(error)}", file=sys.stderr)
+            _tell(f"clsplat: error: {one_line(error)}")
             return error.exit_status if isinstance(error, ClsplatError) else 1
         except Exception as error:
             if debug or not type(error).__module__.startswith("pyopencl"):
@@ -397,7 +401,7 @@ def parse(arguments: Sequence[str]) -> Verb:
         default = replace(verb, config=config, overwrite=False, json=False, view=False)
         verb = _tyro(Train, arguments[1:], prog="clsplat train", default=default)
     elif isinstance(verb, Bench) and verb.preset != "default":
-        bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False)
+        bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False, overwrite=False)
         verb = _tyro(Bench, arguments[1:], prog="clsplat bench", default=bench)
     elif isinstance(verb, Render) and (verb.preset is not None or verb.model.is_dir()):
         from clsplat.formats import model_path
@@ -410,7 +414,7 @@ def parse(arguments: Sequence[str]) -> Verb:
             bundle = Run.open(verb.model).config.rasterizer
         if bundle != RasterizerConfig():
             unset: dict[str, Any] = dict.fromkeys(
-                ("alpha", "deep", "json", "skip_existing", "dry_run", "profile"), False
+                ("alpha", "deep", "json", "overwrite", "skip_existing", "dry_run", "profile"), False
             )
             render = replace(verb, rasterizer=bundle, **unset)
             verb = _tyro(Render, arguments[1:], prog="clsplat render", default=render)
@@ -426,7 +430,7 @@ def _tyro(kind: Any, arguments: Sequence[str], **options: Any) -> Any:
             return tyro.cli(kind, args=list(arguments), **options)
     except SystemExit as error:
         if error.code == 2:
-            print(f"clsplat: error: {_unboxed(report.getvalue())}", file=sys.stderr)
+            _tell(f"clsplat: error: {_unboxed(report.getvalue())}")
         else:
             sys.stderr.write(report.getvalue())
         raise
@@ -492,8 +496,20 @@ def _unboxed(report: str) -> str:
     return " ".join(" ".join(words).split()) or "the call is wrong, see clsplat --help"
 
 
+def _tell(line: str) -> None:
+    """On standard error, if that takes it: the status says the same."""
+    try:
+        print(line, file=sys.stderr, flush=True)
+    except OSError:  # what is left of it would make the interpreter end with a status of its own
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+
+
 def one_line(error: BaseException) -> str:
     """The error's message without line breaks."""
+    if isinstance(error, OSError) and not isinstance(error, ClsplatError):
+        return system_trouble(error)
+    if isinstance(error, MemoryError) and not isinstance(error, ClsplatError):
+        return f"there is not enough main memory: {' '.join(str(error).split()) or 'the system gave no more'}"
     return " ".join(str(error).split()) or type(error).__name__
 
 

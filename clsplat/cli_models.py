@@ -56,6 +56,8 @@ class Report:
     """A run's folder."""
     output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
     """The file; report.html in the run's folder if not given."""
+    overwrite: Flag = False
+    """Replace the file of --output that is there."""
     views: int = 8
     """Most held-out views with pictures: the worst, the best and some between. All are in the table."""
     json: Flag = False
@@ -70,6 +72,8 @@ class Compare:
     """Folders of runs, two or more."""
     output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
     """Write a page too, with the curves overlaid and time against error: one HTML file that loads nothing else."""
+    overwrite: Flag = False
+    """Replace the page that is there."""
     json: Flag = False
     """Print JSON instead of the table."""
 
@@ -85,6 +89,8 @@ class Convert:
     """A run's folder or a model file."""
     target: Annotated[Positional[Path], arg(metavar="OUTPUT")]
     """The file to write."""
+    overwrite: Flag = False
+    """Replace a file that is there, the source too."""
     merge: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Add the Gaussians of these model files."""
     crop: Annotated[str | None, arg(metavar="X0,Y0,Z0,X1,Y1,Z1")] = None

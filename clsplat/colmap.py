@@ -336,7 +336,7 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
 def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
     """Line numbers and lines, without comments."""
     with open_input(path, EXPECTED) as opened:
-        file, number = io.TextIOWrapper(opened, encoding="utf-8"), 0
+        file, number = io.TextIOWrapper(opened, encoding="utf-8-sig"), 0
         try:
             while line := file.readline(MAX_LINE):
                 number += 1

@@ -18,7 +18,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples
 from clsplat.picture_config import ColourConfig
 
 Float32 = NDArray[np.float32]
@@ -156,7 +156,7 @@ class Colours:
                 spaces.update({alias.lower(): each for alias in self._config.getAliases(each)})
             near = dict.fromkeys(spaces[each] for each in get_close_matches(name.lower(), spaces, 5, 0.4))
             there = (
-                f"near it are {', '.join(near)}" if near else f"it has {', '.join(self._config.getColorSpaceNames())}"
+                f"near it are {', '.join(near)}" if near else f"it has {examples(self._config.getColorSpaceNames())}"
             )
             raise InputError(f"{flag} {name}: not in the configuration {self._source}; {there}")
         for own, names in _NAMES.items():

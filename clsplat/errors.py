@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+from collections.abc import Iterable
 
 
 class ClsplatError(Exception):
@@ -17,6 +19,21 @@ def plain(text: str) -> str:
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
+def examples(names: Iterable[object], most: int = 3) -> str:
+    """The first of a list for a line of text, and how many more there are."""
+    listed = [str(name) for name in names]
+    more = len(listed) - most
+    return ", ".join(listed[:most]) + (f" and {more:,} more" if more > 0 else "")
+
+
+def amount(nbytes: int) -> str:
+    """So many bytes for a line of text, in a unit that leaves two digits or more."""
+    for unit, name in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
+        if nbytes >= 10 * unit or (unit == 2**30 and nbytes >= unit):
+            return f"{nbytes / unit:,.1f} {name}" if unit == 2**30 else f"{nbytes / unit:,.0f} {name}"
+    return f"{nbytes:,} bytes"
+
+
 class InputError(ClsplatError):
     """A file, folder or argument is wrong (exit status 2). The message, one line, names it, and what was expected."""
 
@@ -24,6 +41,47 @@ class InputError(ClsplatError):
 
     def __init__(self, message: str = "") -> None:
         super().__init__(plain(message))
+
+
+class WriteError(ClsplatError, OSError):
+    """A file that cannot be written: the system's error number, the reason in plain words, the file's name.
+
+    Exit status 2 where the name is to blame."""
+
+    def __init__(self, number: int, reason: str, path: str) -> None:
+        OSError.__init__(self, number, reason, path)
+        self.exit_status = 2 if number in _NAME else 1
+
+    def __str__(self) -> str:
+        return plain(f"{self.filename}: cannot be written: {self.strerror}")
+
+
+_NAME = (errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG)
+_REASONS = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk's quota is used up",
+    errno.EFBIG: "the file is larger than may be written here",
+    errno.EIO: "the disk does not answer as it should (input/output error)",
+    errno.EROFS: "the disk is read-only",
+    errno.EACCES: "permission is denied",
+    errno.EPERM: "permission is denied",
+    errno.ENOENT: "there is no such file or folder",
+    errno.ENOTDIR: "a part of the path is a file and no folder",
+    errno.EISDIR: "it is a folder",
+    errno.ENAMETOOLONG: "the name is too long",
+    errno.EMFILE: "too many files are open",
+}
+
+
+def reason_of(error: OSError) -> str:
+    """Why the system refused, in plain words."""
+    return _REASONS.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
+
+
+def system_trouble(error: OSError) -> str:
+    """One line about an error of the system that nobody has said more about: the file, and why."""
+    names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
+    return plain(": ".join([" to ".join(names), reason_of(error)] if names else [reason_of(error)]))
 
 
 class DeviceError(InputError):

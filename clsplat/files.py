@@ -4,14 +4,18 @@ that a system takes."""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 import re
 import secrets
+import shutil
 import socket
 import stat
 import sys
+import tempfile
+import threading
 import time
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator
@@ -20,13 +24,16 @@ from functools import cache
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, WriteError, amount, reason_of
 
 TEMPORARY_SUFFIX = ".clsplat-tmp"
 MAX_DOCUMENT = 32 << 20
 """Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
 ABANDONED = 600.0
 """Seconds without a write after which a temporary file of another machine is nobody's any more."""
+FULL = (errno.ENOSPC, errno.EDQUOT)
+PROBE = 1 << 16
+"""Bytes that are written to find out whether a disk has room."""
 WINDOWS = os.name == "nt"
 IGNORES_CASE = sys.platform in ("win32", "darwin")
 """Whether the system's usual file systems take A.png and a.png for one file, and an accented letter for its parts."""
@@ -61,36 +68,141 @@ def _is_abandoned(path: Path, token: str) -> bool:
     return time.time() - path.stat().st_mtime > ABANDONED
 
 
+def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
+    """Raise InputError where a file that is named to be written is there already, or is one of those that are read,
+    unless it may be replaced; where it is a folder, or has none to be in, in any case."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected the name of a file to write")
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such folder, expected one for {path.name}")
+    if overwrite or not (path.exists() or path.is_symlink()):
+        return
+    if any(source.exists() and path.exists() and source.samefile(path) for source in sources):
+        raise InputError(
+            f"{path}: is what is read, and would be replaced by what is made of it; name another file, or give "
+            "--overwrite to change it in place"
+        )
+    raise InputError(f"{path}: is there already; name another file, or give --overwrite to replace it")
+
+
 @contextmanager
-def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[BinaryIO]:
     """Open a binary file that takes the place of `path` when the block ends well, and never exists otherwise.
 
     The data goes to a temporary name in the same folder (a rename is atomic only within a file system), is flushed
-    to the disk and renamed. A link at `path` is followed. The folder must exist. Raises OSError as `open` and
-    `write` do, with the name `path`; the temporary file is removed on any exception, KeyboardInterrupt included.
+    to the disk and renamed. A link at `path` is followed. The folder must exist. needs: bytes that the file will have,
+    for the message of a full disk, where they are known. Raises WriteError where the system refuses, with the name
+    `path`; the temporary file is removed on any exception, KeyboardInterrupt included.
     """
     target = Path(os.path.realpath(path))
     temporary = temporary_name(target)
+    written = 0
     try:
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         # "x" and no mkstemp: the file gets the permissions that the user's umask gives any new file.
         with open(temporary, "xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
+            try:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            finally:
+                with suppress(OSError, ValueError):
+                    written = file.tell()
         replace(temporary, target)
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
-        if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
+        names = (None, str(temporary), str(path))
+        if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
             # A full disk is found by `write`, which does not know the name; and nobody knows the temporary one.
-            raise OSError(error.errno, error.strerror, str(path)) from None
+            raise write_error(path, error, written, needs) from None
         raise
     _sync_folder(target.parent)
 
 
+def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, needs: int | None = None) -> WriteError:
+    """The system's error as a plain sentence about the file that was being written; of a full disk with how much the
+    file needs, or at least what had been `written` of it, and how much is free."""
+    number, reason = error.errno or 0, reason_of(error)
+    folder = Path(os.path.realpath(path)).parent
+    if number in FULL:
+        size = f"{amount(needs)} are needed" if needs is not None else f"more than {amount(written)} are needed"
+        with suppress(OSError):
+            size += f" and {amount(shutil.disk_usage(folder).free)} are free"
+        reason += f": {size}; make room, or write to another disk"
+    elif number == errno.ENOENT:
+        reason = f"no file can be made in {folder}" if folder.is_dir() else f"there is no folder {folder}"
+    elif number == errno.EISDIR:
+        reason = "it is a folder, expected the name of a file"
+    return WriteError(number, reason, str(path))
+
+
+def room_error(folder: Path) -> OSError | None:
+    """Why nothing more can be written to a folder, found out by doing it; for libraries that do not say."""
+    probe = temporary_name(folder / "probe")
+    try:
+        with open(probe, "xb") as file:
+            file.write(os.urandom(PROBE))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        return error
+    finally:
+        with suppress(OSError):
+            probe.unlink()
+    return None
+
+
+_reserved: dict[int, int] = {}
+_reserving = threading.Lock()
+
+
+@contextmanager
+def require_room(path: str | os.PathLike[str], needs: int) -> Iterator[None]:
+    """Inside, a library may write a file of `needs` bytes at most beside others that do; for those that end the
+    process, or say nothing, when the disk is full. Raises WriteError where there is no room."""
+    folder = Path(os.path.realpath(path)).parent
+    try:
+        disk, free = folder.stat().st_dev, shutil.disk_usage(folder).free
+    except OSError as error:
+        raise write_error(path, error) from None
+    with _reserving:
+        if needs and free < needs + _reserved.get(disk, 0):
+            raise write_error(path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), needs=needs)
+        _reserved[disk] = _reserved.get(disk, 0) + needs
+    try:
+        yield
+    finally:
+        with _reserving:
+            _reserved[disk] -= needs
+
+
+@contextmanager
+def scratch_folder(needs: int) -> Iterator[Path]:
+    """A folder for files that a library makes by name, gone afterwards. Raises WriteError where its disk has no room
+    for `needs` bytes, and where that runs full, which the library reports as anything but an OSError."""
+    # a library may hold its file open for longer, which Windows does not remove
+    with tempfile.TemporaryDirectory(prefix="clsplat-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        try:
+            with require_room(folder / "file", needs):
+                yield folder
+        except WriteError as error:
+            if not str(error.filename).startswith(name):
+                raise
+            raise WriteError(error.errno or 0, f"{error.strerror} (TMPDIR names another folder)", str(folder)) from None
+        except (OSError, InputError, KeyboardInterrupt):
+            raise
+        except Exception:
+            if refused := room_error(folder):
+                raise write_error(folder, refused) from None
+            raise
+
+
 def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
     """Write `data` as the whole content of `path`; see `atomic_writer`."""
-    with atomic_writer(path) as file:
+    with atomic_writer(path, len(data)) as file:
         file.write(data)
 
 
@@ -246,22 +358,27 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file, expected {expected}") from None
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
-        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}), expected {expected}") from None
+        raise InputError(
+            f"{path}: cannot be read ({reason_of(error) if isinstance(error, OSError) else error}), expected {expected}"
+        ) from None
     with file:
         try:
             yield file
+        except WriteError:
+            raise
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}), expected {expected}") from None
+            raise InputError(f"{path}: cannot be read ({reason_of(error)}), expected {expected}") from None
 
 
 def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT) -> str:
-    """The text of a file in UTF-8 of at most `limit` bytes. Raises InputError as `open_input`."""
+    """The text of a file in UTF-8 of at most `limit` bytes, without the mark of the byte order that editors on Windows
+    put before it. Raises InputError as `open_input`."""
     with open_input(path, expected) as file:
         data = file.read(limit + 1)
     if len(data) > limit:
         raise InputError(f"{path}: has more than {limit >> 20} MiB, expected {expected}")
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not text in UTF-8 (byte {error.start}), expected {expected}") from None
 

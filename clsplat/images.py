@@ -8,21 +8,32 @@ unassociated in PNG, associated (premultiplied) in EXR.
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 from scipy import sparse
 
-from clsplat.errors import ClsplatError, InputError
-from clsplat.files import is_file, native_name, open_input, replace, temporary_name
+from clsplat.errors import ClsplatError, InputError, WriteError, examples, plain, reason_of
+from clsplat.files import (
+    is_file,
+    native_name,
+    open_input,
+    replace,
+    require_room,
+    room_error,
+    temporary_name,
+    write_error,
+)
 
 Float32 = NDArray[np.float32]
 Metadata = Mapping[str, str | int | float]
@@ -46,12 +57,59 @@ SIGNATURES = (
 HARMLESS = ("extraneous bytes",)
 
 
+COMPANION = (
+    r"(?:depths?|disp|disparity|normals?|alpha|albedo|masks?|matte|seg|segmentation|semantics?|confidence|conf|flow"
+    r"|edges?)"
+)
+_COMPANION_FOLDER = re.compile(rf"(?:\w+[_-])?{COMPANION}(?:[_-]\w+)?", re.IGNORECASE)
+_COMPANION_AFTER = re.compile(rf"[._-]?{COMPANION}(?:[._-]?(?:\d+|vis|map|raw|image))*", re.IGNORECASE)
+_COMPANION_BEFORE = re.compile(rf"(?:dynamic[._-])?{COMPANION}(?:[._-]map)?[._-]", re.IGNORECASE)
+_COLOUR = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE)
+
+
+def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) -> set[Path]:
+    """Those of `paths` that go with one of the pictures and are none: masks, depths, normals and the like.
+
+    By name: a picture's own with such a word behind it (r_0_depth_0001.png) or before it (mask_r_0.png), in place of
+    "color" (frame-1.color.jpg, frame-1.depth.png), or with .png behind its extension (COLMAP's masks); and whatever is
+    in a sub-folder of `folder` that is called by such a word.
+    """
+    pictures = list(pictures)
+
+    def is_beside(path: Path) -> bool:
+        inside = path.parent.relative_to(folder).parts if path.is_relative_to(folder) else ()
+        return any(_COMPANION_FOLDER.fullmatch(part) for part in inside)
+
+    folders = {picture.parent for picture in pictures}
+    others = [picture for picture in pictures if not is_beside(picture)]
+    pictures, alone = others or pictures, not others
+    names = {picture.name for picture in pictures}
+    stems = {picture.stem for picture in pictures} | names
+    stems |= {_COLOUR.sub("", stem) for stem in stems}
+    return {
+        path
+        for path in paths
+        if (is_beside(path) and not (path.parent in folders and (alone or path.stem not in stems)))
+        or _goes_with(path, names, stems)
+    }
+
+
+def _goes_with(path: Path, names: set[str], stems: set[str]) -> bool:
+    if path.stem in names and path.suffix.lower() == ".png":
+        return True
+    before = _COMPANION_BEFORE.match(path.stem)
+    if before and path.stem[before.end() :] in stems:
+        return True
+    return any(path.stem[:at] in stems and _COMPANION_AFTER.fullmatch(path.stem, at) for at in range(1, len(path.stem)))
+
+
 def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     """All pictures (by extension) under `folder`, if `deep` with its sub-folders, sorted; hidden files and folders are
-    left out. Links to folders are followed, to each folder once."""
+    left out, and links that lead nowhere. Links to folders are followed, to each folder once. Raises InputError for a
+    folder that cannot be read."""
     found: list[Path] = []
     seen: set[str] = set()
-    for root, folders, files in os.walk(folder, followlinks=True):
+    for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
         real = os.path.realpath(root)  # not the inode: some file systems of Windows number every folder 0
         if real in seen:
             folders.clear()
@@ -61,20 +119,21 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
         found += [
             path
             for path in (Path(root, name) for name in files)
-            if not path.name.startswith(".") and path.suffix.lower() in EXTENSIONS
+            if not path.name.startswith(".") and path.suffix.lower() in EXTENSIONS and is_file(path)
         ]
     return sorted(found)
+
+
+def cannot_be_searched(error: OSError) -> None:
+    """For `os.walk`, which else passes over a folder that it cannot read. Raises InputError."""
+    why = reason_of(error)
+    raise InputError(f"{error.filename}: cannot be searched for pictures: {why}; make it readable or move it away")
 
 
 def require_images(paths: Iterable[Path], listed_in: Path) -> None:
     """Raise InputError that names the files of `paths` that do not exist; `listed_in` is what lists them."""
     if missing := [path for path in paths if not is_file(path)]:
-        raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {name_all(missing)}")
-
-
-def name_all(paths: Sequence[Path]) -> str:
-    """The paths, for a message of one line; however many, as each has to be looked for."""
-    return ", ".join(str(path) for path in paths)
+        raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {examples(missing)}")
 
 
 def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
@@ -284,7 +343,7 @@ def _as_rgb(path: Path, pixels: Float32, spec: Any) -> Float32:
     else:
         others = [index for index in range(len(names)) if index != alpha]
         if len(others) not in (1, 3):
-            listed = ", ".join(spec.channelnames)
+            listed = examples(spec.channelnames)
             raise InputError(f"{path}: has the channels {listed}; expected grey or RGB, with alpha or without")
         colour = others * 3 if len(others) == 1 else others
     return pixels[:, :, [*colour, alpha] if alpha >= 0 else colour]
@@ -305,7 +364,16 @@ def _display_window(image: Float32, spec: Any) -> Float32:
 
 
 def _check_png_is_whole(path: Path) -> None:
-    """Follow the chunks to the last one: finds a file that is cut short before training, and before libpng prints."""
+    """Raise InputError for a file that is cut short, before training, and before libpng prints."""
+    if not _png_is_whole(path):
+        size = path.stat().st_size
+        raise InputError(
+            f"{path}: does not decode: the PNG ends early, after {size} bytes; copy it again or leave it out"
+        )
+
+
+def _png_is_whole(path: Path) -> bool:
+    """Whether the chunks lead to the last one."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         position = len(PNG_SIGNATURE) if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE else size
@@ -316,8 +384,8 @@ def _check_png_is_whole(path: Path) -> None:
                 break
             position += 12 + length
             if kind == b"IEND" and position <= size:
-                return
-    raise InputError(f"{path}: does not decode: the PNG ends early, after {size} bytes; copy it again or leave it out")
+                return True
+    return False
 
 
 def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], kind: str) -> None:
@@ -331,18 +399,62 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
             output.take(output.file.write_image(pixels))
 
 
+def _is_whole(path: Path, kind: str, parts: int) -> bool:
+    """Whether the end of a picture that has been written is there: the last chunk of a PNG, the last row of others."""
+    if kind == "png":
+        return _png_is_whole(path)
+    source = oiio.ImageInput.open(native_name(path))
+    if source is None:
+        oiio.geterror()
+        return False
+    try:
+        for part in range(parts):
+            if not source.seek_subimage(part, 0):
+                return False
+            spec = source.spec()
+            read = source.read_native_deep_scanlines if spec.deep else source.read_scanlines
+            last = spec.y + spec.height - 1
+            values = read(part, 0, last, last + 1, 0, 0, spec.nchannels, *(() if spec.deep else (oiio.FLOAT,)))
+            if values is None or source.geterror():
+                return False
+        return True
+    finally:
+        source.geterror()
+        source.close()
+
+
+def jpeg_room(spec: Any) -> int:
+    """More bytes than a JPEG of that size has."""
+    return int(spec.width * spec.height * spec.nchannels * 5 // 4) + (1 << 16)
+
+
 @dataclass(frozen=True, eq=False)
 class Output:
-    """file: OpenImageIO's, open under the temporary name `name`."""
+    """file: OpenImageIO's, open under the temporary name `temporary`."""
 
     file: Any
-    name: str
+    temporary: Path
     path: Path
 
+    @property
+    def name(self) -> str:
+        """The temporary name as OpenImageIO takes it."""
+        return native_name(self.temporary)
+
     def take(self, done: bool) -> None:
-        """What the file's methods give. Raises ClsplatError where that is failure."""
+        """What the file's methods give. Raises WriteError or ClsplatError where that is failure."""
         if not done:
-            raise ClsplatError(f"{self.path}: cannot be written: {_one_line(self.file.geterror())}")
+            self.fail(self.file.geterror())
+
+    def fail(self, reason: str) -> NoReturn:
+        """Raise WriteError where the system refuses to write, else ClsplatError: OpenImageIO seldom says which."""
+        written = self.temporary.stat().st_size if is_file(self.temporary) else 0
+        if error := room_error(self.temporary.parent):
+            self.file.close()
+            with suppress(OSError):  # so that the message has what is free without it
+                self.temporary.unlink()
+            raise write_error(self.path, error, written) from None
+        raise ClsplatError(f"{self.path}: cannot be written: {plain(_one_line(reason))}")
 
 
 @contextmanager
@@ -353,15 +465,24 @@ def atomic_output(path: Path, specs: Sequence[Any], kind: str) -> Iterator[Outpu
     # Not through files.atomic_writer: OpenImageIO writes to a name, not to an open file.
     target = Path(os.path.realpath(path))
     temporary = temporary_name(target)
-    output = Output(oiio.ImageOutput.create(kind), native_name(temporary), path)
+    output = Output(oiio.ImageOutput.create(kind), temporary, path)
+    # libjpeg ends the process when it cannot write
+    most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
     try:
-        # several parts have to be announced together
-        output.take(output.file.open(output.name, specs[0] if len(specs) == 1 else tuple(specs)))
-        yield output
-        output.take(output.file.close())
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        with require_room(path, most):
+            # several parts have to be announced together
+            output.take(output.file.open(output.name, specs[0] if len(specs) == 1 else tuple(specs)))
+            yield output
+            output.take(output.file.close())
+        if not _is_whole(temporary, kind, len(specs)):  # the last bytes of a full disk are lost without a word
+            output.fail("the file is not whole")
         replace(temporary, target)
+    except WriteError:
+        raise
     except OSError as error:
-        raise ClsplatError(f"{path}: cannot be written: {error.strerror}") from None
+        raise write_error(path, error) from None
     finally:
         output.file.close()
         with suppress(OSError):  # it is gone if all went well

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera, Window
 from clsplat.config import EXR_DEPTH, Compression, ExrDepth, Parts
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples
 from clsplat.files import native_name
 from clsplat.images import image_size, steps_of, unassociate, write_spec
 
@@ -93,7 +93,7 @@ def parse_channels(text: str) -> tuple[str, ...]:
     asked = [word.strip() for word in text.split(",") if word.strip()]
     unknown = [word for word in asked if word not in LAYERS]
     if unknown or not asked:
-        found = f"has {', '.join(map(repr, unknown))}" if unknown else "is empty"
+        found = f"has {examples(map(repr, unknown))}" if unknown else "is empty"
         raise InputError(f"--channels {text}: {found}, expected some of {', '.join(LAYERS)}")
     return tuple(name for name in LAYERS if name in asked)
 

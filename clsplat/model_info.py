@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.colour import recorded_space
 from clsplat.files import is_file, open_input
-from clsplat.formats import format_of, model_path, packing, ply
+from clsplat.formats import format_of, model_path, packing, ply, tell_kind
 from clsplat.gaussians import Float32, Gaussians
 
 PERCENTILES = (0, 1, 50, 99, 100)
@@ -23,6 +23,7 @@ def model_info(path: Path) -> dict[str, Any]:
     """What `clsplat info --json` prints. Raises InputError for a file that no format reads."""
     path = model_path(path)
     module = format_of(path)
+    tell_kind(path, module)
     result: dict[str, Any] = {"path": str(path), "format": module.NAME, "bytes": size(path)}
     if module is ply:
         origin, blocks = _ply_blocks(path)
@@ -38,9 +39,14 @@ def model_info(path: Path) -> dict[str, Any]:
 
 def size(path: Path) -> int:
     """Bytes of the file, with the pictures beside a meta.json and the .bin beside a .gltf."""
-    beside = path.parent.glob("*.webp") if path.name == "meta.json" else ()
-    binary = [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
-    return sum(each.stat().st_size for each in (path, *beside, *binary) if is_file(each))
+    return sum(each.stat().st_size for each in (path, *beside(path)) if is_file(each))
+
+
+def beside(path: Path) -> list[Path]:
+    """The other files of a model: the pictures of a meta.json, the .bin of a .gltf."""
+    if path.name == "meta.json":
+        return sorted(path.parent.glob("*.webp"))
+    return [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
 
 
 def _ply_blocks(path: Path) -> tuple[NDArray[np.float64], Iterator[Gaussians]]:

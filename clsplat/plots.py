@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import InputError
+from clsplat.files import atomic_writer
 
 EXTENSIONS = (".svg", ".png")
 SAME_BITS = 1e-8
@@ -145,4 +146,6 @@ def _figure(title: str, columns: int) -> Any:
 def _save(figure: Any, path: Path) -> None:
     """Without the date and random names that matplotlib puts in an SVG, so that equal plots are equal files."""
     with import_module("matplotlib").rc_context({"svg.hashsalt": "clsplat"}):
-        figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix.lower() == ".svg" else None)
+        kind = path.suffix.lower()[1:]
+        with atomic_writer(path) as file:
+            figure.savefig(file, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else None)

@@ -87,16 +87,18 @@ class TrainProgress:
 
     def _numbers(self) -> str:
         assert self.last is not None
-        return (
+        numbers = (
             f"step {self.last.step}/{self.total}  loss {self.loss:.4f}  PSNR {self.psnr:.2f}  "
-            f"{self.last.gaussians:,} Gaussians  {self.rate():.1f} it/s"
+            f"{self.last.gaussians:,} Gaussians"
         )
+        rate = self.rate()
+        return f"{numbers}  {rate:.{1 if rate >= 1 else 3}f} steps/s" if rate > 0 else numbers
 
     def _print_line(self) -> None:
         assert self.last is not None
         rate = self.rate()
-        left = duration((self.total - self.last.step) / rate) if rate > 0 else "?"
-        print(f"{self._numbers()}  {left} left", file=self.stream, flush=True)
+        left = f"  {duration((self.total - self.last.step) / rate)} left" if rate > 0 else ""
+        print(f"{self._numbers()}{left}", file=self.stream, flush=True)
         self.printed_at, self.printed_step = self.clock(), self.last.step
 
 

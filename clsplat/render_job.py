@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from clsplat import layers
 from clsplat.camera import Camera
 from clsplat.device.child import abandon
-from clsplat.errors import InputError
+from clsplat.errors import InputError, reason_of
 from clsplat.files import abandoned
 from clsplat.frame_settings import SETTINGS
 from clsplat.frames import output_paths
@@ -120,7 +120,7 @@ def make_folders(tasks: Sequence[Task]) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+            raise InputError(f"{folder}: cannot be made: {reason_of(error)}") from None
 
 
 def remove_temporaries(tasks: Sequence[Task]) -> None:

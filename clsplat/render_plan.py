@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from clsplat import render_job
+from clsplat.errors import examples
 from clsplat.frames import ranges
 from clsplat.framing import COLOUR, crop, finer, on_tiles, renderer_channels
 from clsplat.picture_config import FPS
@@ -40,7 +41,7 @@ def dry_run(job: Job) -> int:
     host = held * max(render_job.frame_bytes(task, options) for task in tasks)
     print(f"model     {job.model}: {len(job.gaussians):,} Gaussians, SHA-256 {job.digest[:12]}")
     cameras = [picture_camera(task, options) for task in tasks]
-    print(f"frames    {len(tasks)}: {ranges([task.number for task in tasks])}; {', '.join(_sizes(cameras))}")
+    print(f"frames    {len(tasks)}: {ranges([task.number for task in tasks])}; {examples(_sizes(cameras))}")
     print(f"files     {tasks[0].path}" + (f" to {tasks[-1].path}" if tasks[-1].path != tasks[0].path else ""))
     if job.is_video:
         from clsplat.video import rate_of

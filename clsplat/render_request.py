@@ -15,8 +15,8 @@ from clsplat.camera import Camera
 from clsplat.cli import Render
 from clsplat.colour import CHROMATICITIES, Colours, recorded_space
 from clsplat.config import RasterizerConfig
-from clsplat.errors import InputError
-from clsplat.files import digest
+from clsplat.errors import InputError, examples
+from clsplat.files import check_new, digest
 from clsplat.frame_settings import digest_of
 from clsplat.framing import finer
 from clsplat.gaussians import Gaussians
@@ -81,6 +81,8 @@ def read_job(verb: Render) -> Job:
     tasks = render_job.make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
     _check_pictures(tasks, options)
     render_job.check_folders(tasks)
+    if tasks[0].is_video and tasks[0].path.exists():
+        check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
     for warning in chosen.warnings:
         warn(warning)
     rasterizer = verb.rasterizer
@@ -180,7 +182,9 @@ def _check_video(verb: Render) -> None:
     if reason := video_missing():
         raise InputError(f"{verb.output}: {reason}")
     if verb.skip_existing:
-        raise InputError("--skip-existing: a video is written as a whole, expected a call without, or a file a frame")
+        raise InputError(
+            "--skip-existing: a video is written as a whole; leave the flag out, or write a picture for each frame"
+        )
 
 
 def _check_pictures(tasks: list[Task], options: RenderOptions) -> None:
@@ -193,7 +197,7 @@ def _check_pictures(tasks: list[Task], options: RenderOptions) -> None:
         sizes.add(f"{camera.width}x{camera.height}")
     if tasks[0].is_video and len(sizes) > 1:
         raise InputError(
-            f"{tasks[0].path}: frames are of the sizes {', '.join(sorted(sizes))}, expected one; give --width and "
+            f"{tasks[0].path}: frames are of the sizes {examples(sorted(sizes))}, expected one; give --width and "
             "--height"
         )
 

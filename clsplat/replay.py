@@ -104,8 +104,9 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
     arrays = {f"{kind}/{g}": values for kind, groups in models.items() for g, values in groups.items()}
     path = folder / f"trouble-step-{incident.step:07d}.npz"
     text = np.frombuffer(json.dumps(record).encode(), np.uint8)
-    with atomic_writer(path) as file:
-        np.savez(file, allow_pickle=False, **{RECORD: text, **pixels, **pose, **arrays})
+    members = {RECORD: text, **pixels, **pose, **arrays}
+    with atomic_writer(path, sum(array.nbytes + 512 for array in members.values())) as file:
+        np.savez(file, allow_pickle=False, **members)
     return path
 
 

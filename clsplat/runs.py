@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeVar, get_args, get_origin, get_type_hints
 from zipfile import ZIP_STORED, ZipFile
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 import clsplat
 from clsplat.config import TrainConfig
-from clsplat.errors import ClsplatError, InputError, plain
+from clsplat.errors import ClsplatError, InputError, examples, plain
 from clsplat.files import (
     TEMPORARY_SUFFIX,
     atomic_write,
@@ -32,6 +33,7 @@ from clsplat.files import (
     parse_json,
     read_document,
     remove,
+    write_error,
 )
 from clsplat.gaussians import Gaussians
 
@@ -152,7 +154,7 @@ class Run:
             with open(self.metrics_path, "a", encoding="utf-8", newline="\n") as file:
                 file.write(line + "\n")
         except OSError as error:  # a full disk does not say which file it was
-            raise OSError(error.errno, error.strerror, str(self.metrics_path)) from None
+            raise write_error(self.metrics_path, error, needs=len(line) + 1) from None
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """The records of metrics.jsonl; a cut last line, as a crash leaves it, is left out."""
@@ -190,7 +192,7 @@ class Run:
         self.checkpoints_path.mkdir(parents=True, exist_ok=True)
         path = self.checkpoints_path / f"step-{step:07d}.npz"
         members: Arrays = {STATE_KEY: np.frombuffer(text.encode(), np.uint8), **arrays}
-        with atomic_writer(path) as file:
+        with atomic_writer(path, sum(array.nbytes + 512 for array in members.values())) as file:
             np.savez(file, allow_pickle=False, **members)
         earlier = [(s, p) for s, p in self.checkpoints() if s <= step]
         keep = {p for _, p in earlier[-KEPT_CHECKPOINTS:]}
@@ -265,7 +267,7 @@ def _read_checkpoint(path: Path) -> Checkpoint:
     digests = record.get("sha256")  # runs of earlier versions have none
     if digests is not None:
         if not isinstance(digests, dict) or arrays.keys() != digests.keys():
-            other = ", ".join(sorted(arrays.keys() ^ set(digests)))[:200] if isinstance(digests, dict) else "no list"
+            other = examples(sorted(arrays.keys() ^ set(digests)))[:200] if isinstance(digests, dict) else "no list"
             raise ValueError(f"it has not the arrays it was written with ({other})")
         for name, array in arrays.items():
             if _digest(array) != digests[name]:
@@ -376,7 +378,9 @@ def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
         raise InputError(f"{path}: not readable as TOML ({error})") from None
     for key in document:
         if key not in ("clsplat", "scene", "train"):
-            raise InputError(f"{path}: unknown key {key!r}, expected clsplat, scene or train")
+            raise InputError(
+                f"{path}: has {key!r}, which is no setting; expected clsplat, scene and the tables of train"
+            )
     scene = document.get("scene")
     config = _from_table(TrainConfig, document.get("train", {}), path, "train")
     try:
@@ -395,12 +399,27 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str) -> T:
     values = {}
     for key, value in table.items():
         if key not in names:
-            raise InputError(f"{path}: unknown key '{where}.{key}', expected one of {', '.join(names)}")
+            raise InputError(f"{path}: [{where}] has {key!r}, which is no setting there; {_meant(key, where)}")
         if is_dataclass(types[key]):
             values[key] = _from_table(types[key], value, path, f"{where}.{key}")
         else:
             values[key] = _value(types[key], value, f"{path}: {where}.{key}")
     return cls(**values)
+
+
+def _meant(key: str, where: str) -> str:
+    """Where a setting of that name, or one like it, belongs."""
+    tables = {"train": TrainConfig} | {
+        f"train.{name}": kind for name, kind in get_type_hints(TrainConfig).items() if is_dataclass(kind)
+    }
+    places = {f.name: table for table, kind in reversed(tables.items()) for f in fields(kind)}
+    if key in places:
+        return f"it belongs to [{places[key]}]"
+    here = [name for name, table in places.items() if table == where]
+    near = get_close_matches(key, here, 1) or get_close_matches(key, places, 1)
+    if near:
+        return f"did you mean {near[0]!r} in [{places[near[0]]}]?"
+    return "take it out: was it written by another version?"
 
 
 def _value(kind: Any, value: Any, what: str) -> Any:
@@ -416,4 +435,5 @@ def _value(kind: Any, value: Any, what: str) -> Any:
         return float(value)
     elif type(value) is kind and not (kind is int and abs(value) >= 1 << 62):
         return value
-    raise InputError(f"{what} is {value!r}, expected {getattr(kind, '__name__', kind)}")
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+    raise InputError(f"{what} is {value!r}, expected {words.get(kind, 'a list of whole numbers')}")

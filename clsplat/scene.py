@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from clsplat import colmap, transforms
 from clsplat.camera import Camera
 from clsplat.config import TEST_EVERY
-from clsplat.errors import InputError, plain
-from clsplat.images import downscale, find_images, image_size, name_all, read_image, require_images
+from clsplat.errors import InputError, examples, plain
+from clsplat.files import digest
+from clsplat.images import companions, downscale, find_images, image_size, read_image, require_images
 from clsplat.transforms import Frame
 from clsplat.undistort import Lens, undistort
 
@@ -203,7 +204,8 @@ def load_scene(
 
     Raises InputError naming the file for whatever is wrong with the input: see `detect`, `colmap.read_model` and
     `transforms.read_transforms`; pictures that are listed and missing, or of another size than their camera; pictures
-    whose header does not decode. Pictures that are there and not listed are named in the scene's warnings.
+    whose header does not decode. Pictures that are there and not listed are named in the scene's warnings, but for
+    masks, depths and the like (`images.companions`), and so are those on both sides of the split.
     """
     path = Path(path)
     if resolution < 0 or test_every < 0:
@@ -226,6 +228,7 @@ def load_scene(
     for index, frame in enumerate(found):
         held_out = frame.split == "test" if own_split else test_every > 0 and index % test_every == 0
         views.append(_view(frame, "test" if held_out else "train", resolution, smaller))
+    _warn_of_copies(views, heard)
     if kind == "blender":
         bounds = (np.full(3, -BLENDER_CUBE), np.full(3, BLENDER_CUBE))
     else:
@@ -298,7 +301,7 @@ def _read_colmap(
         raise InputError(f"{folder}: no images found, expected the {len(model.images)} of {model_path}")
     frames = [Frame(m.name, folder / m.name, m.lens, m.rotation, m.translation) for m in model.images]
     require_images([frame.path for frame in frames], model_path)
-    _warn_of_unlisted(present, frames, model_path, heard)
+    _warn_of_unlisted(present, frames, model_path, folder, heard)
     smaller = [] if chosen is not None else [folder.with_name(f"{folder.name}_{factor}") for factor in (2, 4, 8)]
     return frames, model.points, model.colors, [candidate for candidate in smaller if candidate.is_dir()]
 
@@ -314,14 +317,39 @@ def _read_transforms(path: Path, kind: Kind, heard: list[str]) -> transforms.Tra
     heard += data.warnings
     parents = {frame.path.parent for frame in data.frames}
     present = [file for parent in parents for file in find_images(parent, deep=False)]
-    _warn_of_unlisted(present, data.frames, listed_in, heard)
+    _warn_of_unlisted(present, data.frames, listed_in, folder, heard)
     return data
 
 
-def _warn_of_unlisted(present: list[Path], frames: list[Frame], listed_in: Path, heard: list[str]) -> None:
+def _warn_of_unlisted(
+    present: list[Path], frames: list[Frame], listed_in: Path, folder: Path, heard: list[str]
+) -> None:
     listed = {frame.path for frame in frames}
-    if unlisted := sorted(path for path in present if path not in listed):
-        heard.append(f"{listed_in}: does not list {len(unlisted)} image(s) that are there: {name_all(unlisted)}")
+    unlisted = sorted(path for path in present if path not in listed)
+    known = companions(unlisted, listed, folder) if unlisted else set()
+    if unlisted := [path for path in unlisted if path not in known]:
+        heard.append(
+            f"{listed_in}: does not list {len(unlisted):,} image(s) that are there, and they are not used: "
+            f"{examples(unlisted)}"
+        )
+
+
+def _warn_of_copies(views: list[View], heard: list[str]) -> None:
+    """A held-out picture that is trained on as well says nothing about how good the model is."""
+    by_size: dict[int, list[View]] = {}
+    for view in views:
+        by_size.setdefault(view.path.stat().st_size, []).append(view)
+    copies = []
+    for same in by_size.values():
+        if len({view.split for view in same}) > 1:
+            trained = {digest(view.path): view.name for view in reversed(same) if view.split == "train"}
+            held_out = [(view.name, trained.get(digest(view.path))) for view in same if view.split == "test"]
+            copies += [f"{name} is {other}" for name, other in held_out if other is not None]
+    if copies:
+        heard.append(
+            f"{len(copies)} of the held-out pictures are trained on too, as copies under another name, so that their "
+            f"scores say little: {examples(sorted(copies))}; remove the copies"
+        )
 
 
 def _view(frame: Frame, split: Split, resolution: int, smaller: list[Path]) -> View:

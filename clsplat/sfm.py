@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import IO, Any, Literal
 
 from clsplat import sfm_photos
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError, InputError, examples
 from clsplat.files import parse_json, read_document, replace
 from clsplat.process import apart
 
@@ -88,7 +88,8 @@ def reconstruct(
         raise InputError(f"matching {matching!r}: expected auto, exhaustive or sequential")
     if camera_model not in CAMERA_MODELS:
         raise InputError(f"camera model {camera_model!r}: expected one of {', '.join(CAMERA_MODELS)}")
-    paths, unreadable = sfm_photos.find_photos(images, excluded=output)
+    found = sfm_photos.find_photos(images, excluded=output)
+    paths = found.photos
     settings = f"{matching} {camera_model} {shared_camera} {max_image_size} {max_features} {seed}"
     fingerprint = sfm_photos.fingerprint(images, paths, settings)
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
@@ -96,10 +97,13 @@ def reconstruct(
         return output
     if len(paths) < MINIMUM_PHOTOS:
         raise InputError(f"{images}: only {len(paths)} photo(s) found, expected at least {MINIMUM_PHOTOS}")
-    if unreadable:
-        warnings.warn(
-            f"{images}: {_listed(unreadable, images)} left out: convert to JPEG, PNG or TIFF first", stacklevel=2
-        )
+    for left_out, why in (
+        (found.others, "convert to JPEG, PNG or TIFF first"),
+        (found.broken, "links that lead nowhere"),
+        (found.companions, "by their names masks, depths or the like of other photos"),
+    ):
+        if left_out:
+            warnings.warn(f"{images}: {_listed(left_out, images)} left out: {why}", stacklevel=2)
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -302,8 +306,6 @@ def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
     )
 
 
-def _listed(paths: list[Path], folder: Path, most: int = 8) -> str:
+def _listed(paths: list[Path], folder: Path) -> str:
     """A line such as 3 photo(s) (a.jpg, b.jpg, c.jpg), cut where there are many."""
-    names = [sfm_photos.photo_name(folder, path) for path in paths[:most]]
-    more = f" and {len(paths) - most} more" if len(paths) > most else ""
-    return f"{len(paths)} photo(s) ({', '.join(names)}{more})"
+    return f"{len(paths):,} photo(s) ({examples(sfm_photos.photo_name(folder, path) for path in paths)})"

@@ -18,11 +18,13 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import WINDOWS, is_file, native_name
-from clsplat.images import error_of, open_image
+from clsplat.files import WINDOWS, is_file, native_name, require_room, room_error, write_error
+from clsplat.images import cannot_be_searched, companions, error_of, jpeg_room, open_image
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 """What pycolmap's wheel reads and writes; its OpenImageIO has no WebP, JPEG 2000 or HEIF."""
+READABLE = frozenset({"jpeg", "png", "tiff", "bmp"})
+"""OpenImageIO's names of these: what a file is, whatever it is called."""
 OTHER_IMAGES = frozenset({".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"})
 
 
@@ -41,18 +43,30 @@ class Photo:
     transparent: bool = False
 
 
-def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], list[Path]]:
-    """Photos below folder in the order of their names, and image files of kinds that cannot be used.
+@dataclass(frozen=True)
+class Found:
+    """photos in the order of their names, and what is left out: images of kinds that cannot be used, links that lead
+    nowhere, and masks, depths and the like that go with photos."""
+
+    photos: list[Path]
+    others: list[Path]
+    broken: list[Path]
+    companions: list[Path]
+
+
+def find_photos(folder: Path, excluded: Path | None = None) -> Found:
+    """The photos below a folder.
 
     Hidden files and folders are skipped, as is `excluded` (the output, where it lies inside). Raises InputError
-    for a folder that does not exist or holds no photos.
+    for a folder that does not exist, that cannot be read, or that holds no photos.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected one with photos")
     skip = excluded.resolve() if excluded is not None else None
     photos: list[Path] = []
     others: list[Path] = []
-    for parent, folders, files in os.walk(folder):
+    broken: list[Path] = []
+    for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
         here = Path(parent)
         folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() != skip]
         for name in files:
@@ -61,16 +75,21 @@ def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path],
                 continue
             if extension in EXTENSIONS and not name.isprintable():
                 raise InputError(f"{here / name}: has a name that a scene cannot list; rename it")
-            if extension in EXTENSIONS:
+            if extension in EXTENSIONS and (here / name).is_symlink() and not (here / name).exists():
+                broken.append(here / name)
+            elif extension in EXTENSIONS:
                 photos.append(here / name)
             elif extension in OTHER_IMAGES:
                 others.append(here / name)
     if not photos:
         kinds = " ".join(sorted(EXTENSIONS))
         found = f", only {len(others)} of a kind not supported such as {others[0].name}" if others else ""
+        found += f", only {len(broken)} link(s) that lead nowhere such as {broken[0].name}" if broken else ""
         raise InputError(f"{folder}: no photos found{found}; expected files ending in {kinds}")
     key = partial(photo_name, folder)
-    return sorted(photos, key=key), sorted(others, key=key)
+    aside = companions(photos, photos, folder)
+    kept = [path for path in photos if path not in aside]
+    return Found(*(sorted(paths, key=key) for paths in (kept, others, broken, aside)))
 
 
 def photo_name(folder: Path, path: Path) -> str:
@@ -92,8 +111,9 @@ def stage_photos(
 ) -> list[Photo]:
     """Put every photo under target, upright and with its name, and say what it is.
 
-    pycolmap ignores the EXIF orientation, so that turned photos are written anew; the others are linked (copied
-    where the file system cannot). Every photo is decoded once, as pycolmap would skip a broken one silently:
+    pycolmap ignores the EXIF orientation and cannot read some kinds of files, so that turned photos, and those that are
+    of such a kind whatever their name says, are written anew; the others are linked (copied where the file system
+    cannot). Every photo is decoded once, as pycolmap would skip a broken one silently:
     raises InputError with the name of the first that does not decode.
     """
     staged: list[Photo] = []
@@ -114,7 +134,7 @@ def _stage(folder: Path, target: Path, path: Path) -> Photo:
         raise InputError(f"{path}: cannot be decoded as an image: is no regular file")
     source = open_image(path)
     try:
-        spec = source.spec()
+        spec, kind = source.spec(), source.format_name()
         pixels = source.read_image(spec.format)
         # a truncated JPEG still gives pixels, grey at its end, and only an error text says so
         trouble = error_of(source)
@@ -128,10 +148,10 @@ def _stage(folder: Path, target: Path, path: Path) -> Photo:
     copy.parent.mkdir(parents=True, exist_ok=True)
     orientation = spec.get_int_attribute("Orientation", 1)
     width, height = spec.width, spec.height
-    if orientation in range(2, 9):
-        if orientation >= 5:
+    if orientation in range(2, 9) or kind not in READABLE:
+        if orientation in range(5, 9):
             width, height = height, width
-        _write_upright(path, copy)
+        _write_upright(path, copy, spec)
     else:
         try:
             if WINDOWS and not os.access(path, os.W_OK):
@@ -162,12 +182,17 @@ def has_alpha(path: Path) -> bool:
     return found
 
 
-def _write_upright(path: Path, copy: Path) -> None:
-    """Write the photo as it is meant to be seen. EXIF stays, for the focal length, but says upright now."""
+def _write_upright(path: Path, copy: Path, spec: Any) -> None:
+    """Write the photo as it is meant to be seen, of the kind that its name says. EXIF stays, for the focal length, but
+    says upright now."""
     upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(native_name(path)))
     upright.specmod().attribute("Orientation", 1)
     upright.specmod().attribute("Compression", "jpeg:98" if copy.suffix.lower() in (".jpg", ".jpeg") else "lzw")
-    if upright.has_error or not upright.write(native_name(copy)):
+    with require_room(copy, jpeg_room(spec)):  # libjpeg ends the process when it cannot write
+        written = not upright.has_error and upright.write(native_name(copy))
+    if not written:
+        if error := room_error(copy.parent):
+            raise write_error(copy, error)
         raise ClsplatError(f"{copy}: cannot write the turned copy of {path}: {_last_line(upright.geterror())}")
 
 

@@ -15,11 +15,11 @@ import numpy as np
 from clsplat import colour, edit, fidelity
 from clsplat.cli_models import Convert, Info
 from clsplat.errors import InputError
-from clsplat.files import is_file, read_document
-from clsplat.formats import format_of, format_of_name, load, model_path, save
+from clsplat.files import check_new, is_file, read_document
+from clsplat.formats import format_of, format_of_name, load, model_path, save, sog
 from clsplat.gaussians import MAX_SH_DEGREE, Float32, Float64, Gaussians
 from clsplat.memory import parse_bytes
-from clsplat.model_info import model_info, size, text
+from clsplat.model_info import beside, model_info, size, text
 from clsplat.progress import StageProgress
 from clsplat.runs import is_run, model_file
 
@@ -46,8 +46,10 @@ def convert(verb: Convert) -> int:
     check(verb)
     matrix = similarity(verb)
     written_by = format_of_name(verb.target, writable=True)
-    if not verb.target.parent.is_dir():
-        raise InputError(f"{verb.target.parent}: no such folder, expected one for {verb.target.name}")
+    check_new(verb.target, overwrite=verb.overwrite, sources=[source, *map(_file, verb.merge)])
+    for each in beside(verb.target):
+        if each.suffix == ".bin" or each.stem.partition("_")[0] in sog.PICTURES:
+            check_new(each, overwrite=verb.overwrite)
     original = load(source)
     edited = original if not verb.merge else edit.merge([original, *(load(_file(path)) for path in verb.merge)])
     edited = _thinned(verb, edited)

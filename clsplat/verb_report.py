@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 from clsplat.cli_models import Compare, Report
 from clsplat.errors import InputError, plain
+from clsplat.files import check_new
 from clsplat.runs import Run
 
 
@@ -17,7 +17,7 @@ def report(verb: Report) -> int:
     if verb.views < 0:
         raise InputError(f"--views {verb.views}: expected at least 0")
     path = verb.output or run.path / "report.html"
-    check_page(path)
+    check_new(path, overwrite=verb.overwrite or verb.output is None)
     from clsplat.report.page import json_text, write_report
 
     figures = write_report(run, path, views=verb.views)
@@ -35,7 +35,7 @@ def compare(verb: Compare) -> int:
         raise InputError(f"{verb.runs[0]}: expected at least two runs to compare")
     runs = [Run.open(path) for path in verb.runs]
     if verb.output is not None:
-        check_page(verb.output)
+        check_new(verb.output, overwrite=verb.overwrite)
     from clsplat.report.compare import compare_runs, comparison_table, write_comparison
     from clsplat.report.page import json_text
 
@@ -47,11 +47,3 @@ def compare(verb: Compare) -> int:
     for note in found.notes:
         print(f"clsplat: warning: {plain(note)}", file=sys.stderr)
     return 0
-
-
-def check_page(path: Path) -> None:
-    """Raise InputError where no page can be written to `path`."""
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, expected a file such as report.html")
-    if not path.parent.is_dir():
-        raise InputError(f"{path.parent}: no such folder, expected one for {path.name}")

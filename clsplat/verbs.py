@@ -266,6 +266,7 @@ def bench(verb: Bench) -> int:
     from clsplat import bench as measure
     from clsplat import tradeoff
     from clsplat.device.context import Device, select
+    from clsplat.files import check_new
     from clsplat.plots import check_plot, plot_settings
     from clsplat.progress import StageProgress
     from clsplat.trust import require
@@ -278,6 +279,7 @@ def bench(verb: Bench) -> int:
     verb.rasterizer.check()
     if verb.plot is not None:
         check_plot(verb.plot)
+        check_new(verb.plot, overwrite=verb.overwrite)
     if verb.source is not None and not verb.source.exists():
         raise InputError(f"{verb.source}: no such file or folder, expected a scene, a run or a model file")
     progress = StageProgress()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterable
 from contextlib import suppress
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import native_name, replace, temporary_name
+from clsplat.files import FULL, native_name, replace, temporary_name, write_error
 from clsplat.layers import VIDEO
 from clsplat.picture_config import FPS, VideoConfig
 
@@ -155,6 +156,9 @@ class VideoWriter:
         try:
             work()
         except (av.error.FFmpegError, OSError) as error:
+            if error.errno in FULL or error.errno == errno.EFBIG:
+                written = self._temporary.stat().st_size if self._temporary.is_file() else 0
+                raise write_error(self._path, OSError(error.errno, os.strerror(error.errno)), written) from None
             reason = error.strerror or str(error)
             raise ClsplatError(f"{self._path}: cannot be written: {reason}") from None
 

@@ -183,7 +183,14 @@ def test_a_checkpoint_that_cannot_be_written_is_named(
         assert train(scene, folder, short(checkpoint_every=10)) == 1
     said = capfd.readouterr().err.splitlines()[-1]
     path = folder / "checkpoints" / "step-0000020.npz"
-    assert said == f"clsplat: error: [Errno {number}] {os.strerror(number)}: '{path}'"
+    why = {
+        errno.EROFS: "read-only",
+        errno.EACCES: "permission is denied",
+        errno.ENOSPC: "full: ",
+        errno.EDQUOT: "quota",
+    }
+    assert said.startswith(f"clsplat: error: {path}: cannot be written: ")
+    assert why[number] in said
     assert [step for step, _ in Run.open(folder).checkpoints()] == [10]
     assert main(["train", "-o", str(folder), "--resume"]) == 0
     assert (folder / "model.ply").read_bytes() == (trained / "model.ply").read_bytes()

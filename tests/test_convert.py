@@ -11,6 +11,7 @@ import pytest
 from calls import Capture
 from models import assert_equal, random_gaussians
 from scipy.spatial.transform import Rotation
+from systems import can_link
 from tiny import cameras, hidden_model
 
 from clsplat import colour, edit, formats
@@ -38,7 +39,7 @@ def test_what_was_lost_is_said(model: Path, capsys: Capture) -> None:
     assert f"{target}: splat, 300 Gaussians of SH degree 0, 9,600 bytes" in said
     for name in ("position", "scale", "rotation", "opacity", "colour", "SH"):
         assert f"\n{name} " in said
-    assert convert(model, target, "--json") == 0
+    assert convert(model, target, "--json", "--overwrite") == 0
     found = json.loads(capsys.readouterr().out)
     whole, read = Gaussians.load(model), Gaussians.load(target)
     errors = found["errors"]
@@ -168,6 +169,89 @@ def test_a_folder_that_is_not_there(model: Path, capsys: Capture) -> None:
     assert convert(model, target) == 2
     assert capsys.readouterr().err == f"clsplat: error: {target.parent}: no such folder, expected one for out.ply\n"
     assert not target.parent.exists()
+
+
+@pytest.mark.parametrize("name", ["other.ply", "other.gltf", "meta.json", "link.ply"])
+def test_a_file_that_is_there_is_replaced_only_if_asked(name: str, model: Path, capsys: Capture) -> None:
+    target = model.parent / name
+    if name == "link.ply":
+        if not can_link():
+            pytest.skip("this user may not make symbolic links")
+        target.symlink_to(model.parent / "nowhere.ply")
+    else:
+        first = {"other.gltf": "other.bin", "meta.json": "quats.webp"}.get(name, name)
+        (model.parent / first).write_bytes(b"precious")
+        target = model.parent / first
+    assert convert(model, model.parent / name) == 2
+    said = f"clsplat: error: {target}: is there already; name another file, or give --overwrite to replace it\n"
+    assert capsys.readouterr().err == said
+    assert name == "link.ply" or target.read_bytes() == b"precious"
+    assert convert(model, model.parent / name, "--overwrite") == 0
+    assert len(Gaussians.load(model.parent / name)) == 300
+
+
+def test_a_model_is_changed_in_place_only_if_asked(model: Path, capsys: Capture) -> None:
+    before = model.read_bytes()
+    for target in (model, model.parent / "." / "x" / ".." / model.name):
+        (model.parent / "x").mkdir(exist_ok=True)
+        assert convert(model, target, "--prune-opacity", "0.5") == 2
+        assert "is what is read, and would be replaced by what is made of it" in capsys.readouterr().err
+    other = model.with_name("b.ply")
+    random_gaussians(3).save(other)
+    assert convert(model, other, "--merge", other) == 2
+    assert "b.ply: is what is read" in capsys.readouterr().err
+    assert model.read_bytes() == before
+    assert convert(model, model, "--prune-opacity", "0.5", "--overwrite") == 0
+    assert 0 < len(Gaussians.load(model)) < 300
+
+
+def test_a_folder_as_output_is_named(model: Path, capsys: Capture) -> None:
+    (model.parent / "x.ply").mkdir()
+    assert convert(model, model.parent / "x.ply", "--overwrite") == 2
+    assert "x.ply: is a folder, expected the name of a file to write" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="no /proc on this system")
+def test_a_place_that_takes_no_files_is_named(model: Path, capsys: Capture) -> None:
+    assert convert(model, "/proc/x.ply") == 2
+    said = "clsplat: error: /proc/x.ply: cannot be written: no file can be made in /proc\n"
+    assert capsys.readouterr().err == said
+
+
+def test_info_of_a_model_of_nothing(model: Path, capsys: Capture) -> None:
+    head = model.read_bytes().partition(b"end_header\n")[0].replace(b"element vertex 300", b"element vertex 0")
+    model.write_bytes(head + b"end_header\n")
+    assert main(["info", str(model)]) == 0
+    said = capsys.readouterr().out
+    assert "\nGaussians     0\n" in said
+    assert "\nSH degree     2, zero beyond 0\n" in said
+    assert main(["info", str(model), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["gaussians"] == 0
+    assert convert(model, model.with_name("b.ply")) == 2
+    assert "has 0 Gaussians" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("made", "name"), [(".ply", "a.splat"), (".glb", "a.splat"), (".spz", "a.ply")])
+def test_a_file_of_another_kind_than_its_name_says(made: str, name: str, model: Path, capsys: Capture) -> None:
+    real = model.with_name(f"real{made}")
+    assert convert(model, real) == 0
+    wrong = real.rename(model.with_name(name))
+    capsys.readouterr()
+    assert main(["info", str(wrong), "--json"]) == 0
+    said = capsys.readouterr()
+    kind = formats.format_of(wrong).NAME
+    assert json.loads(said.out)["format"] == kind
+    assert said.err == f"clsplat: warning: {wrong}: is {kind} by its content, whatever its name says\n"
+    assert len(formats.load(model)) == 300
+
+
+def test_any_beginning_may_be_that_of_a_splat(model: Path) -> None:
+    target = model.with_suffix(".splat")
+    assert convert(model, target) == 0
+    data = bytearray(target.read_bytes())
+    data[0] = ord("{")
+    target.write_bytes(data)
+    assert len(Gaussians.load(target)) == 300
 
 
 def test_the_colour_space_goes_along_or_is_told(model: Path, capsys: Capture) -> None:

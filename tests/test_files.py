@@ -3,11 +3,14 @@
 
 import errno
 import os
+import pickle
 from pathlib import Path
 
 import pytest
 from systems import posix
 
+from clsplat.cli import one_line
+from clsplat.errors import WriteError
 from clsplat.files import atomic_write, atomic_writer
 
 
@@ -38,7 +41,7 @@ def test_disk_full_while_flushing_leaves_the_previous_file(tmp_path: Path, monke
     path = tmp_path / "model.ply"
     path.write_bytes(b"old")
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="the disk is full"):
         atomic_write(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
@@ -54,7 +57,7 @@ def test_disk_full_for_real(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     path.write_bytes(b"old")
     monkeypatch.setattr(builtins, "open", lambda *_: real_open("/dev/full", "wb"))
     for size in (10, 1 << 20):
-        with pytest.raises(OSError, match="No space left"):
+        with pytest.raises(OSError, match="the disk is full"):
             atomic_write(path, bytes(size))
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
@@ -73,5 +76,46 @@ def test_link_is_followed_and_permissions_are_the_umasks(tmp_path: Path) -> None
 
 
 def test_missing_folder_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(WriteError, match=r"file: cannot be written: there is no folder .*no$") as caught:
         atomic_write(tmp_path / "no" / "file", b"")
+    assert caught.value.exit_status == 2
+    assert caught.value.errno == errno.ENOENT
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "model.ply").mkdir()
+    with pytest.raises(WriteError, match=r"model\.ply: cannot be written: it is a folder, expected the name of a file"):
+        atomic_write(tmp_path / "model.ply", b"")
+    assert list(tmp_path.iterdir()) == [tmp_path / "model.ply"]
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="no /proc on this system")
+def test_a_place_that_takes_no_files() -> None:
+    with pytest.raises(WriteError) as caught:
+        atomic_write("/proc/x.ply", b"")
+    assert str(caught.value) == "/proc/x.ply: cannot be written: no file can be made in /proc"
+
+
+def test_a_full_disk_says_how_much_is_needed(tmp_path: Path) -> None:
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    said = r"model.ply: cannot be written: the disk is full: {} needed and [\d,.]+ \w+ are free; make room"
+    with pytest.raises(WriteError, match=said.format("293 KiB are")), atomic_writer(tmp_path / "model.ply", 300_000):
+        raise full
+    with pytest.raises(WriteError, match=said.format("more than 5,000 bytes are")):  # noqa: SIM117
+        with atomic_writer(tmp_path / "model.ply") as file:
+            file.write(bytes(5000))
+            raise full
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_error_of_writing_survives_another_process() -> None:
+    error = WriteError(errno.ENOSPC, "the disk is full", "a.exr")
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.exit_status) == ("a.exr: cannot be written: the disk is full", 1)
+
+
+def test_errors_of_the_system_are_plain_sentences() -> None:
+    error = OSError(errno.EACCES, "Permission denied", "/a/b")
+    assert one_line(error) == "/a/b: permission is denied"
+    assert one_line(OSError(errno.ENOSPC, "No space left on device")) == "the disk is full"
+    assert one_line(MemoryError()) == "there is not enough main memory: the system gave no more"

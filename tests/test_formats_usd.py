@@ -17,6 +17,7 @@ from splats import assert_refused_or_sound, assert_within, colours, covariances,
 
 from clsplat.errors import InputError
 from clsplat.formats import usd
+from clsplat.paths import read_shot
 
 require("pxr")
 from pxr import Gf, Sdf, Usd, UsdGeom  # noqa: E402
@@ -168,6 +169,43 @@ def test_a_file_that_crashes_the_library(tmp_path: Path, monkeypatch: pytest.Mon
     for read in (usd.read, usd.describe):
         with pytest.raises(InputError, match=r"model\.usdc: USD's library crashes when it reads it; is it damaged"):
             read(path)
+
+
+def too_deep(path: Path) -> Path:
+    """USD's own parser goes down with each level until its stack ends."""
+    path.write_text("#usda 1.0\n" + 'def "a" {\n' * 200_000 + 'def Camera "c" {}\n' + "}\n" * 200_000)
+    return path
+
+
+def test_text_that_refers_to_others_is_tried_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "shot.usda"
+    path.write_text("#usda 1.0\n(\n    subLayers = [@damaged.usdc@]\n)\n")
+    monkeypatch.setattr(usd, "_lives", lambda *_: False)
+    for read in (usd.read, lambda each: read_shot(each, size=(64, 48))):
+        with pytest.raises(InputError, match=r"shot\.usda: USD's library crashes when it reads it; is it damaged"):
+            read(path)
+
+
+@pytest.mark.slow
+def test_text_that_leads_to_a_file_that_crashes_the_library(tmp_path: Path) -> None:
+    too_deep(tmp_path / "damaged.usda")
+    path = tmp_path / "shot.usda"
+    path.write_text("#usda 1.0\n(\n    subLayers = [@damaged.usda@]\n)\n")
+    for read in (usd.read, lambda each: read_shot(each, size=(64, 48))):
+        with pytest.raises(InputError, match=r"shot\.usda: USD's library crashes when it reads it; is it damaged"):
+            read(path)
+
+
+@pytest.mark.slow
+def test_cameras_that_crash_the_library(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"deep\.usda: USD's library crashes when it reads it"):
+        read_shot(too_deep(tmp_path / "deep.usda"), size=(64, 48))
+
+
+def test_text_that_stands_alone_is_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usd.write(tmp_path / "model.usda", lopsided(4, degree=0))
+    monkeypatch.setattr(usd, "_lives", None)
+    assert len(usd.read(tmp_path / "model.usda")) == 4
 
 
 def test_a_stage_without_gaussians(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def test_plain_lines_now_and_then() -> None:
             now[0] += 0.5
             progress(Report(step, seconds=now[0]))
     lines = stream.getvalue().splitlines()
-    assert lines[0] == "step 20/100  loss 0.5000  PSNR 20.00  12,345 Gaussians  2.0 it/s  0:40 left"
+    assert lines[0] == "step 20/100  loss 0.5000  PSNR 20.00  12,345 Gaussians  2.0 steps/s  0:40 left"
     assert [line.split()[1] for line in lines] == ["20/100", "40/100", "50/100"]
 
 

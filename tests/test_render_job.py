@@ -328,5 +328,5 @@ def test_folders_are_looked_at_first(tmp_path: Path, monkeypatch: pytest.MonkeyP
         render_job.check_folders(tasks_in(tmp_path / "new" / "shot"))
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system")))
-    with pytest.raises(InputError, match="cannot be made: Read-only file system"):
+    with pytest.raises(InputError, match="cannot be made: the disk is read-only"):
         render_job.make_folders(tasks_in(tmp_path / "new" / "shot"))

@@ -307,7 +307,7 @@ def test_wrong_calls_are_one_line(reported: Path, tmp_path: Path, capsys: Captur
         (["report", str(tmp_path / "none")], "no such folder, expected a run"),
         (["report", str(reported / "model.ply")], "no such folder, expected a run"),
         (["report", str(reported), "-o", str(tmp_path / "a" / "b.html")], "no such folder, expected one for b.html"),
-        (["report", str(reported), "-o", str(tmp_path)], "is a folder, expected a file"),
+        (["report", str(reported), "-o", str(tmp_path)], "is a folder, expected the name of a file"),
         (["report", str(reported), "--views", "-1"], "--views -1: expected at least 0"),
         (["compare", str(reported)], "expected at least two runs"),
         (["compare", str(reported), str(tmp_path)], "not a run"),

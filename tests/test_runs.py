@@ -39,13 +39,20 @@ def test_config_comes_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('clsplat = "1"\n[train]\niteration = 3\n', "unknown key 'train.iteration', expected one of iterations"),
-        ('clsplat = "1"\n[train.density]\neach = 3\n', "unknown key 'train.density.each'"),
-        ('clsplat = "1"\ntrian = 3\n', "unknown key 'trian'"),
-        ('clsplat = "1"\n[train]\niterations = "many"\n', "train.iterations is 'many', expected int"),
-        ('clsplat = "1"\n[train]\niterations = true\n', "train.iterations is True, expected int"),
+        (
+            'clsplat = "1"\n[train]\niteration = 3\n',
+            "[train] has 'iteration', which is no setting there; did you mean 'iterations' in [train]?",
+        ),
+        ('clsplat = "1"\n[train.density]\neach = 3\n', "[train.density] has 'each', which is no setting there"),
+        (
+            'clsplat = "1"\n[train.rasterizer]\niterations = 3\n',
+            "[train.rasterizer] has 'iterations', which is no setting there; it belongs to [train]",
+        ),
+        ('clsplat = "1"\ntrian = 3\n', "has 'trian', which is no setting"),
+        ('clsplat = "1"\n[train]\niterations = "many"\n', "train.iterations is 'many', expected a whole number"),
+        ('clsplat = "1"\n[train]\niterations = true\n', "train.iterations is True, expected a whole number"),
         ('clsplat = "1"\n[train]\nbackground = "red"\n', "expected one of black, white, random"),
-        ('clsplat = "1"\n[train]\neval_at = [1, "x"]\n', "train.eval_at is 'x', expected int"),
+        ('clsplat = "1"\n[train]\neval_at = [1, "x"]\n', "train.eval_at is 'x', expected a whole number"),
         ('clsplat = "1"\n[train]\noptimiser = 3\n', "train.optimiser is 3, expected a table"),
         ('clsplat = "1"\n[train\n', "not readable as TOML"),
     ],

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 import warnings
@@ -10,6 +11,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pycolmap
 import pytest
+from PIL import Image as Pillow
+from systems import can_link
 
 from clsplat import demo_scene, sfm, sfm_photos
 from clsplat.errors import ClsplatError, InputError
@@ -245,6 +248,76 @@ def test_photo_that_does_not_decode_is_named(photos, tmp_path, damage):
     with pytest.raises(InputError, match=r"view_05\.jpg: (cannot be decoded|does not decode)"):
         sfm.reconstruct(folder, tmp_path / "out")
     assert leftovers(tmp_path) == ["photos"]
+
+
+def task_of(monkeypatch):
+    """What the worker would have been given, in place of running it."""
+    tasks = []
+
+    def run(task, work, report):
+        tasks.append(task)
+        return {"result": {"registered": sorted(name for group in task["groups"] for name in group)}}
+
+    def move(work, output):
+        tasks.append({path.name: path.read_bytes() for path in (work / "photos").rglob("*") if path.is_file()})
+
+    monkeypatch.setattr(sfm, "_run_worker", run)
+    monkeypatch.setattr(sfm, "_move_into_place", move)
+    real = sfm.sfm_photos.stage_photos
+
+    def stage(images, paths, target, report, threads):
+        (target.parent / "result" / "images").mkdir(parents=True)
+        return real(images, paths, target, report, threads)
+
+    monkeypatch.setattr(sfm_photos, "stage_photos", stage)
+    return tasks
+
+
+def test_what_is_no_photo_is_left_out_with_a_line(photos, tmp_path, monkeypatch):
+    folder = tmp_path / "photos"
+    shutil.copytree(photos, folder)
+    (folder / "masks").mkdir()
+    for index in range(COUNT):
+        write_png(folder / "masks" / f"view_{index:02d}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    broken = can_link()
+    if broken:
+        (folder / "gone.jpg").symlink_to(folder / "nowhere.jpg")
+    tasks = task_of(monkeypatch)
+    messages = warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "out"))
+    assert sorted(tasks[0]["groups"][0]) == [f"view_{index:02d}.jpg" for index in range(COUNT)]
+    masks = "12 photo(s) (masks/view_00.png, masks/view_01.png, masks/view_02.png and 9 more) left out: by their names "
+    assert messages[-1].startswith(f"{folder}: {masks}")
+    assert messages[:-1] == ([f"{folder}: 1 photo(s) (gone.jpg) left out: links that lead nowhere"] if broken else [])
+
+
+def test_a_folder_of_photos_that_cannot_be_read_is_named(photos, tmp_path, monkeypatch):
+    folder = tmp_path / "photos"
+    shutil.copytree(photos, folder / "a")
+    (folder / "locked").mkdir()
+    real = os.scandir
+
+    def scandir(path):
+        if str(path).endswith("locked"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    with pytest.raises(InputError, match="locked: cannot be searched for pictures: permission is denied; make it read"):
+        sfm.reconstruct(folder, tmp_path / "out")
+
+
+def test_a_photo_of_another_kind_than_its_name_says_is_written_anew(photos, tmp_path, monkeypatch):
+    """pycolmap reads no WebP."""
+    folder = tmp_path / "photos"
+    shutil.copytree(photos, folder)
+    picture = read_image(folder / "view_03.jpg")
+    Pillow.fromarray(picture).save(folder / "view_03.jpg", "WEBP", quality=95)
+    tasks = task_of(monkeypatch)
+    assert warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "out")) == []
+    assert tasks[1]["view_03.jpg"].startswith(b"\xff\xd8\xff")
+    assert tasks[1]["view_04.jpg"] == (folder / "view_04.jpg").read_bytes()
+    (tmp_path / "staged.jpg").write_bytes(tasks[1]["view_03.jpg"])
+    assert np.abs(read_image(tmp_path / "staged.jpg").astype(int) - picture).mean() < 4
 
 
 def test_photos_without_texture_say_what_there_was(tmp_path):

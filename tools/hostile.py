@@ -364,7 +364,7 @@ def read_checkpoint(folder: Path) -> None:
 
 def read_photos(folder: Path) -> None:
     """What structure from motion does before it starts pycolmap."""
-    photos, _ = sfm_photos.find_photos(folder / "photos")
+    photos = sfm_photos.find_photos(folder / "photos").photos
     sfm_photos.stage_photos(folder / "photos", photos, folder / "staged", lambda _: None, 1)
 
 

@@ -448,7 +448,7 @@ def full_temporary(found: Found, alone: Machine) -> Machine:
     script = 'mount -t tmpfs -o size=64k none "$1" && { cat /dev/zero >"$1/filler" 2>/dev/null; shift; exec "$@"; }'
     scene, train = ten_steps("{folder}/work")
     command = tuple("{folder}/tmp/run" if word == "{folder}/work/run" else word for word in train.command)
-    on_it = Step("on it", command, TRAIN_LIMIT, status=1, says="No space left")
+    on_it = Step("on it", command, TRAIN_LIMIT, status=1, says="the disk is full")
     return replace(
         alone,
         name="full-tmp",

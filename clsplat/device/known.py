@@ -20,6 +20,7 @@ from typing import Any
 import pyopencl as cl
 
 from clsplat.device.source import kernel_root, kernel_source
+from clsplat.errors import reason_of
 from clsplat.files import atomic_write, locked, parse_json
 
 BREAK = "CLSPLAT_BREAK_KERNEL"
@@ -168,7 +169,7 @@ def _remember(addition: _Addition) -> None:
             atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
         del _unwritten[path]
     except OSError as error:
-        tell_once(f"{path}: cannot be written ({error.strerror}), drivers are tested anew each time")
+        tell_once(f"{path}: cannot be written ({reason_of(error)}), so that drivers are tested anew each time")
 
 
 @lru_cache(maxsize=8)

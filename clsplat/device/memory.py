@@ -7,7 +7,7 @@ import gc
 import weakref
 from typing import Any
 
-from clsplat.errors import CapacityError
+from clsplat.errors import CapacityError, amount
 
 
 class Memory:
@@ -25,8 +25,8 @@ class Memory:
         gc.collect()  # what an exception's traceback or a cycle still holds is not in use
         if self.used + nbytes > self.limit:
             raise CapacityError(
-                f"{mebibytes(nbytes)} more are needed on the device where {mebibytes(self.used)} are in use and "
-                f"--max-device-mem allows {mebibytes(self.limit)}: allow more, or use a smaller resolution or fewer "
+                f"--max-device-mem {amount(self.limit)} is too little: {amount(self.used)} of the device's memory are "
+                f"in use, and {amount(nbytes)} more are needed; allow more, or use a smaller resolution or fewer "
                 "Gaussians (--density.max-gaussians)"
             )
 
@@ -38,8 +38,3 @@ class Memory:
 
     def _remove(self, nbytes: int) -> None:
         self.used -= nbytes
-
-
-def mebibytes(nbytes: int) -> str:
-    """For messages: whole MiB, or KiB where those would say little."""
-    return f"{nbytes / 2**20:,.0f} MiB" if nbytes >= 10 * 2**20 else f"{nbytes / 2**10:,.0f} KiB"

@@ -14,7 +14,7 @@ import pyopencl as cl
 
 from clsplat.device import known
 from clsplat.device.child import regardless
-from clsplat.errors import DeviceError
+from clsplat.errors import DeviceError, reason_of
 
 LANES = (1, 4, 8, 16)
 """Pixels that a vector can have."""
@@ -230,12 +230,14 @@ def saved_shapes() -> dict[str, str]:
     except (FileNotFoundError, NotADirectoryError):  # a home may be a file, or none
         return {}
     except OSError as error:
-        warnings.warn(f"{path}: cannot be read ({error.strerror}), so no tuned shape is used", stacklevel=2)
+        warnings.warn(f"{path}: cannot be read ({reason_of(error)}), so that no tuned shape is used", stacklevel=2)
         return {}
     except ValueError:
         saved = None
     if not isinstance(saved, dict) or not all(isinstance(value, str) for value in saved.values()):
-        warnings.warn(f"{path}: not a list of shapes, passed over; clsplat tune writes it anew", stacklevel=2)
+        warnings.warn(
+            f"{path}: is damaged, so that no tuned shape is used; clsplat tune writes the file anew", stacklevel=2
+        )
         return {}
     return saved
 

@@ -22,12 +22,13 @@ import functools
 import inspect
 import os
 import pkgutil
+import warnings
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, plain
 from clsplat.files import is_file, open_input
 from clsplat.gaussians import Gaussians
 
@@ -73,11 +74,20 @@ def format_of(path: Path) -> ModuleType:
         return named
     with open_input(path, f"a model file, its ending one of {' '.join(suffixes())}") as file:
         head = file.read(HEAD_BYTES)
-    if named is None or not _recognised(named, head):
+    # of a format without a beginning of its own another's counts, but for JSON's, which says too little
+    nameless = named is not None and not hasattr(named, "recognises") and head.lstrip()[:1] != b"{"
+    if named is None or nameless or not _recognised(named, head):
         for module in formats().values():
             if hasattr(module, "recognises") and module.recognises(head):
                 return module
     return named or format_of_name(path)
+
+
+def tell_kind(path: Path, module: ModuleType) -> None:
+    """Warn where the file's name says that it is of another format than it is."""
+    endings = {Path(f"x{suffix}").suffix for suffix in module.SUFFIXES}
+    if path.suffix.lower() not in endings:
+        warnings.warn(plain(f"{path}: is {module.NAME} by its content, whatever its name says"), stacklevel=3)
 
 
 def is_model_name(path: Path) -> bool:
@@ -106,7 +116,9 @@ def model_path(path: Path) -> Path:
 def load(path: str | os.PathLike[str]) -> Gaussians:
     """Read a model file of any format. Raises InputError naming the file and the trouble."""
     path = model_path(Path(path))
-    gaussians: Gaussians = format_of(path).read(path)
+    module = format_of(path)
+    tell_kind(path, module)
+    gaussians: Gaussians = module.read(path)
     return gaussians
 
 

@@ -32,7 +32,7 @@ import numpy as np
 from clsplat.colour import srgb_to_linear
 from clsplat.edit import merge
 from clsplat.errors import InputError
-from clsplat.files import atomic_writer
+from clsplat.files import atomic_write, atomic_writer
 from clsplat.formats import conventions, packing, spz
 from clsplat.formats.conventions import LEFT_UP
 from clsplat.formats.gltf_asset import (
@@ -108,11 +108,10 @@ def write(
     document, buffer = _document(path, gaussians, spz_compression, color_space)
     if path.suffix.lower() == ".gltf":
         binary = path.with_suffix(".bin")
-        with atomic_writer(binary) as file:
+        with atomic_writer(binary, buffer.length) as file:
             length = buffer.write(file)
         document["buffers"] = [{"byteLength": length, "uri": binary.name}]
-        with atomic_writer(path) as file:
-            file.write(json.dumps(document, indent=1).encode())
+        atomic_write(path, json.dumps(document, indent=1).encode())
         return
     length = buffer.length
     document["buffers"] = [{"byteLength": length}]
@@ -122,7 +121,7 @@ def write(
     total = 28 + len(text) + padded
     if total > LARGEST_GLB:
         raise InputError(f"{path}: a .glb holds 4 GiB at most, {total} bytes would be needed; write a .gltf")
-    with atomic_writer(path) as file:
+    with atomic_writer(path, total) as file:
         file.write(struct.pack("<IIIII", GLB_MAGIC, 2, total, len(text), JSON_CHUNK) + text)
         file.write(struct.pack("<II", padded, BIN_CHUNK))
         buffer.write(file)

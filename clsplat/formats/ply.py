@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, examples, plain
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
@@ -126,6 +126,8 @@ def read_blocks(path: Path) -> Iterator[Gaussians]:
         rest = _check_properties(vertex, path)
         higher, kept = rest // 3, min(rest // 3, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
         names = [*DC, *(f"f_rest_{c * higher + k}" for k in range(kept) for c in range(3))]
+        if vertex.count == 0:
+            yield _none(kept)
         for block in read_vertices(file, header, path, "Gaussian") if vertex.count else ():
 
             def columns(*of: str, block: Block = block) -> NDArray[np.float32]:
@@ -134,6 +136,13 @@ def read_blocks(path: Path) -> Iterator[Gaussians]:
 
             sh = columns(*names).reshape(-1, 1 + kept, 3)
             yield Gaussians(columns(*POSITION), columns(*ROTATION), columns(*SCALE), columns("opacity")[:, 0], sh)
+
+
+def _none(kept: int) -> Gaussians:
+    def array(*shape: int) -> NDArray[np.float32]:
+        return np.empty((0, *shape), np.float32)
+
+    return Gaussians(array(3), array(4), array(3), array(), array(1 + kept, 3))
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -173,8 +182,9 @@ def write(
     lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
     lines += [f"element {LOCAL} {count}", *(f"property float {name}" for name in POSITION)] if far else []
     lines += ["end_header", ""]
-    with atomic_writer(path) as file:
-        file.write("\n".join(lines).encode("ascii"))
+    head = "\n".join(lines).encode("ascii")
+    with atomic_writer(path, len(head) + 4 * count * (len(names) + (3 if far else 0))) as file:
+        file.write(head)
         for start in range(0, len(gaussians), BLOCK_ROWS):
             rows = slice(start, start + BLOCK_ROWS)
             sh = gaussians.sh[rows]
@@ -234,7 +244,9 @@ def read_header(file: BinaryIO, path: Path) -> Header:
                 case _:
                     raise ValueError
         except (ValueError, KeyError, IndexError):
-            raise InputError(f"{path}: PLY header has a line that is none: {' '.join(words)[:80]!r}") from None
+            raise InputError(
+                f"{path}: PLY header has a line that is of no PLY header: {' '.join(words)[:80]!r}"
+            ) from None
     raise InputError(f"{path}: PLY header is truncated or damaged (no line 'end_header')")
 
 
@@ -291,7 +303,7 @@ def _vertex_element(header: Header, path: Path) -> tuple[Element, list[Element]]
     """The vertex element and those stored before it."""
     names = [element.name for element in header.elements]
     if "vertex" not in names:
-        found = ", ".join(names) or "none"
+        found = examples(names) or "none"
         raise InputError(f"{path}: PLY has no element 'vertex' (elements: {found})")
     at = names.index("vertex")
     return header.elements[at], header.elements[:at]
@@ -303,11 +315,11 @@ def _check_properties(vertex: Element, path: Path) -> int:
     missing = [name for name in REQUIRED if name not in names]
     if missing:
         noun = "property" if len(missing) == 1 else "properties"
-        raise InputError(f"{path}: PLY lacks the {noun} {' '.join(missing)}, expected a 3DGS model")
+        raise InputError(f"{path}: PLY lacks the {noun} {examples(missing)}, expected a 3DGS model")
     rest = sum(name.startswith("f_rest_") for name in names)
     counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 2)]
     if rest not in counts:
-        raise InputError(f"{path}: PLY has {rest} f_rest properties, expected {', '.join(map(str, counts))}")
+        raise InputError(f"{path}: PLY has {rest} f_rest properties, expected {', '.join(map(str, counts))} (SH)")
     for index in range(rest):
         if f"f_rest_{index}" not in names:
             raise InputError(f"{path}: PLY lacks the property f_rest_{index}, though it has {rest} of f_rest")

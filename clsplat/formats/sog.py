@@ -19,14 +19,13 @@ import json
 import math
 import os
 import shutil
-import tempfile
 import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import OpenImageIO as oiio
@@ -35,12 +34,15 @@ from numpy.typing import NDArray
 from clsplat.errors import InputError, plain
 from clsplat.files import (
     MAX_DOCUMENT,
+    atomic_write,
     atomic_writer,
     is_file,
     native_name,
     open_input,
     parse_json,
     read_document,
+    scratch_folder,
+    write_error,
 )
 from clsplat.formats import packing
 from clsplat.formats.palette import codebook, nearest, palette
@@ -59,6 +61,8 @@ Float64 = NDArray[np.float64]
 Progress = Callable[[str, float | None], None]
 
 META = "meta.json"
+PICTURES = ("means", "quats", "scales", "sh0", "shN")
+"""Beginnings of the pictures' names that are written."""
 MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
 LARGEST_TAG = 252
@@ -145,7 +149,7 @@ class _Archive(_Files):
                     left -= len(block)
                     if left < 0:
                         raise InputError(f"{self.path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
-                    file.write(block)
+                    _write(file, block, target)
         except KeyError:
             raise InputError(f"{self.path}: has no {name[:80]} in it") from None
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
@@ -153,18 +157,26 @@ class _Archive(_Files):
         return target
 
 
+def _write(file: BinaryIO, block: bytes, path: Path) -> None:
+    try:
+        file.write(block)
+        file.flush()  # here and not at the end, where it would seem that reading failed
+    except OSError as error:
+        raise write_error(path, error) from None
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[_Files]:
     if path.is_dir() or path.name.lower().endswith(".json"):
         yield _Files(path)
         return
-    with open_input(path, "a .sog archive") as file, tempfile.TemporaryDirectory(prefix="clsplat-sog-") as folder:
+    with open_input(path, "a .sog archive") as file, scratch_folder(0) as folder:
         try:
             archive = zipfile.ZipFile(file)
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
             raise InputError(f"{path}: is no .sog archive ({error})") from None
         with archive:
-            yield _Archive(path, archive, Path(folder))
+            yield _Archive(path, archive, folder)
 
 
 class _Meta:
@@ -312,23 +324,27 @@ def write(
     packing.require_finite(path, gaussians, writing=True)
     if not len(gaussians):
         raise InputError(f"{path}: cannot be written: the model has no Gaussians")
-    with tempfile.TemporaryDirectory(prefix="clsplat-sog-") as name:
-        folder = Path(name)
+    with scratch_folder(_room(len(gaussians))) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)
         meta = _pictures(folder, gaussians, order, iterations, progress)
         text = json.dumps(meta, separators=(",", ":")).encode()
         files = sorted(folder.iterdir())
         if path.name.lower().endswith(".json"):
             for each in files:
-                with atomic_writer(path.with_name(each.name)) as file, each.open("rb") as source:
+                with atomic_writer(path.with_name(each.name), each.stat().st_size) as file, each.open("rb") as source:
                     shutil.copyfileobj(source, file)
-            with atomic_writer(path) as file:
-                file.write(text)
+            atomic_write(path, text)
             return
-        with atomic_writer(path) as file, zipfile.ZipFile(file, "w") as archive:  # stored: WebP is compressed
+        total = sum(each.stat().st_size for each in files)
+        with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:  # stored: WebP is compressed
             archive.writestr(zipfile.ZipInfo(META), text)
             for each in files:
                 archive.writestr(zipfile.ZipInfo(each.name), each.read_bytes())
+
+
+def _room(count: int) -> int:
+    """More bytes than the pictures have: the encoder of WebP crashes where there is no room."""
+    return 24 * count + 64 * min(count, MAX_PALETTE) + (1 << 16)
 
 
 def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, progress: Progress) -> dict[str, Any]:

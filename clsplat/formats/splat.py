@@ -65,7 +65,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
     """Write it, atomically."""
     gaussians.check()
     packing.require_finite(path, gaussians, writing=True)
-    with atomic_writer(path) as file:
+    with atomic_writer(path, ROW.itemsize * len(gaussians)) as file:
         for start in range(0, len(gaussians), BLOCK_ROWS):
             rows = slice(start, start + BLOCK_ROWS)
             block: Any = np.empty(len(gaussians.means[rows]), ROW)

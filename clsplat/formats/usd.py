@@ -14,24 +14,24 @@ Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_g
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
-import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.edit import merge
 from clsplat.errors import InputError, plain
-from clsplat.files import atomic_writer, native_name, open_input
+from clsplat.files import atomic_writer, native_name, open_input, scratch_folder
 from clsplat.formats import conventions, packing
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
@@ -44,6 +44,8 @@ TYPE = "ParticleField3DGaussianSplat"
 TYPES = (TYPE, "ParticleField_3DGaussianSplat")
 """The second is what a draft, and Nuke 17.0, called it."""
 COEFFICIENTS, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
+MOST_LEVELS = 5000
+"""Braces in a text: under 20,000 levels of prims USD's stack of 8 MiB is enough."""
 WORLD, PRIM = "/World", "/World/Gaussians"
 
 Float32 = NDArray[np.float32]
@@ -62,29 +64,45 @@ def recognises(head: bytes) -> bool:
     return head.startswith((b"#usda", b"PXR-USDC", b"PK\x03\x04"))
 
 
-def _survive(path: Path) -> None:
-    """Raise InputError where there is no usd-core or no such file, and where a process that reads the file does not
-    live to its end: USD's library follows what a damaged binary file says to anywhere."""
+def survive(path: Path, call: str = "clsplat.formats.usd:read_here", **arguments: Any) -> None:
+    """Raise InputError where there is no usd-core or no such file, and where a process that makes the `call`
+    (MODULE:FUNCTION, with the path and these arguments) does not live to its end: USD's library follows what a damaged
+    binary file says to anywhere, and so deep into a file that its stack ends."""
     _pxr(path)
     with open_input(path, "a USD stage") as file:
-        text, found = file.read(5) == b"#usda", os.fstat(file.fileno())
-    if not (text or _lives(os.path.realpath(path), found.st_mtime_ns, found.st_size)):
-        raise InputError(f"{path}: USD's library crashes when it reads it; is it damaged?")
+        alone, found = _stands_alone(file), os.fstat(file.fileno())
+    words = json.dumps(arguments)
+    if not (alone or _lives(call, words, os.path.realpath(path), found.st_mtime_ns, found.st_size)):
+        raise InputError(f"{path}: USD's library crashes when it reads it; is it damaged, or a file that it refers to?")
+
+
+def _stands_alone(file: BinaryIO) -> bool:
+    """Whether it is text that refers to no other file, of few levels: USD reads that without harm."""
+    if file.read(5) != b"#usda":
+        return False
+    levels = 0
+    while block := file.read(1 << 20):
+        levels += block.count(b"{")
+        if b"@" in block or levels > MOST_LEVELS:
+            return False
+    return True
 
 
 @lru_cache(maxsize=32)
-def _lives(path: str, *_: int) -> bool:
+def _lives(call: str, arguments: str, path: str, *_: int) -> bool:
+    module, function = call.split(":")
     code = (
-        f"import sys; sys.path[:] = {sys.path!r}; from pathlib import Path; from clsplat.formats import usd; "
-        "usd.read_here(Path(sys.argv[1]))"
+        f"import json, sys; sys.path[:] = {sys.path!r}; from pathlib import Path; from {module} import {function}; "
+        f"{function}(Path(sys.argv[1]), **json.loads(sys.argv[2]))"
     )
-    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, check=False)
+    words = [sys.executable, "-c", code, path, arguments]
+    done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, check=False)
     return done.returncode in (0, 1)  # 1: an error, which this process will find itself
 
 
 def describe(path: Path) -> dict[str, Any]:
     """What the stage says of its axes and units, which move nothing here."""
-    _survive(path)
+    survive(path)
     stage = _open(path)
     from pxr import UsdGeom
 
@@ -125,7 +143,7 @@ def _open(path: Path) -> Any:
 
 def read(path: Path) -> Gaussians:
     """Read every prim of Gaussians of a stage, at its first time, as one model. Raises InputError."""
-    _survive(path)
+    survive(path)
     return read_here(path)
 
 
@@ -218,20 +236,29 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     from pxr import Usd, UsdUtils
 
     suffix = path.suffix.lower()
-    # USD may hold its file open for longer, which Windows does not remove
-    with tempfile.TemporaryDirectory(prefix="clsplat-usd-", ignore_cleanup_errors=True) as folder:
-        made = Path(folder) / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
+    with scratch_folder(4 * sum(array.size for array in _arrays(gaussians))) as folder:
+        made = folder / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
         stage = Usd.Stage.CreateNew(native_name(made))
         _author(stage, gaussians, up_axis, meters_per_unit)
         stage.GetRootLayer().Save()
         del stage
         if suffix == ".usdz":
-            package = Path(folder) / "gaussians.usdz"
+            package = folder / "gaussians.usdz"
             if not UsdUtils.CreateNewUsdzPackage(native_name(made), native_name(package)):
                 raise OSError(f"{path}: USD could not make the package")
             made = package
-        with atomic_writer(path) as file, made.open("rb") as source:
+        with atomic_writer(path, made.stat().st_size) as file, made.open("rb") as source:
             shutil.copyfileobj(source, file, 1 << 20)
+
+
+def _arrays(gaussians: Gaussians) -> tuple[Float32, ...]:
+    return (
+        gaussians.means,
+        gaussians.quaternions,
+        gaussians.log_scales,
+        gaussians.opacity_logits,
+        gaussians.sh,
+    )
 
 
 def _author(stage: Any, gaussians: Gaussians, up_axis: str, meters_per_unit: float) -> None:

@@ -7,7 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples
 from clsplat.paths.shot import MOST_FRAMES, Shot, named, numbered
 
 COUNT = 120
@@ -91,7 +91,7 @@ def _read_folder(path: Path, size: tuple[int | None, int | None]) -> Shot:
         model = find_model(path)
         if model is None or "colmap" in model.relative_to(path).parts:
             if listed != ["transforms.json"]:
-                raise InputError(f"{path}: holds {', '.join(listed)}, expected one of them to be named by --cameras")
+                raise InputError(f"{path}: holds {examples(listed)}, expected one of them to be named by --cameras")
             return _read_json(path / listed[0], size)
     cameras = read_cameras(path)
     if not cameras:

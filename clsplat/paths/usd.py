@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples
 from clsplat.files import native_name
-from clsplat.formats.usd import readable
+from clsplat.formats.usd import readable, survive
 from clsplat.paths.shot import MOST_FRAMES, Frame, Shot
 from clsplat.transforms import opengl_pose
 
@@ -36,12 +36,14 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
     stage that cannot be opened or has no such camera, no size, or values that cannot be; and where usd-core is not
     installed.
     """
-    try:
-        from pxr import Tf, Usd, UsdGeom, UsdUtils
-    except ImportError:
-        raise InputError(f"{path}: USD needs usd-core, expected it installed: pip install 'clsplat[usd]'") from None
-    if not path.is_file():
-        raise InputError(f"{path}: no such file, expected a USD stage")
+    survive(path, "clsplat.paths.usd:read_here", size=size, prim=prim)
+    return read_here(path, size, prim)
+
+
+def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
+    """`read_usd` of a file that is known not to end the process."""
+    from pxr import Tf, Usd, UsdGeom, UsdUtils
+
     # takes what USD would print: a layer that does not resolve may have nothing to do with the camera
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
@@ -114,7 +116,7 @@ def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:
     if len(matching) != 1:
         found = "has no such camera" if not matching else f"has {len(matching)} cameras"
         asked = "" if prim is None else f"--usd-camera {prim}: "
-        raise InputError(f"{path}: {asked}{found}, expected --usd-camera with one of {', '.join(paths[:20])}")
+        raise InputError(f"{path}: {asked}{found}, expected --usd-camera with one of {examples(paths)}")
     return matching[0]
 
 

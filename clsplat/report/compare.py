@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, examples, plain
 from clsplat.files import atomic_write
 from clsplat.report.figures import SCORES, Figures, read_figures, settings_of, smooth
 from clsplat.report.page import TITLES, duration, render_page, score, setting_text
@@ -68,7 +68,7 @@ def compare_runs(runs: Sequence[Run]) -> Comparison:
         found.notes += [f"{label}: {note}" for note in each.notes if note.startswith(("Not finished", "eval.json"))]
     scenes = {each.run.scene.name for each in figures if each.run.scene is not None}
     if len(scenes) > 1:
-        found.notes.append(f"The runs are of different scenes: {', '.join(sorted(scenes))}.")
+        found.notes.append(f"The runs are of different scenes: {examples(sorted(scenes))}.")
     held_out = {frozenset(view["name"] for view in each.evaluation["views"]) for each in figures if each.evaluation}
     if len(held_out) > 1:
         found.notes.append("The runs do not hold out the same views: their scores are not of the same pictures.")

@@ -11,9 +11,8 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups, launch_items
 from clsplat.device.layout import TILE
-from clsplat.device.memory import mebibytes
 from clsplat.device.profile import stage
-from clsplat.errors import CapacityError
+from clsplat.errors import CapacityError, amount
 from clsplat.stages.project import Projected
 from clsplat.stages.scan import chunking, scan
 from clsplat.stages.sort import sort
@@ -173,7 +172,7 @@ def plan_bands(
     if (most := int(by_tile.max(initial=0))) > capacity:
         raise CapacityError(
             f"one tile of {TILE}x{TILE} pixels has {most:,} Gaussians, and the memory that is left on {device.name} "
-            f"is enough for {capacity:,} of {mebibytes(device.budget)}: allow more (--max-device-mem)"
+            f"is enough for {capacity:,} of {amount(device.budget)}: allow more (--max-device-mem)"
         )
     ends = np.cumsum(by_tile, dtype=np.uint64)
     bands, first, done = [], 0, 0
