@@ -81,10 +81,6 @@ def read_job(verb: Render) -> Job:
     render_job.check_folders(tasks)
     for warning in chosen.warnings:
         warn(warning)
-    rasterizer = verb.rasterizer
-    if rasterizer.sh_angle:
-        warn(f"--rasterizer.sh-angle {rasterizer.sh_angle:g} is not used: a frame would depend on those before it")
-        rasterizer = replace(rasterizer, sh_angle=0.0)
     model = model_file(verb.model)
     gaussians = Gaussians.load(model)
     recorded = recorded_space(model)
@@ -92,7 +88,7 @@ def read_job(verb: Render) -> Job:
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
     attributes["clsplat:colorspace"] = colours.output
     options = replace(options, attributes=attributes, recorded=recorded)
-    return Job(verb, options, rasterizer, model, gaussians, tasks, devices, limit, (colours.model, colours.output))
+    return Job(verb, options, verb.rasterizer, model, gaussians, tasks, devices, limit, (colours.model, colours.output))
 
 
 def _options(verb: Render) -> RenderOptions:

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeVar, get_args, get_origin, get_type_hints
 from zipfile import ZIP_STORED, ZipFile
@@ -55,6 +56,9 @@ NPY_HEADER = re.compile(
 
 Arrays = dict[str, NDArray[Any]]
 T = TypeVar("T")
+
+RETIRED: dict[str, Any] = {"train.rasterizer.sh_angle": 0.0}
+"""Settings that earlier versions had, and the value of each with which it did nothing."""
 
 
 @dataclass(frozen=True)
@@ -370,15 +374,20 @@ def config_text(config: TrainConfig, scene: Path | None) -> str:
 
 def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
     """The configuration and the scene's path. Raises InputError naming the file and the key that is wrong."""
+    return parse_config(read_document(path, "the settings of a run", MAX_SETTINGS), path)
+
+
+def parse_config(text: str, path: Path, *, tell: bool = True) -> tuple[TrainConfig, Path | None]:
+    """As `read_config`, of the file's text; tell: warn of settings that there are no more."""
     try:
-        document = tomllib.loads(read_document(path, "the settings of a run", MAX_SETTINGS))
+        document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as TOML ({error})") from None
     for key in document:
         if key not in ("clsplat", "scene", "train"):
             raise InputError(f"{path}: unknown key {key!r}, expected clsplat, scene or train")
     scene = document.get("scene")
-    config = _from_table(TrainConfig, document.get("train", {}), path, "train")
+    config = _from_table(TrainConfig, document.get("train", {}), path, "train", tell=tell)
     try:
         config.check()
     except InputError as error:
@@ -386,7 +395,7 @@ def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
     return config, Path(scene) if isinstance(scene, str) else None
 
 
-def _from_table(cls: type[T], table: Any, path: Path, where: str) -> T:
+def _from_table(cls: type[T], table: Any, path: Path, where: str, *, tell: bool) -> T:
     """An instance of the dataclass `cls`; keys that are not there keep their defaults."""
     if not isinstance(table, dict):
         raise InputError(f"{path}: {where} is {table!r}, expected a table")
@@ -394,13 +403,23 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str) -> T:
     names = [f.name for f in fields(cls)]  # type: ignore[arg-type]  # every caller passes a dataclass
     values = {}
     for key, value in table.items():
+        if (name := f"{where}.{key}") in RETIRED:
+            if value != RETIRED[name] and tell:
+                _tell_retired(path, name, repr(value))
+            continue
         if key not in names:
             raise InputError(f"{path}: unknown key '{where}.{key}', expected one of {', '.join(names)}")
         if is_dataclass(types[key]):
-            values[key] = _from_table(types[key], value, path, f"{where}.{key}")
+            values[key] = _from_table(types[key], value, path, f"{where}.{key}", tell=tell)
         else:
             values[key] = _value(types[key], value, f"{path}: {where}.{key}")
     return cls(**values)
+
+
+@cache
+def _tell_retired(path: Path, name: str, value: str) -> None:
+    """A warning, once for a file however often it is read."""
+    warnings.warn(plain(f"{path}: {name} is {value} there and is passed over, this version has no such setting"))
 
 
 def _value(kind: Any, value: Any, what: str) -> Any:
