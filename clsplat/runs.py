@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run folder: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/, test/ (held-out renders)."""
+"""The run folder: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/, test/ (held-out renders). What is in
+scene.json `clsplat.run_scene` knows."""
 
 from __future__ import annotations
 
@@ -35,6 +36,7 @@ from clsplat.files import (
     remove,
 )
 from clsplat.gaussians import Gaussians
+from clsplat.locks import locked
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -95,20 +97,23 @@ class Run:
         """Make the folder and its config.toml; `scene` is recorded there as an absolute path.
 
         resume: go on in a run that is there, with `config` (see `check_resumed`); overwrite: remove the files of the
-        run that is there, and nothing else. Raises InputError where `check_output` does.
+        run that is there, and nothing else. Raises InputError where `check_output` and `locks.locked` do.
         """
         path = Path(path)
         check_output(path, resume=resume, overwrite=overwrite)
-        if resume:
-            earlier = cls.open(path)
-            check_resumed(earlier, config)
-            scene = scene or earlier.scene
-        elif overwrite and is_run(path):
-            for file in owned_files(path):
-                remove(file)
-        run = cls(path, config, Path(scene).absolute() if scene is not None else None, resuming=resume)
-        run.checkpoints_path.mkdir(parents=True, exist_ok=True)
-        atomic_write(run.config_path, config_text(config, run.scene).encode())
+        path.mkdir(parents=True, exist_ok=True)
+        with locked(path, "train"):
+            check_output(path, resume=resume, overwrite=overwrite)  # again: another process may just have been there
+            if resume:
+                earlier = cls.open(path)
+                check_resumed(earlier, config)
+                scene = scene or earlier.scene
+            elif overwrite and is_run(path):
+                for file in owned_files(path):
+                    remove(file)
+            run = cls(path, config, Path(scene).absolute() if scene is not None else None, resuming=resume)
+            run.checkpoints_path.mkdir(exist_ok=True)
+            atomic_write(run.config_path, config_text(config, run.scene).encode())
         return run
 
     @classmethod
@@ -350,7 +355,7 @@ def owned_files(path: Path) -> list[Path]:
     """The files in a run's folder that clsplat wrote, and that --overwrite may therefore remove."""
     patterns = ("checkpoints/step-*.npz", "trouble-step-*.npz", "test/**/*.png", "**/.*" + TEMPORARY_SUFFIX)
     # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
-    names = ("model.ply", "metrics.jsonl", "eval.json", "report.html", "config.toml")
+    names = ("model.ply", "metrics.jsonl", "eval.json", "report.html", "scene.json", "config.toml")
     found = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
     return [file for file in found if file.is_file() or file.is_symlink()]
 

@@ -410,7 +410,8 @@ class Trainer:
         loaded = [self._loaded(checkpoint, kind) for kind in ("parameters", "first", "second")]
         self.step = checkpoint.step
         self.rng.bit_generator.state = checkpoint.state["rng"]
-        self.queue = list(checkpoint.state["queue"])
+        queue = list(checkpoint.state["queue"])
+        self.queue = queue if max(queue, default=0) < len(self.views) else []  # of a scene that had more of them
         self.watch.patience = Patience(**checkpoint.state.get("patience", {}))
         self.watch.forget()
         del self.parameters, self.first, self.second, self.gradients, self.statistics
