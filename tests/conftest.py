@@ -31,10 +31,10 @@ from clsplat.device.context import Device, open_device
 begin_session()
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a run in the background; tests interrupt its children
-# what PoCL takes by itself: tests that move the cache away then do not build every kernel anew
-os.environ.setdefault(
-    "POCL_CACHE_DIR", str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pocl" / "kcache")
-)
+# what they take by themselves: tests that move the cache away then do not build every kernel anew
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+os.environ.setdefault("POCL_CACHE_DIR", str(CACHE / "pocl" / "kcache"))
+os.environ.setdefault("CLSPLAT_BINARIES", str(CACHE / "clsplat" / "binaries"))
 
 
 def pytest_configure() -> None:

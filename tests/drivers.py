@@ -65,8 +65,8 @@ def begin_session() -> None:
 def why_not(index: int, lanes: int, items: int) -> str:
     """Why kernels in this shape cannot run on a device, found out in a process of its own; empty where they can.
 
-    PoCL 3.0 has no square root of 16 lanes on processors with AVX-512, and aborts at the first launch of a kernel that
-    has one. A wrong result is no reason: that is for the tests to find.
+    PoCL 3.0 aborts at the first launch of a kernel with a square root of 16 lanes where its compiler takes a processor
+    with AVX-512 for one without. A wrong result is no reason: that is for the tests to find.
     """
     device = all_devices()[index]
     if lanes <= default_shape(device).lanes:

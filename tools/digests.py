@@ -36,7 +36,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / part) for part in ("tests", "tests/stages", "tools", ".")]
 
 import numpy as np  # noqa: E402
-from processor import has_avx512, processor  # noqa: E402
+from processor import processor  # noqa: E402
 
 SHAPES = ("8x1", "16x1", "1x1", "1x64", "1x256")
 """Lanes x items; the first is what the others are compared with."""
@@ -54,8 +54,6 @@ EXPECTED = {
     ("Rusticl", "8x1"): "llvmpipe's compiler does not come back from vectors of 8",
 }
 """What cannot be had, with the reason. It is tried all the same."""
-if has_avx512():
-    EXPECTED["PoCL 3.0", "16x1"] = "it aborts on processors with AVX-512, for which its LLVM has no root of 16 lanes"
 GRADIENT_BOUND = 1e-6
 """Relative, in norm, of each parameter group of each scene. Two orders of adding up 256 numbers differ by some
 sqrt(256) half ulp of what is added, 5e-7, where that does not cancel."""

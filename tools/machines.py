@@ -383,7 +383,7 @@ def machines(found: Found) -> list[Machine]:
 
 
 def emulated(found: Found, missing: str) -> Machine:
-    """A processor without AVX-512. PyPI's PoCL builds kernels of 16 lanes there, and aborts on one with it."""
+    """A processor without AVX-512, which PyPI's PoCL takes for what it is."""
 
     def write_interpreter(folder: Path) -> None:
         # what TCG lacks of Haswell: it says so of each in every process

@@ -21,6 +21,7 @@ from clsplat.device.advice import no_device
 from clsplat.device.buffers import allocate
 from clsplat.device.launch import launch_groups
 from clsplat.device.memory import Memory
+from clsplat.device.processor import name_processor
 from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build, variant_of
 from clsplat.device.rehearsal import Rehearsal
@@ -55,6 +56,8 @@ def all_devices() -> list[cl.Device]:
             devices += platform.get_devices()
         except cl.Error:
             continue
+    for device in devices:
+        name_processor(device)
     return devices
 
 

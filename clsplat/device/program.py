@@ -14,6 +14,7 @@ from typing import Any
 
 import pyopencl as cl
 
+from clsplat.device import binaries
 from clsplat.device.known import BREAK
 from clsplat.device.source import kernel_source
 from clsplat.errors import DriverError, InputError, KernelBuildError
@@ -65,12 +66,15 @@ def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.
     """Compile a kernel file; the program, and the salt of `Variant.anew` that it took, or nothing. Raises
     KernelBuildError with the device, the options, the log and the source, and DriverError for a program without
     kernels, as PoCL makes of what an aborted build left in its cache."""
+    if (saved := binaries.load(context, device, variant.digest, variant.options)) is not None:
+        return saved, ""
     program, salt = _compiled(context, device, variant), ""
     if program.num_kernels == 0:
         salt = secrets.token_hex(8)
         program = _compiled(context, device, variant.anew(salt))
     if program.num_kernels == 0:
         raise DriverError(f"{device.name.strip()}: {variant.stem}.cl has no kernels when the driver has built it")
+    binaries.save(device, variant.digest, program)
     return program, salt
 
 
@@ -84,9 +88,12 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
         numbered = "\n".join(f"{number:4d}  {line}" for number, line in enumerate(source.splitlines(), 1))
         log = str(error)
         first = next((line.strip() for line in log.splitlines() if "error:" in line), log.splitlines()[0])
+        advice = "CLSPLAT_DEBUG=1 shows the log and the source"
+        if "unknown target CPU" in log:
+            advice = "this driver is older than the processor: take another one, such as your distribution's PoCL"
         raise KernelBuildError(
             f"{variant.stem}.cl does not build on {device.name.strip()} with {' '.join(variant.options)}: {first} "
-            "(CLSPLAT_DEBUG=1 shows the log and the source)",
+            f"({advice})",
             log,
             numbered,
         ) from None

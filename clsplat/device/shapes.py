@@ -79,6 +79,12 @@ def caches_programs(device: cl.Device) -> bool:
     return _pocl_version(device) is not None
 
 
+def wants_cache(device: cl.Device) -> bool:
+    """True for a driver that is known to build everything anew in each process, and to load its binaries again:
+    Intel's runtime for CPUs. Other drivers have a cache of their own, or have not been tried."""
+    return kind_of(device) == "cpu" and str(device.platform.name).strip() == "Intel(R) OpenCL"
+
+
 def default_shape(device: cl.Device) -> Shape:
     """The shape by type and vector width; why there are several is in docs/decisions/0003-one-source-many-shapes.md."""
     if kind_of(device) != "cpu":

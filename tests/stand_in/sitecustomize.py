@@ -41,6 +41,8 @@ def _misbehave(cl):
         os.abort()
 
     def build(self, options=(), *args, **kwargs):
+        if not hasattr(self, "_source"):
+            raise cl.Error("this driver takes no binaries")
         text = " ".join(options) + self._source
         if how == "launch" or not is_doomed(text, " ".join(options)):
             built = real_build(self, options, *args, **kwargs)
