@@ -18,11 +18,6 @@ from typing import IO
 from clsplat.errors import InputError, plain
 from clsplat.files import parse_json
 
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
-
 NAME = ".clsplat-lock"
 """The file in the folder that is locked, as long as somebody writes there. It says who."""
 _FAR = 1 << 30
@@ -86,11 +81,13 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
 
 def try_lock(file: IO[bytes]) -> None:
     """Lock the file, or raise OSError."""
+    file.seek(_FAR)
     if sys.platform == "win32":
-        file.seek(_FAR)
+        import msvcrt
+
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
     else:
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.lockf(file.fileno(), os.F_TLOCK, 1)
 
 
 def _sign(file: IO[bytes], verb: str) -> None:
@@ -115,6 +112,8 @@ def _who(file: IO[bytes]) -> str:
 def _give_back(file: IO[bytes], path: Path) -> None:
     with suppress(OSError):
         if sys.platform == "win32":  # there an open file cannot be removed
+            import msvcrt
+
             file.seek(_FAR)
             msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
             file.close()
