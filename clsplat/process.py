@@ -62,6 +62,30 @@ def terminable() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Inside, no signal that asks the process to end is seen to; afterwards the first that came is. What a library has
+    put in the place of our handlers is taken away again. In the main thread, as `terminable`."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    numbers = (signal.SIGINT, *endings())
+    before = {each: signal.signal(each, lambda number, _: came.append(number)) for each in numbers}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers) if sys.platform != "win32" else None
+    try:
+        yield
+    finally:
+        for each in before:
+            signal.signal(each, lambda number, _: came.append(number))
+        if sys.platform != "win32" and mask is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # what has waited comes now
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+        if came:
+            signal.raise_signal(came[0])
+
+
 def reader_has_gone(error: OSError, *, windows: bool = sys.platform == "win32") -> bool:
     """True if a write failed as what reads our output has ended, as `| head` does. Windows says "invalid argument", and
     as of any stream names no file."""

@@ -118,6 +118,49 @@ def test_every_verb_ends_with_the_signals_number(monkeypatch: pytest.MonkeyPatch
     assert capsys.readouterr().err == "clsplat: interrupted\n"
 
 
+@posix
+def test_a_signal_waits_where_nobody_may_be_disturbed() -> None:
+    done = []
+    with process.terminable(), pytest.raises(process.Interrupted) as caught:
+        with process.undisturbed():
+            os.kill(os.getpid(), signal.SIGTERM)
+            signal.signal(signal.SIGTERM, lambda *_: done.append("the library's"))
+            done.append("the work")
+        done.append("what follows")
+    assert caught.value.number == signal.SIGTERM
+    assert done == ["the work"]
+
+
+@posix
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
+    """pycolmap takes a Ctrl-C for a sign that it is not installed."""
+    code = (
+        "import os, sys, types, importlib.abc, importlib.util\n"
+        "class Slow(importlib.abc.MetaPathFinder, importlib.abc.Loader):\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        return importlib.util.spec_from_loader(name, self) if name == 'pycolmap' else None\n"
+        "    def create_module(self, spec): return types.ModuleType(spec.name)\n"
+        "    def exec_module(self, module):\n"
+        "        try:\n"
+        f"            os.kill(os.getpid(), {int(number)})\n"
+        "            [None for _ in range(1000)]\n"
+        "        except BaseException as error: raise RuntimeError('not installed') from error\n"
+        "sys.meta_path.insert(0, Slow())\n"
+        "sys.argv = ['clsplat', 'train', '.', '-o', 'nowhere']\n"
+        "from clsplat.__main__ import main\n"
+        "from clsplat.process import terminable\n"
+        "from clsplat import cli\n"
+        "from clsplat import verbs\n"
+        "def work(verb):\n"
+        "    import clsplat.undistort\n"
+        "verbs.run = work\n"
+        "sys.exit(main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
+
+
 # Two processes
 
 
@@ -173,6 +216,17 @@ def test_a_file_system_without_locks_is_told(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(locks, "try_lock", none)
     with pytest.warns(UserWarning, match="on a file system without locks"), locks.locked(tmp_path, "train"):
         pass
+
+
+@pytest.mark.slow
+@posix
+def test_the_tool_makes_tables() -> None:
+    tool = [sys.executable, str(Path(__file__).parents[1] / "tools" / "interruptions.py"), "--markdown"]
+    calls = ["--verbs", "train,info", "--events", "SIGTERM,second process"]
+    done = subprocess.run([*tool, *calls], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "| `info` | 143 | `clsplat: interrupted` | - |" in done.stdout
+    assert "| `train` | 2 | `clsplat: error: OUT/run: is being written by clsplat train (process 123)" in done.stdout
 
 
 def test_threads_have_no_say_in_signals() -> None:
