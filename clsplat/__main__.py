@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m clsplat`, and the command `clsplat`: the command line, with Ctrl-C caught while that is being imported."""
+"""`python -m clsplat`, and the command `clsplat`: the command line; signals are heard while that is imported."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ import sys
 def main() -> int:
     """Run the command line in `sys.argv`; returns the exit status."""
     try:
-        from clsplat.process import fill_closed_streams
+        from clsplat.process import fill_closed_streams, terminable
 
         fill_closed_streams()
         output = sys.stdout
         if isinstance(output, io.TextIOWrapper) and output.errors == "strict":
             output.reconfigure(errors="backslashreplace")  # a path may have letters that the stream's encoding lacks
-        from clsplat.cli import main as run
 
-        return run()
-    except KeyboardInterrupt:  # before the command line could catch it
+        with terminable():
+            from clsplat.cli import main as run
+
+            return run()
+    except KeyboardInterrupt as error:  # before the command line could catch it
         print("clsplat: interrupted", file=sys.stderr)
-        return 130
+        return 128 + getattr(error, "number", 2)  # as `process.status_of`, which may not be there yet
 
 
 if __name__ == "__main__":

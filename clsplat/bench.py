@@ -288,7 +288,7 @@ def picture_of(frame: Frame) -> Float32:
 
 def held_kind(config: RasterizerConfig) -> tuple[object, ...]:
     """The switches of which a model on the device depends."""
-    return config.sh_tolerance, config.sh_angle, config.sh_storage
+    return config.sh_tolerance, config.sh_storage
 
 
 def table(result: dict[str, Any]) -> str:

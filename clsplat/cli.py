@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: what each verb takes. What it does is in `clsplat.verbs`, the training's defaults in `config`.
 
-Exit status: 0 done, 1 the work failed, 2 the call or its input is wrong, 130 interrupted. Trouble is one line on
-standard error; CLSPLAT_DEBUG=1 shows the traceback as well.
+Exit status: 0 done, 1 the work failed, 2 the call or its input is wrong, 130 interrupted, 128 and the signal's number
+where another one did that (docs/interruptions.md). Trouble is one line on standard error; CLSPLAT_DEBUG=1 shows the
+traceback as well.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args, get_origin
 
@@ -39,7 +40,7 @@ from clsplat.config import (
 )
 from clsplat.errors import ClsplatError, InputError, system_trouble
 from clsplat.picture_config import ColourConfig, DeepConfig, FramingConfig, SamplingConfig, VideoConfig
-from clsplat.process import reader_has_gone
+from clsplat.process import reader_has_gone, status_of, terminable
 
 Output = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
 
@@ -95,17 +96,20 @@ class Sfm:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a scene. Ctrl-C writes a checkpoint first; --resume goes on from the latest.
+    """Train a scene. Ctrl-C, SIGTERM and SIGHUP write a checkpoint first; --resume goes on from the latest.
 
     With --resume the settings of the run hold, and a flag that is given changes one.
     """
 
     output: Output
-    """Folder for the run: config.toml, model.ply, metrics.jsonl, eval.json, report.html, checkpoints/, test/."""
+    """Folder for the run: config.toml, scene.json, model.ply, metrics.jsonl, eval.json, report.html, checkpoints/,
+    test/."""
     scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None
     """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, or just photos. Not needed with --resume."""
     resume: Flag = False
     """Go on with the run in the output folder."""
+    accept_changes: Flag = False
+    """With --resume: go on though the scene is another than the run began with, or a photograph has changed."""
     overwrite: Flag = False
     """Replace the run in the output folder; files that clsplat did not write stay."""
     device: Device = None
@@ -359,14 +363,16 @@ def _run(arguments: Sequence[str] | None) -> int:
                 return 0
             from clsplat import verbs
 
-            return verbs.run(parse(arguments))
+            with terminable():
+                return verbs.run(parse(arguments))
         except SystemExit as error:  # --help, or a wrong call that has been reported
             return error.code if isinstance(error.code, int) else 1
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as error:
             if debug:
                 traceback.print_exc()
-            print("clsplat: interrupted", file=sys.stderr)
-            return 130
+            with contextlib.suppress(OSError):  # the terminal may be gone
+                print("clsplat: interrupted", file=sys.stderr)
+            return status_of(error)
         except (ClsplatError, OSError, MemoryError) as error:
             if isinstance(error, OSError) and reader_has_gone(error):
                 raise
@@ -393,15 +399,15 @@ def parse(arguments: Sequence[str]) -> Verb:
         check_output(verb.output, resume=True, overwrite=verb.overwrite)
         # Once more, with the run's settings as the defaults: only flags that are given differ from them.
         earlier = Run.open(verb.output)
-        default = replace(verb, config=earlier.config, resume=False, overwrite=False, view=False)
-        verb = replace(_tyro(Train, arguments[1:], prog="clsplat train", default=default), resume=True)
+        default = replace(verb, config=earlier.config, **_unset(verb))
+        verb = _tyro(Train, arguments[1:], prog="clsplat train", default=default)
     elif isinstance(verb, Train) and (verb.preset, verb.schedule) != ("default", None):
         # Once more, as above, with the bundles' settings as the defaults.
         config = bundled(verb.preset, verb.schedule, verb.config.iterations)
-        default = replace(verb, config=config, overwrite=False, json=False, view=False)
+        default = replace(verb, config=config, **_unset(verb))
         verb = _tyro(Train, arguments[1:], prog="clsplat train", default=default)
     elif isinstance(verb, Bench) and verb.preset != "default":
-        bench = replace(verb, rasterizer=PRESETS[verb.preset], json=False, overwrite=False)
+        bench = replace(verb, rasterizer=PRESETS[verb.preset], **_unset(verb))
         verb = _tyro(Bench, arguments[1:], prog="clsplat bench", default=bench)
     elif isinstance(verb, Render) and (verb.preset is not None or verb.model.is_dir()):
         from clsplat.formats import model_path
@@ -413,12 +419,14 @@ def parse(arguments: Sequence[str]) -> Verb:
         elif is_run(verb.model) or model_path(verb.model) == verb.model:  # refused, if it is neither
             bundle = Run.open(verb.model).config.rasterizer
         if bundle != RasterizerConfig():
-            unset: dict[str, Any] = dict.fromkeys(
-                ("alpha", "deep", "json", "overwrite", "skip_existing", "dry_run", "profile"), False
-            )
-            render = replace(verb, rasterizer=bundle, **unset)
+            render = replace(verb, rasterizer=bundle, **_unset(verb))
             verb = _tyro(Render, arguments[1:], prog="clsplat render", default=render)
     return verb
+
+
+def _unset(verb: Verb) -> dict[str, Any]:
+    """The flags of a verb, none given: where the default is that one is, it cannot be given again."""
+    return {each.name: False for each in fields(verb) if isinstance(getattr(verb, each.name), bool)}
 
 
 def _tyro(kind: Any, arguments: Sequence[str], **options: Any) -> Any:

@@ -51,8 +51,8 @@ class RasterizerConfig:
 
     `extent` "constant", `tile_test`, `depth_sort`, `key_bits`, `last_contributor`, `record_cells` and the `_skip`,
     `_stop` and `_cull` switches change no bit of a frame; they are there to be measured. The others are approximate
-    where they differ from the default. `sh_tolerance`, `sh_angle` and `sh_storage` are of frames of a model that is
-    held on the device (`Renderer`), not of training.
+    where they differ from the default. `sh_tolerance` and `sh_storage` are of frames of a model that is held on the
+    device (`Renderer`), not of training.
     """
 
     extent: Literal["opacity", "constant", "3sigma"] = "opacity"
@@ -96,9 +96,6 @@ class RasterizerConfig:
     """Leave out a Gaussian's highest SH bands as long as that changes no channel of its colour by more than this, from
     any direction: 0 leaves out those that are zero (approximate above 0). Bands that none needs are always left out,
     those that some need only where that is half of all coefficients: from there on it pays."""
-    sh_angle: float = 0.0
-    """Keep a Gaussian's colour from frame to frame until its direction from the camera has turned by more than this, in
-    degrees; 0 works it out in every frame (approximate above 0, where frames depend on those before)."""
     sh_storage: Literal["float", "half"] = "float"
     """Keep the SH bands above 0 in 32 or in 16 bits (half is approximate, of half the memory)."""
     alpha_min: float = 1 / 255
@@ -112,7 +109,6 @@ class RasterizerConfig:
         rules: tuple[_Rule, ...] = (
             (("sh_degree_limit",), lambda value: 0 <= value <= 3, "0 to 3"),
             (("sh_tolerance",), lambda value: 0 <= value <= 1, "0 to 1"),
-            (("sh_angle",), lambda value: 0 <= value <= 90, "0 to 90 degrees"),
             (("alpha_min",), lambda value: 1e-3 <= value < 0.5, "0.001 to 0.5"),
             (("transmittance_min",), lambda value: 1e-6 <= value < 0.5, "1e-6 to 0.5"),
         )

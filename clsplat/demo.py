@@ -13,6 +13,7 @@ from clsplat import sfm
 from clsplat.config import DEMO_ITERATIONS, TrainConfig
 from clsplat.demo_scene import Progress, ignore_progress, write_photos
 from clsplat.errors import InputError
+from clsplat.locks import locked
 from clsplat.trajectory import turntable
 
 PHOTOS = 40
@@ -29,6 +30,13 @@ def run_demo(
     training; frames: of the turntable. Raises InputError for a folder that holds something else, and what the steps
     raise.
     """
+    output.mkdir(parents=True, exist_ok=True)
+    with locked(output, "demo"):
+        return _run_demo(output, device=device, iterations=iterations, frames=frames)
+
+
+def _run_demo(output: Path, *, device: str | None, iterations: int, frames: int) -> dict[str, Any]:
+    """As `run_demo`, alone in the folder."""
     from clsplat.device.context import open_device
     from clsplat.progress import StageProgress
 

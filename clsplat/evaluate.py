@@ -63,7 +63,8 @@ def evaluate(
 
     render: gives a view's image (H, W, 3), float, over `background` (3,), at the size of `view.load()`; save_dir: the
     renders go there as PNG, under the view's name. step, gaussians, seconds are passed through. Without views the
-    mean is empty. Raises ClsplatError where a render is not finite, InputError naming a view that is too small.
+    mean is empty; lpips_missing says why there is no LPIPS, where there is none. Raises ClsplatError where a render is
+    not finite, InputError naming a view that is too small.
     """
     records: list[dict[str, Any]] = []
     names = picture_names([view.name for view in views])
@@ -92,7 +93,10 @@ def evaluate(
             write_image(path, np.clip(image, 0, 1).astype(np.float32))
     keys = [key for key in ("psnr", "ssim", "lpips") if records and key in records[0]]
     mean = {key: float(np.mean([record[key] for record in records])) for key in keys}
-    return {"step": step, "gaussians": gaussians, "seconds": seconds, "mean": mean, "views": records}
+    result: dict[str, Any] = {"step": step, "gaussians": gaussians, "seconds": seconds, "mean": mean, "views": records}
+    if records and (reason := metrics.lpips_missing()):
+        result["lpips_missing"] = reason
+    return result
 
 
 def picture_names(names: Sequence[str], extension: str = ".png") -> list[str]:

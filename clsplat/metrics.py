@@ -6,15 +6,19 @@ Images are (H, W, 3), clamped to [0, 1] and compared in float64.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import sys
 from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError
+from clsplat import weights
+from clsplat.errors import ClsplatError, InputError
 
 MIN_SQUARED_ERROR = 1e-12
 """Equal images would have an infinite PSNR, which JSON cannot hold; this floor makes it 120 dB."""
@@ -61,16 +65,30 @@ def lpips_missing() -> str | None:
 
 
 @functools.cache
+def prepare_lpips() -> str | None:
+    """See to what LPIPS needs, in seconds but for the network's weights, which are fetched if they are not there: why
+    it cannot be had and what to do, None where it can. Loads nothing."""
+    for name in ("lpips", "torch"):
+        if find_spec(name) is None:
+            return f"the optional extra is not installed (no {name}): pip install 'clsplat[lpips]'"
+    try:
+        weights.fetch()
+    except ClsplatError as error:
+        return str(error)
+    return None
+
+
+@functools.cache
 def _lpips_model() -> Callable[[Image, Image], float] | str:
     """The metric as a function of two images, or the reason why there is none."""
+    if reason := prepare_lpips():
+        return reason
     try:
-        package: Any = import_module("lpips")
-        torch: Any = import_module("torch")
-    except ImportError as error:
-        return f"the optional extra is not installed ({error}): pip install 'clsplat[lpips]'"
-    try:
-        network = package.LPIPS(net="vgg", verbose=False).eval()
-    except Exception as error:  # noqa: BLE001  # whatever fails in its download of weights must not fail an evaluation
+        with contextlib.redirect_stdout(sys.stderr):  # standard output is for results
+            package: Any = import_module("lpips")
+            torch: Any = import_module("torch")
+            network = package.LPIPS(net="vgg", verbose=False).eval()
+    except Exception as error:  # noqa: BLE001  # whatever fails there must not fail an evaluation
         return f"its network could not be loaded ({' '.join(str(error).split())[:100]})"
 
     def measure(a: Image, b: Image) -> float:

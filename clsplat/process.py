@@ -8,6 +8,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 
@@ -19,9 +23,68 @@ def apart() -> dict[str, Any]:
 
 
 def endings() -> tuple[signal.Signals, ...]:
-    """The signals beside Ctrl-C by which managers of jobs ask a process to end. On Windows nobody sends SIGTERM: there
-    it is Ctrl-Break."""
-    return tuple(getattr(signal, name) for name in ("SIGTERM", "SIGBREAK") if hasattr(signal, name))
+    """The signals beside Ctrl-C by which managers of jobs, and a terminal that goes, ask a process to end. On Windows
+    nobody sends SIGTERM: there it is Ctrl-Break. Those that are ignored, as under nohup, are left out."""
+    names = ("SIGTERM", "SIGHUP", "SIGBREAK")
+    found = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    return tuple(each for each in found if signal.getsignal(each) != signal.SIG_IGN)
+
+
+class Interrupted(KeyboardInterrupt):
+    """As a Ctrl-C, by the signal of this number."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+def status_of(error: KeyboardInterrupt) -> int:
+    """The exit status of a process that was interrupted so, as shells have it: 130 for Ctrl-C."""
+    return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
+
+
+def interrupt(number: int, _frame: FrameType | None) -> None:
+    """A handler of signals that raises Interrupted."""
+    raise Interrupted(number)
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Inside, what asks the process to end is as a Ctrl-C: temporary files go, and children end. In the main thread;
+    another one has no say in signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {each: signal.signal(each, interrupt) for each in endings()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Inside, no signal that asks the process to end is seen to; afterwards the first that came is. What a library has
+    put in the place of our handlers is taken away again. In the main thread, as `terminable`."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    numbers = (signal.SIGINT, *endings())
+    before = {each: signal.signal(each, lambda number, _: came.append(number)) for each in numbers}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers) if sys.platform != "win32" else None
+    try:
+        yield
+    finally:
+        for each in before:
+            signal.signal(each, lambda number, _: came.append(number))
+        if sys.platform != "win32" and mask is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # what has waited comes now
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+        if came:
+            signal.raise_signal(came[0])
 
 
 def fill_closed_streams() -> None:

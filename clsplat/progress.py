@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, Literal, Protocol, TextIO
 
@@ -63,7 +64,8 @@ class TrainProgress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self.live is not None:
-            self.live.stop()
+            with suppress(OSError):
+                self.live.stop()
         elif self.last is not None and self.last.step != self.printed_step:
             self._print_line()
 
@@ -98,7 +100,8 @@ class TrainProgress:
         assert self.last is not None
         rate = self.rate()
         left = f"  {duration((self.total - self.last.step) / rate)} left" if rate > 0 else ""
-        print(f"{self._numbers()}{left}", file=self.stream, flush=True)
+        with suppress(OSError):  # nobody reads it any more: a training goes on, or comes to its checkpoint
+            print(f"{self._numbers()}{left}", file=self.stream, flush=True)
         self.printed_at, self.printed_step = self.clock(), self.last.step
 
 

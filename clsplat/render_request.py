@@ -85,10 +85,6 @@ def read_job(verb: Render) -> Job:
         check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
     for warning in chosen.warnings:
         warn(warning)
-    rasterizer = verb.rasterizer
-    if rasterizer.sh_angle:
-        warn(f"--rasterizer.sh-angle {rasterizer.sh_angle:g} is not used: a frame would depend on those before it")
-        rasterizer = replace(rasterizer, sh_angle=0.0)
     model = model_file(verb.model)
     gaussians = Gaussians.load(model)
     recorded = recorded_space(model)
@@ -99,10 +95,10 @@ def read_job(verb: Render) -> Job:
         warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
     attributes["clsplat:colorspace"] = colours.output
-    options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(rasterizer))
+    options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer))
     spaces = (colours.model, colours.output)
     video = _video(verb, whole)
-    return Job(verb, options, rasterizer, model, gaussians, tasks, devices, limit, spaces, video)
+    return Job(verb, options, verb.rasterizer, model, gaussians, tasks, devices, limit, spaces, video)
 
 
 def frames_there(job: Job) -> set[int]:

@@ -325,15 +325,11 @@ def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
         check_half(gaussians.sh)
     degrees = needed_degrees(gaussians.sh, config.sh_tolerance)
     coefficients, differ = coefficients_in_use(degrees)
-    return ShStorage(coefficients, degrees if differ else None, half, config.sh_angle > 0)
+    return ShStorage(coefficients, degrees if differ else None, half)
 
 
 class Renderer:
-    """Renders models; keeps the last one on the device. It can work in another's rasterizer and its memory.
-
-    With `sh_angle` a frame depends on those before it of the same model; not where a model is streamed, as there is no
-    place for its colours then.
-    """
+    """Renders models; keeps the last one on the device. It can work in another's rasterizer and its memory."""
 
     def __init__(
         self,

@@ -14,7 +14,6 @@ import argparse
 import json
 import platform
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +34,7 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.files import atomic_writer, parse_json
 from clsplat.quarantine import Incident, finite_or_zero
 from clsplat.rendering import Rasterizer
-from clsplat.runs import config_text, read_arrays, read_config
+from clsplat.runs import config_text, parse_config, read_arrays
 from clsplat.stages.adam import REFUSED, adam
 from clsplat.stages.loss import loss
 from clsplat.stages.project import GROUPS, DeviceGaussians, allocate_gaussians, group_shapes
@@ -119,7 +118,7 @@ def _forget_marks(models: dict[str, dict[str, NDArray[np.float32]]]) -> None:
 def read_bundle(path: Path) -> Bundle:
     """Raises InputError for what is no bundle."""
     try:
-        return _checked(_bundle_of(read_arrays(path, "a bundle")))
+        return _checked(_bundle_of(read_arrays(path, "a bundle"), path))
     except Exception as error:  # as of a checkpoint: zipfile raises nearly anything for a flipped bit
         if isinstance(error, InputError) and str(path) in str(error):
             raise
@@ -127,15 +126,11 @@ def read_bundle(path: Path) -> Bundle:
         raise InputError(f"{path}: not a bundle of a training that gave up ({why})") from None
 
 
-def _bundle_of(arrays: dict[str, NDArray[Any]]) -> Bundle:
+def _bundle_of(arrays: dict[str, NDArray[Any]], path: Path) -> Bundle:
     record = parse_json(arrays[RECORD].tobytes())
     size = record["camera"]
     lens = (size["width"], size["height"], size["fx"], size["fy"], size["cx"], size["cy"])
-    with tempfile.TemporaryDirectory() as folder:
-        settings = Path(folder) / "config.toml"
-        settings.write_text(record["settings"], "utf-8")
-        config, _ = read_config(settings)
-    config.check()
+    config, _ = parse_config(record["settings"], path, tell=False)
     camera = Camera(*lens, arrays["rotation"], arrays["translation"], near=size["near"])
     models = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS}
     return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)

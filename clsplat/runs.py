@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run folder: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/, test/ (held-out renders)."""
+"""The run folder: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/, test/ (held-out renders). What is in
+scene.json `clsplat.run_scene` knows."""
 
 from __future__ import annotations
 
@@ -14,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeVar, get_args, get_origin, get_type_hints
 from zipfile import ZIP_STORED, ZipFile
@@ -36,6 +38,7 @@ from clsplat.files import (
     write_error,
 )
 from clsplat.gaussians import Gaussians
+from clsplat.locks import locked
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -57,6 +60,9 @@ NPY_HEADER = re.compile(
 
 Arrays = dict[str, NDArray[Any]]
 T = TypeVar("T")
+
+RETIRED: dict[str, Any] = {"train.rasterizer.sh_angle": 0.0}
+"""Settings that earlier versions had, and the value of each with which it did nothing."""
 
 
 @dataclass(frozen=True)
@@ -93,20 +99,23 @@ class Run:
         """Make the folder and its config.toml; `scene` is recorded there as an absolute path.
 
         resume: go on in a run that is there, with `config` (see `check_resumed`); overwrite: remove the files of the
-        run that is there, and nothing else. Raises InputError where `check_output` does.
+        run that is there, and nothing else. Raises InputError where `check_output` and `locks.locked` do.
         """
         path = Path(path)
         check_output(path, resume=resume, overwrite=overwrite)
-        if resume:
-            earlier = cls.open(path)
-            check_resumed(earlier, config)
-            scene = scene or earlier.scene
-        elif overwrite and is_run(path):
-            for file in owned_files(path):
-                remove(file)
-        run = cls(path, config, Path(scene).absolute() if scene is not None else None, resuming=resume)
-        run.checkpoints_path.mkdir(parents=True, exist_ok=True)
-        atomic_write(run.config_path, config_text(config, run.scene).encode())
+        path.mkdir(parents=True, exist_ok=True)
+        with locked(path, "train"):
+            check_output(path, resume=resume, overwrite=overwrite)  # again: another process may just have been there
+            if resume:
+                earlier = cls.open(path)
+                check_resumed(earlier, config)
+                scene = scene or earlier.scene
+            elif overwrite and is_run(path):
+                for file in owned_files(path):
+                    remove(file)
+            run = cls(path, config, Path(scene).absolute() if scene is not None else None, resuming=resume)
+            run.checkpoints_path.mkdir(exist_ok=True)
+            atomic_write(run.config_path, config_text(config, run.scene).encode())
         return run
 
     @classmethod
@@ -348,7 +357,7 @@ def owned_files(path: Path) -> list[Path]:
     """The files in a run's folder that clsplat wrote, and that --overwrite may therefore remove."""
     patterns = ("checkpoints/step-*.npz", "trouble-step-*.npz", "test/**/*.png", "**/.*" + TEMPORARY_SUFFIX)
     # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
-    names = ("model.ply", "metrics.jsonl", "eval.json", "report.html", "config.toml")
+    names = ("model.ply", "metrics.jsonl", "eval.json", "report.html", "scene.json", "config.toml")
     found = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
     return [file for file in found if file.is_file() or file.is_symlink()]
 
@@ -372,8 +381,13 @@ def config_text(config: TrainConfig, scene: Path | None) -> str:
 
 def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
     """The configuration and the scene's path. Raises InputError naming the file and the key that is wrong."""
+    return parse_config(read_document(path, "the settings of a run", MAX_SETTINGS), path)
+
+
+def parse_config(text: str, path: Path, *, tell: bool = True) -> tuple[TrainConfig, Path | None]:
+    """As `read_config`, of the file's text; tell: warn of settings that there are no more."""
     try:
-        document = tomllib.loads(read_document(path, "the settings of a run", MAX_SETTINGS))
+        document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as TOML ({error})") from None
     for key in document:
@@ -382,7 +396,7 @@ def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
                 f"{path}: has {key!r}, which is no setting; expected clsplat, scene and the tables of train"
             )
     scene = document.get("scene")
-    config = _from_table(TrainConfig, document.get("train", {}), path, "train")
+    config = _from_table(TrainConfig, document.get("train", {}), path, "train", tell=tell)
     try:
         config.check()
     except InputError as error:
@@ -390,7 +404,7 @@ def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
     return config, Path(scene) if isinstance(scene, str) else None
 
 
-def _from_table(cls: type[T], table: Any, path: Path, where: str) -> T:
+def _from_table(cls: type[T], table: Any, path: Path, where: str, *, tell: bool) -> T:
     """An instance of the dataclass `cls`; keys that are not there keep their defaults."""
     if not isinstance(table, dict):
         raise InputError(f"{path}: {where} is {table!r}, expected a table")
@@ -398,10 +412,14 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str) -> T:
     names = [f.name for f in fields(cls)]  # type: ignore[arg-type]  # every caller passes a dataclass
     values = {}
     for key, value in table.items():
+        if (name := f"{where}.{key}") in RETIRED:
+            if value != RETIRED[name] and tell:
+                _tell_retired(path, name, repr(value))
+            continue
         if key not in names:
             raise InputError(f"{path}: [{where}] has {key!r}, which is no setting there; {_meant(key, where)}")
         if is_dataclass(types[key]):
-            values[key] = _from_table(types[key], value, path, f"{where}.{key}")
+            values[key] = _from_table(types[key], value, path, f"{where}.{key}", tell=tell)
         else:
             values[key] = _value(types[key], value, f"{path}: {where}.{key}")
     return cls(**values)
@@ -420,6 +438,12 @@ def _meant(key: str, where: str) -> str:
     if near:
         return f"did you mean {near[0]!r} in [{places[near[0]]}]?"
     return "take it out: was it written by another version?"
+
+
+@cache
+def _tell_retired(path: Path, name: str, value: str) -> None:
+    """A warning, once for a file however often it is read."""
+    warnings.warn(plain(f"{path}: {name} is {value} there and is passed over, this version has no such setting"))
 
 
 def _value(kind: Any, value: Any, what: str) -> Any:

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from clsplat import colmap, transforms
 from clsplat.camera import Camera
 from clsplat.config import TEST_EVERY
 from clsplat.errors import InputError, examples, plain
-from clsplat.files import digest
+from clsplat.files import digest, short_digest
 from clsplat.images import companions, downscale, find_images, image_size, read_image, require_images
 from clsplat.transforms import Frame
 from clsplat.undistort import Lens, undistort
@@ -29,6 +29,7 @@ Float64 = NDArray[np.float64]
 Kind = Literal["colmap", "blender", "transforms", "photos"]
 Split = Literal["train", "test"]
 Progress = Callable[[str, float | None], None]
+T = TypeVar("T")
 
 MAX_SIZE = 1600
 """Longest side in pixels where no resolution is asked for."""
@@ -119,14 +120,27 @@ class Scene:
         return self.train_views
 
     def check_pictures(self) -> None:
-        """Decode every picture once, so that a cut one is named before training and not in the middle of it.
+        """Decode every picture once, so that a cut one is named before training and not in the middle of it; the
+        `digests` are made on the way.
 
         Raises InputError for the first by name that does not decode.
         """
+
+        def look(view: View) -> str | None:
+            view.check()
+            return short_digest(view.path)
+
+        self.__dict__["digests"] = self._of_each(look)
+
+    @cached_property
+    def digests(self) -> dict[str, str | None]:
+        """Of each view's file, by the view's name."""
+        return self._of_each(lambda view: short_digest(view.path))
+
+    def _of_each(self, work: Callable[[View], T]) -> dict[str, T]:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             try:
-                for _ in pool.map(View.check, self.views):
-                    pass
+                return {view.name: each for view, each in zip(self.views, pool.map(work, self.views), strict=True)}
             finally:
                 pool.shutdown(cancel_futures=True)
 

@@ -26,21 +26,6 @@ def change_bounds(band: NDArray[np.float32], degree: int) -> NDArray[np.float64]
     return bounds
 
 
-def turn_bounds(sh: NDArray[np.float32], angle: float) -> NDArray[np.float64]:
-    """The most that each channel changes when the direction turns by `angle` radians: sh (n, K, 3) -> (n, 3).
-
-    The gradients of a band's Y on the sphere have squares that add up to l (l + 1) (2 l + 1) / 4 pi at every direction,
-    half of it along any tangent. So, as above, a derivative is at most sqrt(l (l + 1) (2 l + 1) / 8 pi) |c|, and the
-    way along the sphere is `angle`.
-    """
-    total = np.zeros((len(sh), 3))
-    for degree in range(1, round(sh.shape[1] ** 0.5)):
-        band = sh[:, degree**2 : (degree + 1) ** 2]
-        # the ratio of the squared gradient's bound to that of the value
-        total += np.sqrt(degree * (degree + 1) / 2) * change_bounds(band, degree)
-    return angle * total
-
-
 def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint8]:
     """The lowest degree of each Gaussian (n) such that leaving out the bands above it changes no channel, before the
     floor at 0, by more than `tolerance`, by `change_bounds`; at 0 all those bands are zero. sh (n, K, 3)."""

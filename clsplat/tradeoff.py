@@ -74,7 +74,6 @@ def settings() -> dict[str, RasterizerConfig]:
     changes["extent 3sigma"] = {"extent": "3sigma"}
     changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
     changes.update({f"sh-tolerance {steps}/255": {"sh_tolerance": steps / 255} for steps in (4, 16, 64)})
-    changes.update({f"sh-angle {degrees:g}": {"sh_angle": degrees} for degrees in (0.5, 2.0)})
     changes["sh-storage half"] = {"sh_storage": "half"}
     changes.update({f"alpha-min {steps}/255": {"alpha_min": steps / 255} for steps in (2, 4)})
     changes.update({f"transmittance-min {value:g}": {"transmittance_min": value} for value in (1e-3, 1e-2)})
@@ -83,14 +82,6 @@ def settings() -> dict[str, RasterizerConfig]:
     for name, config in named.items():
         merged[config] = f"{merged[config]} = {name.removeprefix('preset ')}" if config in merged else name
     return {name: config for config, name in merged.items()}
-
-
-def aside(camera: Camera, gaussians: Gaussians, degrees: float) -> Camera:
-    """The camera moved to its right, so that half of the Gaussians before it turn by more than `degrees`."""
-    depths = gaussians.means @ camera.rotation[2] + camera.translation[2]
-    before = depths[depths > camera.near]
-    step = np.tan(np.radians(degrees)) * float(np.median(before)) if len(before) else 0.0
-    return replace(camera, translation=camera.translation - np.array([step, 0.0, 0.0]))
 
 
 def compare(
@@ -104,8 +95,6 @@ def compare(
     """Run time against error of each setting: median times of a frame and of a training step, the settings taken in
     turn; the frame's difference from the float64 reference on a crop, and from the exact preset's frame on the whole
     image. Where both are among the settings, also how many times faster all exact switches together make them.
-
-    Where colours are kept from frame to frame, they are those of a frame from `aside`: half of them are used again.
     """
     say = progress or (lambda *_: None)
     candidates = candidates or settings()
@@ -120,13 +109,9 @@ def compare(
         part = picture[y0 : y0 + height, x0 : x0 + width]
         return Error.of(part, reference), Error.of(picture, exact)
 
-    def draw(rasterizer: Rasterizer, at: Camera = camera) -> Frame:
+    def draw(rasterizer: Rasterizer) -> Frame:
         held = models[held_kind(rasterizer.config)]
-        return rasterizer.forward(held, at, background, backward=False)
-
-    def prepare(rasterizer: Rasterizer) -> None:
-        if (degrees := rasterizer.config.sh_angle) > 0:
-            draw(rasterizer, aside(camera, subject.gaussians, degrees))
+        return rasterizer.forward(held, camera, background, backward=False)
 
     def step(rasterizer: Rasterizer) -> None:
         trainer.rasterizer = rasterizer
@@ -146,14 +131,12 @@ def compare(
     found = {}
     for done, (name, rasterizer) in enumerate(rasterizers.items()):
         say("settings", done / len(rasterizers))
-        prepare(rasterizer)
         found[name] = errors(picture_of(draw(rasterizer)))
         step(rasterizer)
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in rasterizers}
     for done in range(repeat):
         say("times", done / repeat)
         for name, rasterizer in rasterizers.items():
-            prepare(rasterizer)
             both = wall_ms(device, partial(draw, rasterizer)), wall_ms(device, partial(step, rasterizer))
             times[name].append(both)
     medians = {name: tuple(map(statistics.median, zip(*each, strict=True))) for name, each in times.items()}

@@ -479,7 +479,8 @@ class Trainer:
         loaded = [self._loaded(checkpoint, kind) for kind in ("parameters", "first", "second")]
         self.step = checkpoint.step
         self.rng.bit_generator.state = checkpoint.state["rng"]
-        self.queue = list(checkpoint.state["queue"])
+        queue = list(checkpoint.state["queue"])
+        self.queue = queue if max(queue, default=0) < len(self.views) else []  # of a scene that had more of them
         self.controlled, self._mark = bool(checkpoint.state.get("controlled", False)), None
         self.watch.patience = Patience(**checkpoint.state.get("patience", {}))
         self.watch.forget()

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from clsplat import run_scene
 from clsplat.colour import photos_space
 from clsplat.config import TrainConfig
 from clsplat.device.child import TrialInterrupted
@@ -24,7 +26,9 @@ from clsplat.device.context import Device, open_device
 from clsplat.errors import ClsplatError, DriverError
 from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
+from clsplat.locks import locked
 from clsplat.memory import Plan, parse_bytes
+from clsplat.process import Interrupted, endings
 from clsplat.quarantine import RETURNS, WINDOW
 from clsplat.rendering import Renderer
 from clsplat.replay import write_bundle
@@ -55,23 +59,33 @@ class StepReport:
     seconds: float
 
 
-@contextmanager
-def _interruption() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C asks once, and the loop stops between two steps; a second one is Python's own."""
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
-        return
+class _Interruption:
+    """Inside, the first Ctrl-C, or another signal to end, is noted, and the loop stops between two steps; after it a
+    Ctrl-C is Python's own, and the others do what they did before."""
 
-    def ask(_number: int, _frame: FrameType | None) -> None:
-        asked.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    def __init__(self) -> None:
+        self.number = 0
+        self._previous: dict[int, Any] = {}
 
-    previous = signal.signal(signal.SIGINT, ask)
-    try:
-        yield asked.is_set
-    finally:
-        signal.signal(signal.SIGINT, previous)
+    def __call__(self) -> bool:
+        if not self.number:  # again, as compilers of kernels install handlers of their own
+            for each in self._previous:
+                signal.signal(each, self._ask)
+        return self.number != 0
+
+    def __enter__(self) -> _Interruption:  # noqa: PYI034  # Self came with 3.11
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {each: signal.signal(each, self._ask) for each in (signal.SIGINT, *endings())}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number: int, _frame: FrameType | None) -> None:
+        self.number = number
+        for each in self._previous:
+            signal.signal(each, signal.default_int_handler if each == signal.SIGINT else self._previous[each])
 
 
 class _Session:
@@ -296,20 +310,42 @@ def train(
     the model, or None for none of them; resume: go on from the run's latest checkpoint; on_step: called every
     REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes;
     between: called before each step; it may render what the trainer has, and take its time, which is not counted.
-    Raises InputError for a scene without views, ClsplatError where numbers are not finite again and again
-    (docs/decisions/0016-never-a-nan.md; a warning tells of what could be mended), and KeyboardInterrupt on Ctrl-C after
-    a checkpoint has been written.
+    Raises InputError for a scene without views, one that is not the resumed run's, and a run that another process
+    writes, ClsplatError where numbers are not finite again and again (docs/decisions/0016-never-a-nan.md; a warning
+    tells of what could be mended), and Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP after a
+    checkpoint has been written.
     """
     config = config or TrainConfig()
     config.check()
     opened = device if isinstance(device, Device) else open_device(device, parse_bytes(max_device_mem))
+    if run is None:
+        return _train(scene, config, opened, None, on_step=on_step, on_plan=on_plan, between=between)
+    with locked(run.path, "train"):
+        if resume:
+            run_scene.check(run, scene, run.scene or Path(scene.name), config.resolution)
+        run_scene.keep(run, scene, resuming=resume)
+        return _train(scene, config, opened, run, resume=resume, on_step=on_step, on_plan=on_plan, between=between)
+
+
+def _train(
+    scene: Scene,
+    config: TrainConfig,
+    opened: Device,
+    run: Run | None,
+    *,
+    resume: bool = False,
+    on_step: Callable[[StepReport], None] | None,
+    on_plan: Callable[[Plan], None] | None,
+    between: Between | None,
+) -> Gaussians:
+    """As `train`, alone in the run's folder."""
     session = _Session(Trainer(scene, config, opened), run, on_plan)
     trainer = session.trainer
     if resume:
         session.resume()
     session.first_step = trainer.step
     session.tell_plan()
-    with _rescued(session), _interruption() as interrupted:
+    with _rescued(session), _Interruption() as interrupted:
         while True:
             while trainer.step < config.iterations and not interrupted():
                 if between is not None:
@@ -320,7 +356,7 @@ def train(
                 break
         session.tell_the_rest()
         if trainer.step < config.iterations:
-            raise KeyboardInterrupt
+            raise Interrupted(interrupted.number)
     model = trainer.gaussians()
     if run is not None:
         run.save_model(model, photos_space(view.path for view in scene.views))

@@ -7,26 +7,25 @@ The models and their formulas are COLMAP's, evaluated by pycolmap (`Camera.img_f
 from __future__ import annotations
 
 import math
-import signal
-import threading
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.images import associate, downscale, unassociate
+from clsplat.process import undisturbed
+
+with undisturbed():  # it says of a Ctrl-C that it is not installed, and puts a handler of SIGTERM that prints its stack
+    import pycolmap
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 REFUSED = {"EQUIRECTANGULAR": "a panorama has no pinhole camera; cut it into perspective views first"}
-if threading.current_thread() is threading.main_thread() and (_handler := signal.getsignal(signal.SIGTERM)) is not None:
-    signal.signal(signal.SIGTERM, _handler)  # importing pycolmap has put one there that prints its stack
 
 MAX_SIZE = 1 << 20
 """Pixels a side; larger is a damaged file. Also keeps width times height far from overflow."""

@@ -12,13 +12,13 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from clsplat import render_job
 from clsplat.cli import Render
-from clsplat.process import endings
+from clsplat.process import endings, interrupt, status_of
 from clsplat.progress import FrameProgress
 from clsplat.render_job import Record
 from clsplat.render_request import Job, frames_there, read_job, warn
@@ -29,14 +29,13 @@ if TYPE_CHECKING:
 
 
 def render(verb: Render) -> int:
-    """Model and cameras to images. SIGTERM is taken as Ctrl-C is."""
-    with _terminable():
-        job = read_job(verb)
-        if verb.dry_run:
-            from clsplat.render_plan import dry_run
+    """Model and cameras to images."""
+    job = read_job(verb)
+    if verb.dry_run:
+        from clsplat.render_plan import dry_run
 
-            return dry_run(job)
-        return _run(job)
+        return dry_run(job)
+    return _run(job)
 
 
 def _run(job: Job) -> int:
@@ -47,9 +46,9 @@ def _run(job: Job) -> int:
         shaders = [open_shader(job.gaussians, options, job.rasterizer, device=each, **how) for each in job.devices]
         for shader in shaders:
             shader.check(tasks)
-    if _is_main_thread():  # again, as pycolmap and compilers of kernels install handlers of their own
-        for each in endings():
-            signal.signal(each, _interrupt)
+    if threading.current_thread() is threading.main_thread():
+        for each in endings():  # again, as pycolmap and compilers of kernels install handlers of their own
+            signal.signal(each, interrupt)
     render_job.make_folders(tasks)
     render_job.remove_temporaries(tasks)
     there = frames_there(job)
@@ -74,11 +73,12 @@ def _run(job: Job) -> int:
                 _on_farm(job, left, done, video)
             else:
                 render_job.run_tasks(left, shaders, options, done, video)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         count = f"{len(records)} of {len(tasks)} frames"
         advice = "nothing is left of the video" if job.is_video else "go on with --skip-existing"
-        print(f"clsplat: interrupted after {count}; {advice}", file=sys.stderr)
-        return 130
+        with suppress(OSError):  # the terminal may be gone
+            print(f"clsplat: interrupted after {count}; {advice}", file=sys.stderr)
+        return status_of(error)
     if verb.profile:
         _print_profile(records.values(), time.monotonic() - start, len(shaders))
     if verb.json:
@@ -110,26 +110,3 @@ def _print_profile(records: Any, wall: float, devices: int) -> None:
         for name in ("kernel_ms", "transfer_ms")
     )
     print(f"in {wall:.2f} s the device ran kernels {kernels:.1f} % and transfers {transfers:.1f} %", file=sys.stderr)
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """Inside, what asks the process to end raises KeyboardInterrupt in the main thread."""
-    if not _is_main_thread():
-        yield
-        return
-
-    before = {each: signal.signal(each, _interrupt) for each in endings()}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
-
-
-def _is_main_thread() -> bool:
-    return threading.current_thread() is threading.main_thread()

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 
 from clsplat.cli_models import Compare, Report
 from clsplat.errors import InputError, plain
 from clsplat.files import check_new
+from clsplat.locks import locked
 from clsplat.runs import Run
 
 
@@ -20,7 +22,8 @@ def report(verb: Report) -> int:
     check_new(path, overwrite=verb.overwrite or verb.output is None)
     from clsplat.report.page import json_text, write_report
 
-    figures = write_report(run, path, views=verb.views)
+    with nullcontext() if verb.output else locked(run.path, "report"):
+        figures = write_report(run, path, views=verb.views)
     if verb.json:
         print(json_text(figures.document()))
     for note in figures.notes:

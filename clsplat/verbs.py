@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
@@ -16,6 +16,7 @@ from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train
 from clsplat.cli_models import Compare, Convert, Info, Report, View
 from clsplat.errors import InputError
 from clsplat.memory import Plan, parse_bytes
+from clsplat.process import status_of
 
 if TYPE_CHECKING:
     from clsplat.device.context import Device
@@ -124,11 +125,26 @@ def sfm(verb: Sfm) -> int:
 
 def train(verb: Train) -> int:
     """Scene to run. Everything that can be wrong with the call is found before the run's folder is touched."""
-    from clsplat.device.context import open_device
-    from clsplat.runs import Run, check_output, check_resumed
-    from clsplat.trust import require
+    from clsplat.locks import locked
+    from clsplat.runs import check_output
 
     check_output(verb.output, resume=verb.resume, overwrite=verb.overwrite)
+    if verb.accept_changes and not verb.resume:
+        raise InputError("--accept-changes is for --resume, expected both")
+    with ExitStack() as held:
+        if verb.output.is_dir():
+            held.enter_context(locked(verb.output, "train"))
+        return _train_checked(verb, held)
+
+
+def _train_checked(verb: Train, held: ExitStack) -> int:
+    """As `train`; `held` takes the lock of a folder that is new."""
+    from clsplat import run_scene
+    from clsplat.device.context import open_device
+    from clsplat.locks import locked
+    from clsplat.runs import Run, check_resumed
+    from clsplat.trust import require
+
     limit = parse_bytes(verb.max_device_mem)
     verb.config.check()
     page: Callable[[Scene], AbstractContextManager[Between]] | None = None
@@ -155,22 +171,32 @@ def train(verb: Train) -> int:
             f"clsplat: warning: {source}: has a single point, training starts from one Gaussian of next to no size",
             file=sys.stderr,
         )
+    changed = verb.resume and run_scene.check(
+        earlier, scene, source, verb.config.resolution, accept=verb.accept_changes
+    )
     device = require(device)
+    verb.output.mkdir(parents=True, exist_ok=True)
+    held.enter_context(locked(verb.output, "train"))
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
+    if changed:
+        run_scene.write(run, scene)
     print(
         f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
         f"{len(scene.points):,} points; on {device.name}, {device.driver.split('  ')[0].strip()} (the first steps may "
         "wait for kernels to be built)",
         file=sys.stderr,
     )
+    if scene.test_views:
+        _tell_of_lpips()
     try:
         with page(scene) if page else nullcontext() as between:
             _train_verb(scene, run, device, between)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         steps = run.checkpoints()
         at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
-        print(f"clsplat: interrupted {at}; go on with: clsplat train -o {run.path} --resume", file=sys.stderr)
-        return 130
+        with suppress(OSError):  # the terminal may be gone
+            print(f"clsplat: interrupted {at}; go on with: clsplat train -o {run.path} --resume", file=sys.stderr)
+        return status_of(error)
     result = json.loads(run.eval_path.read_text("utf-8")) if run.eval_path.exists() else None
     if verb.json:
         print(json.dumps(result, indent=2))
@@ -202,20 +228,23 @@ def _train_verb(scene: Scene, run: Run, device: Device, between: Between | None 
         )
 
 
-def evaluate(verb: Eval) -> int:
-    """Model and scene to numbers."""
+def evaluate(verb: Eval, *, held: bool = False) -> int:
+    """Model and scene to numbers. held: a run's folder is locked."""
     from clsplat import report
     from clsplat.config import TrainConfig
     from clsplat.device.context import open_device
     from clsplat.evaluate import background_colour
     from clsplat.evaluate import evaluate as measure
     from clsplat.gaussians import Gaussians
-    from clsplat.metrics import lpips_missing
+    from clsplat.locks import locked
     from clsplat.rendering import Renderer
     from clsplat.runs import Run, is_run, model_file
     from clsplat.selftest_result import FORWARD
     from clsplat.trust import require
 
+    if is_run(verb.model) and not held:
+        with locked(verb.model, "eval"):
+            return evaluate(verb, held=True)
     limit = parse_bytes(verb.max_device_mem)
     file = model_file(verb.model)
     given_run = Run.open(verb.model) if is_run(verb.model) else None
@@ -233,6 +262,7 @@ def evaluate(verb: Eval) -> int:
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {test_every}")
     device = require(device, FORWARD)
+    _tell_of_lpips()
     renderer = Renderer(device, config=config.rasterizer)
 
     background = background_colour(verb.background or config.background)
@@ -256,8 +286,6 @@ def evaluate(verb: Eval) -> int:
     for view in result["views"]:
         print(f"{view['name']}  {_scores(view)}")
     _print_summary(result)
-    if reason := lpips_missing():
-        print(f"no LPIPS: {reason}", file=sys.stderr)
     return 0
 
 
@@ -327,6 +355,14 @@ def _check_scene(scene: Scene) -> None:
                 f"{SSIM_WINDOW} pixels a side to measure SSIM"
             )
     scene.check_pictures()
+
+
+def _tell_of_lpips() -> None:
+    """Say once, before the work, that there will be no LPIPS, and why."""
+    from clsplat.metrics import prepare_lpips
+
+    if reason := prepare_lpips():
+        print(f"no LPIPS: {reason}", file=sys.stderr)
 
 
 def _load_scene(path: Path, resolution: int, test_every: int) -> Scene:

@@ -20,8 +20,7 @@
 // sh_rest (n, coefficients - 1, 3); splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.
 // A colour that is not finite, or of more than COLOUR_LIMIT, is not drawn: one such pixel would be all of the loss.
 // With KEEP_CULLED shown (n): 1 where a splat is written, also of those that have no tile. Of a model that is held:
-// with SH_DEGREES sh_degrees (n): the highest that is looked at; with SH_CACHE sh_cache (n, 6): the direction that a
-// Gaussian's colour was last worked out for, and the colour.
+// with SH_DEGREES sh_degrees (n): the highest that is looked at.
 __kernel void project(const uint n, const int coefficients, const int tiles_x, const int tiles_y,
                       __constant float *camera, __global const float *means, __global const float *quaternions,
                       __global const float *log_scales, __global const float *opacity_logits,
@@ -34,10 +33,6 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #ifdef SH_DEGREES
                       ,
                       __global const uchar *sh_degrees
-#endif
-#ifdef SH_CACHE
-                      ,
-                      __global float *sh_cache
 #endif
 ) {
   ROWS_OF_ITEM(n)
@@ -91,17 +86,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   dz = dz / length;
 #endif
   Lanes basis[16];
-#ifdef SH_CACHE
-  const floatL cx = dx - GATHER(sh_cache, 6, 0), cy = dy - GATHER(sh_cache, 6, 1), cz = dz - GATHER(sh_cache, 6, 2);
-  Lanes direction[3];
-  direction[0].all = dx;
-  direction[1].all = dy;
-  direction[2].all = dz;
-  IntLanes fresh; // not where nothing is kept yet: that is NaN
-  fresh.all = fmaL(cx, cx, fmaL(cy, cy, cz * cz)) <= SH_CHORD2;
-  if (ANYL(valid.all & !fresh.all))
-#endif
-    sh_basis(SH_USED(coefficients), dx, dy, dz, &basis[0].all);
+  sh_basis(SH_USED(coefficients), dx, dy, dz, &basis[0].all);
 
   for (uint lane = 0; lane < lanes_used; ++lane) {
     if (!valid.lane[lane]) continue;
@@ -119,15 +104,6 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     if (count == 0) continue;
 #endif
     tile_counts[i] = count;
-#ifdef SH_CACHE
-    __global float *cached = sh_cache + (size_t)6 * i;
-    if (fresh.lane[lane]) {
-      splat[SPLAT_RED] = cached[3];
-      splat[SPLAT_GREEN] = cached[4];
-      splat[SPLAT_BLUE] = cached[5];
-      continue;
-    }
-#endif
 #ifdef SH_DEGREES
     const int bands = sh_degrees[i] + 1, used = min(SH_USED(coefficients), bands * bands);
 #else
@@ -149,11 +125,5 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     splat[SPLAT_RED] = colour.x > 0.0f ? colour.x : 0.0f;
     splat[SPLAT_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
     splat[SPLAT_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
-#ifdef SH_CACHE
-    for (int k = 0; k < 3; ++k) {
-      cached[k] = direction[k].lane[lane];
-      cached[3 + k] = splat[SPLAT_RED + k];
-    }
-#endif
   }
 }

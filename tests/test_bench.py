@@ -338,25 +338,6 @@ def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPat
     assert "step ms" in text
 
 
-@pytest.mark.slow
-def test_half_of_the_colours_are_kept_where_they_can_be(profiled: Device) -> None:
-    subject = measure.synthetic(300, 70, 50)
-    camera, moved = subject.camera, tradeoff.aside(subject.camera, subject.gaussians, 2.0)
-    ways = [subject.gaussians.means - each.position for each in (camera, moved)]
-    units = [way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways]
-    angles = np.degrees(np.arccos((units[0] * units[1]).sum(axis=1)))
-    assert np.median(angles) == pytest.approx(2.0, rel=0.2)  # less off the axis
-    configs = {
-        "exact": RasterizerConfig(),
-        "angle": RasterizerConfig(sh_angle=2.0),
-        "0.5": RasterizerConfig(sh_angle=0.5),
-    }
-    exact, angle, less = tradeoff.compare(subject, profiled, configs, repeat=2)["points"]
-    errors = [point["against_exact"]["max_abs"] for point in (exact, less, angle)]
-    assert errors[0] == 0
-    assert 0 < errors[1] < errors[2] < 0.1
-
-
 @pytest.mark.usefixtures("_quick")
 def test_a_held_model_is_what_frames_are_measured_of(profiled: Device) -> None:
     subject = measure.synthetic(300, 50, 40)

@@ -33,7 +33,7 @@ def test_render(model: str, folder: str, pipeline: Pipeline, tmp_path: Path, cap
 
 def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture) -> None:
     run = tmp_path / "run"
-    own = RasterizerConfig(alpha_min=3 / 255, sh_angle=0.5)
+    own = RasterizerConfig(alpha_min=3 / 255, sh_tolerance=0.5)
     Run.create(run, TrainConfig(rasterizer=own))
 
     def parsed(path: object, *flags: str) -> Render:
@@ -50,9 +50,9 @@ def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture)
         for preset in ("exact", "default", "fast"):
             assert parsed(path, "--preset", preset).rasterizer == PRESETS[preset]
             assert parsed(path, *half, "--preset", preset).rasterizer == replace(PRESETS[preset], **changes)
-    assert parsed(run, "--rasterizer.sh-angle", "0").rasterizer == replace(own, sh_angle=0.0)
-    assert main(["render", model, "--cameras", "S", "-o", "{name}.png", "--rasterizer.sh-angle", "-1"]) == 2
-    assert "--rasterizer.sh-angle -1.0: expected 0 to 90 degrees" in error_line(capsys)
+    assert parsed(run, "--rasterizer.sh-tolerance", "0").rasterizer == replace(own, sh_tolerance=0.0)
+    assert main(["render", model, "--cameras", "S", "-o", "{name}.png", "--rasterizer.sh-tolerance", "-1"]) == 2
+    assert "--rasterizer.sh-tolerance -1.0: expected 0 to 1" in error_line(capsys)
     assert main(["render", str(tmp_path), "--cameras", "S", "-o", "{name}.png"]) == 2
     assert "not a run" in error_line(capsys)
 

@@ -32,7 +32,16 @@ from clsplat.runs import Run
 @pytest.mark.smoke
 def test_train_leaves_a_run(trained: Path, scene: Path) -> None:
     names = {str(path.relative_to(trained)) for path in trained.rglob("*") if path.is_file()}
-    expected = {"config.toml", "model.ply", "metrics.jsonl", "eval.json", "report.html", "test/00.png", "test/08.png"}
+    expected = {
+        "config.toml",
+        "scene.json",
+        "model.ply",
+        "metrics.jsonl",
+        "eval.json",
+        "report.html",
+        "test/00.png",
+        "test/08.png",
+    }
     assert names == {*expected, "checkpoints/step-0000040.npz"}
     run = Run.open(trained)
     assert run.config == CONFIG
@@ -213,7 +222,7 @@ def test_ctrl_c_before_the_first_step(
         patch.setattr(trainer, "upload_gaussians", interrupt)
         assert train(scene, run, CONFIG) == 130
     message = f"clsplat: interrupted before the first checkpoint; go on with: clsplat train -o {run} --resume"
-    started, interrupted = capfd.readouterr().err.splitlines()
+    started, *_, interrupted = capfd.readouterr().err.splitlines()
     assert started.startswith(f"{scene.name}: 8 pictures to train on, 2 held out, 40 points; on ")
     assert interrupted == message
     assert main(["train", "-o", str(run), "--resume", "--iterations", "3"]) == 0

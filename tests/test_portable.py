@@ -178,9 +178,14 @@ def test_processes_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_signals_that_ask_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(signal, "SIGBREAK", raising=False)
-    assert process.endings() == (signal.SIGTERM,)
+    hangup = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()
+    handlers = {signal.SIGTERM: signal.SIG_DFL, 21: signal.SIG_DFL, **dict.fromkeys(hangup, signal.SIG_DFL)}
+    monkeypatch.setattr(signal, "getsignal", handlers.__getitem__)
+    assert process.endings() == (signal.SIGTERM, *hangup)
     monkeypatch.setattr(signal, "SIGBREAK", 21, raising=False)
-    assert process.endings() == (signal.SIGTERM, 21)
+    assert process.endings() == (signal.SIGTERM, *hangup, 21)
+    handlers.update(dict.fromkeys(hangup, signal.SIG_IGN))
+    assert process.endings() == (signal.SIGTERM, 21), "nohup has its way"
 
 
 def test_a_reader_that_has_gone() -> None:

@@ -313,6 +313,25 @@ def test_a_bundle_of_a_sound_step_says_so(
     assert "all is well on this device" in capsys.readouterr().out
 
 
+def test_a_bundle_with_a_setting_of_an_earlier_version_loads(
+    scene: Scene, default_device: Device, tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    trainer = Trainer(scene, CONFIG, default_device)
+    trainer.train_step()
+    trainer.watch.loss_failed()
+    trainer.mend()
+    assert trainer.watch.latest is not None
+    path = replay.write_bundle(tmp_path, trainer, trainer.watch.latest)
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    record = json.loads(arrays[replay.RECORD].tobytes())
+    record["settings"] = record["settings"].replace("[train.rasterizer]", "[train.rasterizer]\nsh_angle = 1.5")
+    arrays[replay.RECORD] = np.frombuffer(json.dumps(record).encode(), np.uint8)
+    np.savez(path, allow_pickle=False, **arrays)
+    assert replay.read_bundle(path).config == CONFIG
+    assert not recwarn.list
+
+
 def test_what_is_no_bundle_is_named(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "some.npz"
     assert replay.main([str(path)]) == 2

@@ -11,10 +11,11 @@ import pytest
 from models import random_gaussians
 
 import clsplat
+from clsplat.cli import Train, main, parse
 from clsplat.config import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import TEMPORARY_SUFFIX
-from clsplat.runs import Run, is_run, read_config
+from clsplat.runs import Run, is_run, parse_config, read_config
 
 CONFIG = TrainConfig(
     iterations=7,
@@ -69,6 +70,31 @@ def test_whole_numbers_serve_as_floats_and_missing_keys_as_defaults(tmp_path: Pa
     path = tmp_path / "config.toml"
     path.write_text('clsplat = "1"\n[train]\ndssim_weight = 1\n')
     assert read_config(path) == (TrainConfig(dssim_weight=1.0), None)
+
+
+@pytest.mark.parametrize("angle", [0.0, 2.5])
+def test_a_setting_of_an_earlier_version_still_loads(
+    angle: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text(f'clsplat = "1"\n[train]\niterations = 9\n[train.rasterizer]\nsh_angle = {angle}\n')
+    verb = parse(["train", "S", "-o", str(tmp_path), "--resume"])
+    assert isinstance(verb, Train)
+    assert verb.config == TrainConfig(iterations=9)
+    assert main(["eval", str(tmp_path)]) == 2, "it has no model"
+    told = [line for line in capsys.readouterr().err.splitlines() if "sh_angle" in line]
+    assert len(told) <= (angle != 0)
+    assert parse_config(path.read_text(), path, tell=False)[0] == TrainConfig(iterations=9)
+
+
+def test_a_setting_of_an_earlier_version_is_told_once(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text('clsplat = "1"\n[train.rasterizer]\nsh_angle = 2.5\n')
+    with pytest.warns(
+        UserWarning, match=r"config\.toml: train\.rasterizer\.sh_angle is 2\.5 there and is passed over"
+    ) as told:
+        assert read_config(path) == read_config(path) == (TrainConfig(), None)
+    assert len(told) == 1
 
 
 def test_a_run_is_not_written_over(tmp_path: Path) -> None:

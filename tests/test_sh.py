@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError
-from clsplat.reference.sh import sh_basis, sh_basis_grad
-from clsplat.sh import change_bounds, check_half, coefficients_in_use, needed_degrees, turn_bounds
+from clsplat.reference.sh import sh_basis
+from clsplat.sh import change_bounds, check_half, coefficients_in_use, needed_degrees
 
 Float64 = NDArray[np.float64]
 
@@ -47,25 +47,6 @@ def test_bound_of_a_band(degree: int) -> None:
     parallel = np.repeat(basis[:50, :, None], 3, axis=2)  # where Cauchy-Schwarz is an equality
     value = np.einsum("nk,nkc->nc", basis[:50], parallel)
     np.testing.assert_allclose(change_bounds(parallel, degree), value, rtol=1e-7)  # the constants have 16 digits
-
-
-@pytest.mark.parametrize("degrees", [0.01, 1.0, 20.0, 90.0])
-def test_bound_of_a_turn(degrees: float) -> None:
-    sh, start, angle = coefficients(), directions(5000), np.radians(degrees)
-    end, _ = turned(start, angle)
-    change = np.einsum("dk,nkc->dnc", sh_basis(end, 3) - sh_basis(start, 3), sh)
-    assert np.all(np.abs(change).max(axis=0) <= turn_bounds(sh, angle))
-
-
-@pytest.mark.parametrize("degree", [1, 2, 3])
-def test_bound_of_a_turn_is_reached(degree: int) -> None:
-    start = directions(50)
-    _, tangents = turned(start, 0.0)
-    slope = np.einsum("nki,ni->nk", sh_basis_grad(start, 3), tangents)
-    sh = np.zeros((50, 16, 3))
-    sh[:, degree**2 : (degree + 1) ** 2] = band_of(slope, degree)[:, :, None]
-    value = np.einsum("nk,nkc->nc", slope, sh)
-    np.testing.assert_allclose(turn_bounds(sh, 1.0), value, rtol=1e-7)
 
 
 @pytest.mark.parametrize("tolerance", [0.05, 0.5, 3.0])

@@ -266,7 +266,6 @@ def test_gradient_of_bands_left_out_is_zero(default_device: Device) -> None:
         {"sh_degree_limit": 4},
         {"sh_tolerance": -0.1},
         {"sh_tolerance": float("nan")},
-        {"sh_angle": 91.0},
         {"alpha_min": 0.0},
         {"alpha_min": float("nan")},
         {"transmittance_min": 1.0},

@@ -36,8 +36,6 @@ def kernel_defines(config: RasterizerConfig) -> dict[str, object]:
     defines.update({name: True for name, wanted in flags.items() if wanted})
     if config.sh_degree_limit != default.sh_degree_limit:
         defines["SH_LIMIT"] = (config.sh_degree_limit + 1) ** 2
-    if config.sh_angle > 0:  # between unit vectors the angle is that of the chord, which has all its digits at 0
-        defines["SH_CHORD2"] = _literal((2 * math.sin(math.radians(config.sh_angle) / 2)) ** 2)
     if config.alpha_min != default.alpha_min:
         defines.update(ALPHA_MIN=_literal(config.alpha_min), LOG2_ALPHA_MIN=_literal(math.log2(config.alpha_min)))
     if config.transmittance_min != default.transmittance_min:

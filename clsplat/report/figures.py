@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config import TrainConfig
-from clsplat.errors import InputError
+from clsplat.errors import InputError, plain
 from clsplat.files import digest, parse_json, read_document
 from clsplat.gaussians import Gaussians
 from clsplat.runs import Run
@@ -173,7 +173,7 @@ def _evaluation(value: object) -> Record | None:
         if not isinstance(view, dict) or not isinstance(name := view.get("name"), str):
             return None
         views.append({"name": name, **_numbers({key: view.get(key) for key in SCORES}, len(SCORES))})
-    mean = value.get("mean")
+    mean, missing = value.get("mean"), value.get("lpips_missing")
     step = number(value.get("step"))
     gaussians = number(value.get("gaussians"))
     return {
@@ -182,6 +182,7 @@ def _evaluation(value: object) -> Record | None:
         "seconds": number(value.get("seconds")),
         "mean": _numbers({key: mean.get(key) for key in SCORES}, len(SCORES)) if isinstance(mean, dict) else {},
         "views": views,
+        **({"lpips_missing": plain(missing)[:500]} if isinstance(missing, str) else {}),
     }
 
 

@@ -22,29 +22,24 @@ from clsplat.gaussians import Gaussians
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 """The parameter groups on the device: as in `Gaussians`, with SH split into its constant and the rest."""
 
-KEPT_COLOUR = 6
-"""Floats of a row of sh_cache: the direction that a colour was worked out for, and the colour."""
-
 
 @dataclass(frozen=True, eq=False)
 class ShStorage:
     """How a model that is only rendered keeps its SH.
 
     coefficients: of each channel; degrees (n,) uint8: the highest of each Gaussian that is looked at, None for all;
-    half: the bands above 0 as float16; cache: colours are kept from frame to frame, as the device's switches say.
+    half: the bands above 0 as float16.
     """
 
     coefficients: int
     degrees: NDArray[np.uint8] | None = None
     half: bool = False
-    cache: bool = False
 
     @property
     def floats(self) -> int:
         """Of one Gaussian's parameters and what is kept beside them, in what floats take, rounded up."""
         rest = 3 * (self.coefficients - 1)
-        beside = (self.degrees is not None) + (KEPT_COLOUR if self.cache else 0)
-        return 14 + (-(-rest // 2) if self.half else rest) + beside
+        return 14 + (-(-rest // 2) if self.half else rest) + (self.degrees is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +47,7 @@ class DeviceGaussians:
     """Parameters, or their gradients or moments: arrays by group name, the first axis of each being `count`.
 
     Of a model that is held to be rendered (`ShStorage`) sh_rest may be float16, and there may be sh_degrees (count)
-    uint8, and on the device alone sh_cache (count, KEPT_COLOUR), NaN where no colour is kept yet.
+    uint8.
     """
 
     count: int
@@ -171,16 +166,13 @@ def upload_gaussians(device: Device, gaussians: Gaussians, sh: ShStorage | None 
     """A copy on the device; sh: to be rendered alone."""
     sh = sh or ShStorage(gaussians.sh.shape[1])
     arrays = {name: upload(device, values) for name, values in _grouped(gaussians, sh).items()}
-    if sh.cache:
-        arrays["sh_cache"] = allocate(device, (len(gaussians), KEPT_COLOUR), np.float32)
-        arrays["sh_cache"].fill(np.nan)
     return DeviceGaussians(len(gaussians), sh.coefficients, arrays)
 
 
 def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None) -> HostGaussians:
     """On the host, to go through the device `rows` at a time. Not a copy: to read, unless the caller may write.
 
-    sh: to be rendered alone; colours are not kept, that would want a place on the device for all rows.
+    sh: to be rendered alone.
     """
     sh = sh or ShStorage(gaussians.sh.shape[1])
     arrays = {name: HostArray(values) for name, values in _grouped(gaussians, sh).items()}
@@ -293,7 +285,7 @@ def project(
         if rays:
             _project_rays(device, part, camera, camera_array, out)
             continue
-        extras = [name for name in ("sh_degrees", "sh_cache") if name in part.arrays]
+        extras = ["sh_degrees"] if "sh_degrees" in part.arrays else []
         defines = {name.upper(): True for name in extras}
         if part["sh_rest"].dtype == np.float16:
             defines["SH_HALF"] = True

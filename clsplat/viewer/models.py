@@ -59,7 +59,6 @@ class HeldModel:
         self, gaussians: Gaussians, device: Device, config: RasterizerConfig, background: Sequence[float]
     ) -> None:
         self.gaussians, self.device, self.background = gaussians, device, background
-        config = replace(config, sh_angle=0.0)  # a picture must not depend on those before
         self._rasterizers = {True: Rasterizer(device, config), False: Rasterizer(device, draft(config))}
         self._held: dict[Look | None, tuple[Gaussians, dict[bool, Renderer]]] = {}
 

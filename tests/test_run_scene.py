@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run knows its scene: another one, or a changed photograph, is refused before anything is written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calls import Capture
+from calls import train as command_train
+from tiny import short, write_scene
+
+from clsplat import run_scene
+from clsplat.cli import Train, main, parse
+from clsplat.config import TrainConfig
+from clsplat.errors import InputError
+from clsplat.images import read_image, write_image
+from clsplat.runs import Run
+from clsplat.scene import Scene, load_scene
+
+FEW = short(iterations=3, report=False, density={"every": 0})
+
+
+@pytest.fixture
+def own(scene: Path, tmp_path: Path) -> Path:
+    """The tiny scene, to be changed."""
+    return Path(shutil.copytree(scene, tmp_path / "own"))
+
+
+@pytest.fixture(scope="module")
+def begun(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three steps; not to be changed."""
+    run = tmp_path_factory.mktemp("begun") / "run"
+    assert command_train(scene, run, FEW) == 0
+    return run
+
+
+@pytest.fixture
+def run(begun: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(begun, tmp_path / "run"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def resume(run: Path, scene: Path, *more: str) -> int:
+    return main(["train", str(scene), "-o", str(run), "--resume", "--iterations", "4", *more])
+
+
+def brighten(path: Path) -> None:
+    write_image(path, np.clip(read_image(path) + np.float32(0.1), 0, 1))
+
+
+def refusal(run: Path, scene: Path, capsys: Capture) -> str:
+    """The one line of error; the run is as it was."""
+    before = contents(run)
+    capsys.readouterr()
+    assert resume(run, scene) == 2
+    assert contents(run) == before
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = [each for each in captured.err.splitlines() if each.startswith("clsplat: error: ")]
+    assert "Traceback" not in captured.err
+    return line
+
+
+def test_the_same_scene_goes_on_from_anywhere(run: Path, own: Path) -> None:
+    known = (run / run_scene.NAME).read_bytes()
+    assert resume(run, own) == 0
+    assert (run / run_scene.NAME).read_bytes() == known
+
+
+def test_a_changed_photograph_is_refused(run: Path, own: Path, capsys: Capture) -> None:
+    brighten(own / "images" / "03.png")
+    line = refusal(run, own, capsys)
+    assert f"{own}: is not the scene that {run} began with: 1 view another photograph (03.png); expected" in line
+    assert "--accept-changes goes on" in line
+
+
+def test_another_scene_is_refused_with_three_examples(run: Path, own: Path, capsys: Capture) -> None:
+    for path in (own / "images").iterdir():
+        brighten(path)
+    line = refusal(run, own, capsys)
+    assert "10 views another photograph (00.png, 01.png, 02.png and 7 more)" in line
+
+
+def test_other_names_and_cameras_are_refused(run: Path, own: Path, capsys: Capture) -> None:
+    listed = own / "sparse" / "0" / "images.txt"
+    lines = listed.read_text().splitlines()
+    words = lines[4].split()  # the third view: its camera moved
+    words[5] = str(float(words[5]) + 0.01)
+    lines[4] = " ".join(words)
+    lines[0] = lines[0].replace("00.png", "zz.png")
+    (own / "images" / "00.png").rename(own / "images" / "zz.png")
+    listed.write_text("\n".join(lines) + "\n")
+    line = refusal(run, own, capsys)
+    assert "1 view not there any more (00.png); 1 view new (zz.png); 1 view another camera (02.png)" in line
+
+
+def test_changes_can_be_accepted(run: Path, own: Path, capsys: Capture) -> None:
+    brighten(own / "images" / "03.png")
+    lines = (own / "sparse" / "0" / "images.txt").read_text().splitlines()
+    (own / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:-2]) + "\n")  # a view less
+    (own / "images" / "09.png").unlink()
+    assert resume(run, own, "--accept-changes") == 0
+    assert resume(run, own, "--iterations", "5") == 0, "from now on this is its scene"
+    assert Run.open(run).config.iterations == 5
+
+
+def test_accepting_is_for_resuming(scene: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert main(["train", str(scene), "-o", str(tmp_path / "new"), "--accept-changes"]) == 2
+    assert "--accept-changes is for --resume" in capsys.readouterr().err
+
+
+def test_another_resolution_is_not_another_scene(run: Path, own: Path) -> None:
+    assert resume(run, own, "--resolution", "40") == 0
+    assert resume(run, own, "--iterations", "5") == 0
+
+
+def test_a_run_of_an_earlier_version_resumes_with_one_line(run: Path, own: Path, capsys: Capture) -> None:
+    (run / run_scene.NAME).unlink()
+    capsys.readouterr()
+    assert resume(run, own) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if run_scene.NAME in line]
+    assert len(told) == 1
+    assert told[0].startswith(f"clsplat: warning: {run}: has no scene.json, as runs of earlier versions")
+    assert (run / run_scene.NAME).exists()
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"views": {"a": {}}}', '{"views": 3, "points": {}}'])
+def test_a_damaged_record_is_named(text: str, run: Path, own: Path, capsys: Capture) -> None:
+    (run / run_scene.NAME).write_text(text)
+    assert f"{run / run_scene.NAME}: is damaged" in refusal(run, own, capsys)
+
+
+def test_the_digest_is_of_the_photograph(scene: Path, own: Path) -> None:
+    def record(folder: Path) -> dict[str, object]:
+        return run_scene.record_of(load_scene(folder), 0)
+
+    assert json.loads(json.dumps(record(scene))) == record(own)
+    with open(own / "images" / "05.png", "ab") as file:
+        file.write(b"x")
+    assert run_scene.differences(record(scene), record(own)) == ["1 view another photograph (05.png)"]
+
+
+def test_a_scene_of_any_size_is_compared(scene: Path) -> None:
+    """Positions of 1e-7 are not all the same."""
+    whole = load_scene(scene)
+
+    def scaled(factor: float, shift: float) -> Scene:
+        moved = [
+            replace(view, camera=replace(view.camera, translation=factor * (view.camera.translation + shift)))
+            for view in whole.views
+        ]
+        return replace(whole, views=moved)
+
+    for factor in (1e-7, 1.0, 1e7):
+        records = [run_scene.record_of(scaled(factor, shift), 0) for shift in (0.0, 0.0, 1e-3)]
+        assert run_scene.differences(records[0], records[1]) == []
+        assert run_scene.differences(records[0], records[2]) != []
+
+
+def test_a_scene_elsewhere_cannot_be_accepted(scene: Path, tmp_path: Path) -> None:
+    known = load_scene(scene)
+    run = Run.create(tmp_path / "run", TrainConfig())
+    run_scene.write(run, known)
+    far = load_scene(write_scene(tmp_path / "far"))
+    far.origin = np.array([1024.0, 0, 0])
+    with pytest.raises(InputError, match="lies elsewhere in the world"):
+        run_scene.check(run, far, tmp_path, 0, accept=True)
+
+
+DISPLAY = [
+    ["--json"],
+    ["--view"],
+    ["--port", "9"],
+    ["--host", "::1"],
+    ["--paths", "p"],
+    ["--device", "cpu"],
+    ["--max-device-mem", "1GiB"],
+    ["--accept-changes"],
+    ["--no-report"],
+]
+
+
+@pytest.mark.parametrize("given", DISPLAY, ids=" ".join)
+def test_what_is_given_beside_resume(given: list[str], tmp_path: Path) -> None:
+    """Each is what it would be without --resume, and the run's settings hold."""
+    Run.create(tmp_path, replace(FEW, report=True))
+    for order in (["--resume", *given], [*given, "--resume"]):
+        verb = parse(["train", "-o", str(tmp_path), *order])
+        fresh = parse(["train", "-o", str(tmp_path), *given])
+        assert isinstance(verb, Train)
+        assert isinstance(fresh, Train)
+        assert replace(verb, resume=False, config=fresh.config) == fresh
+        assert verb.config == replace(FEW, report="--no-report" not in given)
+
+
+def test_all_display_options_beside_resume(tmp_path: Path) -> None:
+    Run.create(tmp_path, FEW)
+    verb = parse(["train", "-o", str(tmp_path), "--resume", *[word for given in DISPLAY for word in given]])
+    assert isinstance(verb, Train)
+    assert (verb.json, verb.view, verb.port, verb.accept_changes, verb.resume) == (True, True, 9, True, True)

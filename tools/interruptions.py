@@ -1,0 +1,384 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of every verb where a signal comes, a disk is full, a stream is closed, or another process is there.
+
+    python tools/interruptions.py [--verbs train,eval] [--events SIGINT,2>&-] [--markdown]
+
+Each verb really runs, as a process of its own, on a small scene that is made on the spot; --markdown prints the tables
+of docs/interruptions.md. A full disk is a file system of its own where this user may mount one, else a limit of the
+size of files; a verb that writes none prints to /dev/full. Exit status 1 if a process ends with a traceback, by a
+signal or not at all. Set CLSPLAT_TRUST_DRIVER=1 to be quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from stress_kills import write_scene
+
+LONG, SHORT = 100_000, 20
+DEADLINE = 300.0
+"""Seconds that a process may take to end."""
+FULL = 48 << 10
+"""Bytes that a full disk still takes."""
+TRAINING = (
+    *("--sh-degree", "0", "--density.every", "0", "--warmup", ""),
+    *("--checkpoint-every", "0", "--no-report"),
+)
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A call. words: of the command line, with {scene}, {photos}, {run}, {other}, {model} and {out}, the folder that it
+    may write to; writes: whether it writes files; ready: what is there, below {out}, when it is at work; where that is
+    None half of its time is waited for."""
+
+    name: str
+    words: str
+    writes: bool = True
+    ready: str | None = None
+
+
+TRAIN = " ".join(["train {scene} -o {out}/run --iterations", str(LONG), *(word or "''" for word in TRAINING)])
+VERBS = (
+    Verb("devices", "devices", writes=False),
+    Verb("demo", "demo -o {out}/demo --iterations 100", ready="demo/photos"),
+    Verb("sfm", "sfm {photos} -o {out}/scene", ready=".scene-sfm-*/database.db"),
+    Verb("train", TRAIN, ready="run/metrics.jsonl"),
+    Verb("eval", "eval {out}/run"),
+    Verb(
+        "render",
+        "render {model} --cameras {scene} --path turntable --count 200 -o {out}/a.####.png",
+        ready="a.0002.png",
+    ),
+    Verb("view", "view {model} --port 0", writes=False),
+    Verb("report", "report {out}/run"),
+    Verb("compare", "compare {run} {other} -o {out}/a.html"),
+    Verb("convert", "convert {model} {out}/a.sog"),
+    Verb("info", "info {model}", writes=False),
+    Verb("bench", "bench --gaussians 5000 --size 320x240 --repeat 3", writes=False),
+    Verb("tune", "tune", writes=False),
+    Verb("selftest", "selftest", writes=False),
+)
+SIGNALS = {"SIGINT": 1, "SIGINT twice": 2, "SIGTERM": 1, "SIGHUP": 1}
+STREAMS = (">&-", "2>&-", "| head -c 0", "2>&1 | head -c 0")
+EVENTS = (*SIGNALS, "full disk", *STREAMS, "second process")
+TITLES = {
+    "SIGINT": "Ctrl-C (SIGINT) in the middle of the work",
+    "SIGINT twice": "Ctrl-C twice, a twentieth of a second apart",
+    "SIGTERM": "SIGTERM, as managers of jobs send it",
+    "SIGHUP": "SIGHUP, as when a terminal is closed",
+    "full disk": "A full disk; where no file is written, standard output on one",
+    ">&-": "Standard output closed: `>&-`",
+    "2>&-": "Standard error closed: `2>&-`",
+    "| head -c 0": "A reader of standard output that has gone: `| head -c 0`",
+    "2>&1 | head -c 0": "A reader of both that has gone: `2>&1 | head -c 0`",
+    "second process": "Another process at work in the same folder: a training in the run, else the same verb",
+}
+
+
+@dataclass
+class Outcome:
+    """status: of the process, None where it did not end; told: its last line; left: hidden files, which are new."""
+
+    verb: str
+    event: str
+    status: int | None
+    told: str
+    left: list[str]
+    traceback: bool
+
+    @property
+    def sound(self) -> bool:
+        return self.status is not None and self.status >= 0 and not self.traceback
+
+
+class Bench:
+    """A folder with what the verbs need."""
+
+    def __init__(self, folder: Path, verbs: Sequence[Verb]) -> None:
+        self.folder, self.seconds = folder, dict[str, float]()
+        self.names = {name: str(folder / name) for name in ("scene", "photos", "run", "other")}
+        self.names["model"] = str(folder / "run" / "model.ply")
+        write_scene(folder / "scene")
+        if any(verb.name == "sfm" for verb in verbs):
+            from clsplat.demo_scene import ignore_progress, write_photos
+
+            write_photos(folder / "photos", count=12, width=320, height=240, progress=ignore_progress)
+        for name in ("run", "other"):
+            self.call(["train", self.names["scene"], "-o", self.names[name], "--iterations", str(SHORT), *TRAINING])
+
+    def call(self, words: Sequence[str]) -> None:
+        """Run to the end, well."""
+        done = subprocess.run(command(words), capture_output=True, text=True, timeout=DEADLINE, check=False)
+        if done.returncode:
+            raise SystemExit(f"{' '.join(words)}: {done.stderr}")
+
+    def words(self, verb: Verb, out: Path) -> list[str]:
+        """The call, with {out}, where the finished run lies for verbs that write into one."""
+        if "{out}/run" in verb.words and verb.name != "train":
+            shutil.copytree(self.folder / "run", out / "run")
+        words = verb.words.format(out=out, **self.names).split(" ")
+        return ["" if word == "''" else word for word in words]
+
+    def time_of(self, verb: Verb) -> float:
+        """Seconds of a verb that nobody disturbs, measured once."""
+        if verb.name == "view":
+            return 12.0
+        for _ in range(2 if verb.name not in self.seconds else 0):  # the first may build kernels
+            with fresh(self.folder) as out:
+                words = self.words(verb, out)
+                start = time.monotonic()
+                self.call(words)
+                self.seconds[verb.name] = time.monotonic() - start
+        return self.seconds[verb.name]
+
+
+def command(words: Sequence[str]) -> list[str]:
+    """Of a process."""
+    return [sys.executable, "-m", "clsplat", *words]
+
+
+def keep_apart(folder: Path) -> None:
+    """Give children a cache of their own, as `tune` writes there what every later call goes by; what drivers have built
+    stays where it is."""
+    before = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    os.environ.setdefault("POCL_CACHE_DIR", str(before / "pocl" / "kcache"))
+    os.environ.setdefault("CLSPLAT_BINARIES", str(before / "clsplat" / "binaries"))
+    os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
+
+
+@contextmanager
+def fresh(folder: Path) -> Iterator[Path]:
+    """A new folder below `folder`."""
+    out = Path(tempfile.mkdtemp(prefix="out-", dir=folder))
+    try:
+        yield out
+    finally:
+        shutil.rmtree(out, ignore_errors=True)
+
+
+@contextmanager
+def full_disk(folder: Path, before: int) -> Iterator[tuple[Path, Callable[[], None] | None]]:
+    """A folder on a disk with room for `before` bytes and FULL; or any, and what limits the files of a child."""
+    with fresh(folder) as out:
+        size = f"size={before + FULL + (64 << 10)}"
+        mounted = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(out)], capture_output=True, check=False
+        )
+        if mounted.returncode == 0:
+            try:
+                yield out, None
+            finally:
+                subprocess.run(["umount", "-l", str(out)], check=True)
+            return
+
+        def limit() -> None:
+            import resource
+
+            resource.setrlimit(resource.RLIMIT_FSIZE, (FULL, FULL))
+
+        yield out, limit
+
+
+def result_of(verb: Verb, event: str, done: tuple[int | None, str], out: Path, names: dict[str, str]) -> Outcome:
+    """Of a process that has ended: its status and its words."""
+    status, text = done
+    lines = [line for line in text.splitlines() if line.strip()]
+    told = lines[-1] if lines else ""
+    for name, path in {"OUT": str(out), **{name.upper(): path for name, path in names.items()}}.items():
+        told = told.replace(path, name)
+    hidden = [path for path in out.rglob(".*") if path.name != ".clsplat-lock" or status != 2]
+    left = sorted(str(path.relative_to(out)) for path in hidden)
+    return Outcome(verb.name, event, status, told, left, "Traceback (most recent call last)" in text)
+
+
+def wait(process: subprocess.Popen[str]) -> tuple[int | None, str]:
+    """Status and words; None where it does not end, and is killed."""
+    try:
+        output, errors = process.communicate(timeout=DEADLINE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        output, errors = process.communicate()
+        return None, (output or "") + (errors or "")
+    return process.returncode, (output or "") + (errors or "")
+
+
+def wait_until_at_work(bench: Bench, verb: Verb, process: subprocess.Popen[str], out: Path, share: float = 0.5) -> None:
+    """Until the file is there that says so, or a part of its time has gone."""
+    until = time.monotonic() + (DEADLINE if verb.ready else share * bench.time_of(verb))
+    while process.poll() is None and time.monotonic() < until:
+        if verb.ready and any(out.glob(verb.ready)):
+            return
+        time.sleep(0.02)
+
+
+def start(words: Sequence[str], **options: object) -> subprocess.Popen[str]:
+    """A process, both of its streams read unless said otherwise."""
+    streams: dict[str, object] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+    return subprocess.Popen(command(words), text=True, encoding="utf-8", errors="replace", **streams)  # type: ignore[call-overload, no-any-return]
+
+
+def signalled(bench: Bench, verb: Verb, event: str) -> Outcome:
+    """A signal in the middle; earlier where the process had ended by then."""
+    if verb.ready is None:
+        bench.time_of(verb)
+    for share in (0.5, 0.35, 0.2):
+        with fresh(bench.folder) as out:
+            process = start(bench.words(verb, out))
+            wait_until_at_work(bench, verb, process, out, share)
+            running = process.poll() is None
+            number = getattr(signal, event.partition(" ")[0])
+            for index in range(SIGNALS[event]):
+                time.sleep(0.05 * index)
+                with suppress(ProcessLookupError):
+                    process.send_signal(number)
+            found = result_of(verb, event, wait(process), out, bench.names)
+        if running and found.status != 0:
+            break
+    if found.status == -number:  # Python ends so by itself, where a Ctrl-C came while it was starting or ending
+        found.status = 128 + number
+    return found
+
+
+def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
+    """Files, or standard output."""
+    if not verb.writes:
+        with fresh(bench.folder) as out, open("/dev/full", "w") as full:
+            process = start(bench.words(verb, out), stdout=full)
+            if verb.name == "view":
+                time.sleep(bench.time_of(verb))
+                process.send_signal(signal.SIGINT)
+            return result_of(verb, "full disk", wait(process), out, bench.names)
+    inside = "{out}/run" in verb.words and verb.name != "train"
+    before = sum(path.stat().st_size + 4096 for path in (bench.folder / "run").rglob("*")) if inside else 0
+    with full_disk(bench.folder, before) as (out, limit):
+        words = bench.words(verb, out)
+        if verb.name == "train":  # to its end, in which it writes most
+            words[words.index(str(LONG))] = str(SHORT)
+        if inside or limit is None:
+            with suppress(OSError), open(out / "filler", "wb") as filler:
+                filler.write(bytes(max(shutil.disk_usage(out).free - FULL // 4, 0)))
+        return result_of(verb, "full disk", wait(start(words, preexec_fn=limit)), out, bench.names)
+
+
+def with_a_stream(bench: Bench, verb: Verb, event: str) -> Outcome:
+    """One that is closed, or a pipe whose reader has gone, as by a shell."""
+    with fresh(bench.folder) as out:
+        words = bench.words(verb, out)
+        if verb.name == "train":
+            words[words.index(str(LONG))] = str(SHORT)
+        said = out / "said"
+        line = '"$@" ' + {">&-": ">&- 2>said", "2>&-": ">said 2>&-"}.get(event, "")
+        if event.endswith("head -c 0"):
+            read, write = os.pipe()
+            os.close(read)
+            kept = {} if event.startswith("2>&1") else {"stderr": subprocess.PIPE}
+            process = start(words, **{"stdout": write, "stderr": write, **kept})
+            os.close(write)
+        else:
+            process = subprocess.Popen(["sh", "-c", f"cd {out}; exec {line}", "sh", *command(words)], text=True)
+        if verb.name == "view":
+            time.sleep(bench.time_of(verb))
+            process.send_signal(signal.SIGINT)
+        status, text = wait(process)
+        text += said.read_text("utf-8", errors="replace") if said.exists() else ""
+        return result_of(verb, event, (status, text), out, bench.names)
+
+
+def beside_another(bench: Bench, verb: Verb) -> Outcome:
+    """A training in the run that the verb works with, or the same verb in the same folder."""
+    with fresh(bench.folder) as out:
+        words = bench.words(verb, out)
+        first, ready = words, verb
+        if "{out}/run" in verb.words and verb.name != "train":
+            resumed = ["train", "-o", str(out / "run"), "--resume", "--iterations", str(LONG)]
+            first, ready = resumed, Verb("train", TRAIN, ready="run/.clsplat-lock")
+        other = start(first, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            wait_until_at_work(bench, ready, other, out)
+            process = start(words)
+            if verb.name == "view":
+                time.sleep(bench.time_of(verb))
+                process.send_signal(signal.SIGINT)
+            done = wait(process)
+        finally:
+            other.kill()
+            other.wait()
+        found = result_of(verb, "second process", done, out, bench.names)
+        found.told = found.told.replace(f"process {other.pid}", "process 123")
+        found.left = []  # the other's
+        return found
+
+
+def outcome(bench: Bench, verb: Verb, event: str) -> Outcome:
+    """Make it happen."""
+    if event in SIGNALS:
+        return signalled(bench, verb, event)
+    if event == "full disk":
+        return on_a_full_disk(bench, verb)
+    if event in STREAMS:
+        return with_a_stream(bench, verb, event)
+    return beside_another(bench, verb)
+
+
+def tables(outcomes: Sequence[Outcome]) -> str:
+    """A table for each event, in Markdown."""
+    text = []
+    for event in dict.fromkeys(each.event for each in outcomes):
+        text += [f"### {TITLES[event]}", "", "| verb | exit status | last line | left behind |", "|---|---|---|---|"]
+        for each in (found for found in outcomes if found.event == event):
+            status = "does not end" if each.status is None else str(each.status)
+            told = f"`{each.told.replace('|', ' ')}`" if each.told else "nothing"
+            told = "a traceback" if each.traceback else told
+            text.append(
+                f"| `{each.verb}` | {status} | {told} | {', '.join(f'`{name}`' for name in each.left) or '-'} |"
+            )
+        text.append("")
+    return "\n".join(text)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line above."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--verbs", help="such as train,eval; all if not given")
+    parser.add_argument("--events", help=f"some of {', '.join(EVENTS)}; all if not given")
+    parser.add_argument("--markdown", action="store_true", help="print tables, not lines")
+    options = parser.parse_args(arguments)
+    known = {verb.name: verb for verb in VERBS}
+    names = options.verbs.split(",") if options.verbs else list(known)
+    events = options.events.split(",") if options.events else list(EVENTS)
+    for given, of in ((names, known), (events, EVENTS)):
+        if unknown := [each for each in given if each not in of]:
+            parser.error(f"{unknown[0]}: expected some of {', '.join(of)}")
+    verbs = [known[name] for name in names]
+    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        signal.signal(number, handler)  # a shell's `&` and nohup have them ignored, and children would go on so
+    outcomes = []
+    with tempfile.TemporaryDirectory(prefix="clsplat-interruptions-") as folder:
+        keep_apart(Path(folder))
+        bench = Bench(Path(folder), verbs)
+        for event in events:
+            for verb in verbs:
+                found = outcome(bench, verb, event)
+                outcomes.append(found)
+                mark = "" if found.sound else "  <- not as it should be"
+                print(f"{event}: {found.verb}: {found.status}: {found.told}{mark}", file=sys.stderr, flush=True)
+    if options.markdown:
+        print(tables(outcomes))
+    return 0 if all(each.sound for each in outcomes) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
