@@ -87,6 +87,7 @@ def read_job(verb: Render) -> Job:
         rasterizer = replace(rasterizer, sh_angle=0.0)
     model = model_file(verb.model)
     gaussians = Gaussians.load(model)
+    tasks = [task.seen_from(gaussians.near) for task in tasks]
     recorded = recorded_space(model)
     colours = Colours(options.pictures.colour, recorded)
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}

@@ -177,7 +177,7 @@ class _Session:
         trainer, background = self.trainer, background_colour(self.trainer.config.background)
 
         def render(view: View) -> NDArray[Any]:
-            return self.renderer.render(trainer.parameters, view.camera.from_origin(trainer.origin), background).image
+            return self.renderer.render(trainer.parameters, trainer.local(view.camera), background).image
 
         return evaluate(
             render,
