@@ -23,6 +23,9 @@ MIN_SQUARED_DISTANCE = 1e-7
 """The authors' floor under the mean squared distance, which keeps points that coincide alive: world units squared in
 scenes whose extent is one of ORDINARY_EXTENTS, and in others as much of the extent as at the nearer end."""
 ORDINARY_EXTENTS = (1.0, 100.0)
+LEAST_COLOUR = 1 / 512
+"""Half a step of an 8 bit image. A channel that starts at 0 is at the clamp of colours, where it has no gradient, and
+rounding may keep it there for good."""
 NEIGHBOURS = 3
 
 Float64 = NDArray[np.float64]
@@ -74,7 +77,7 @@ def from_points(
     quaternions = np.zeros((count, 4), np.float32)
     quaternions[:, 0] = 1
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (rgb - 0.5) / SH_C0
+    sh[:, 0] = (np.maximum(rgb, LEAST_COLOUR) - 0.5) / SH_C0
     return Gaussians(
         means=np.ascontiguousarray(xyz - origin, np.float32),
         quaternions=quaternions,

@@ -9,13 +9,15 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat import doubts
+from clsplat.camera import Camera
 from clsplat.colour import photos_space
 from clsplat.config import TrainConfig
 from clsplat.device.context import Device, open_device
@@ -23,6 +25,7 @@ from clsplat.errors import ClsplatError
 from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.memory import Plan, parse_bytes
+from clsplat.point_colours import is_colourless, photographed
 from clsplat.quarantine import RETURNS, WINDOW
 from clsplat.rendering import Renderer
 from clsplat.replay import write_bundle
@@ -216,6 +219,18 @@ class _Session:
             record["contributions"] = found
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
+    def doubt(self) -> None:
+        """A warning where the pictures are none."""
+        trainer, renderer = self.trainer, self.renderer
+        background = background_colour(trainer.config.background)
+
+        def draw(camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+            drawn = renderer.render(trainer.parameters, trainer.local(camera), background)
+            return drawn.image, drawn.alpha
+
+        if text := doubts.of_pictures(draw, trainer.views):
+            warnings.warn(f"step {trainer.step}: {text}")
+
     def times_stages(self, step: int) -> bool:
         """Whether it is measured what each stage of the step takes: only where that is written down."""
         config = self.trainer.config
@@ -238,6 +253,8 @@ class _Session:
         if self.go_back():
             return
         step = trainer.step
+        if step == doubts.LOOK_AT and step < config.iterations:
+            self.doubt()
         evaluating = step in config.eval_at and bool(trainer.scene.test_views)
         if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
             report = self.report(result)
@@ -273,6 +290,13 @@ def train(
     config = config or TrainConfig()
     config.check()
     opened = device if isinstance(device, Device) else open_device(device, parse_bytes(max_device_mem))
+    scene.require_training_views()
+    if not (resume and run is not None and run.checkpoints()):
+        for text in doubts.of_scene(scene, config.background):
+            warnings.warn(text)
+        if is_colourless(scene):
+            warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
+            scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
     session = _Session(Trainer(scene, config, opened), run, on_plan)
     trainer = session.trainer
     if resume:
@@ -291,6 +315,7 @@ def train(
         session.tell_the_rest()
         if trainer.step < config.iterations:
             raise KeyboardInterrupt
+        session.doubt()
     model = trainer.gaussians()
     if run is not None:
         run.save_model(model, photos_space(view.path for view in scene.views))
