@@ -24,7 +24,7 @@ from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
 from clsplat.formats import is_model_name
 from clsplat.gaussians import Gaussians
-from clsplat.initialise import from_points, random_points
+from clsplat.initialise import from_scene
 from clsplat.rendering import Frame, Renderer, held_sh
 from clsplat.runs import Run, is_run
 from clsplat.scene import Scene, View, load_scene
@@ -95,15 +95,11 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
         return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
     else:
         scene = load_scene(path, progress=progress)
-        if len(scene.points) > 0:
-            gaussians = from_points(scene.points, scene.point_colors, sh_degree=0, origin=scene.origin)
-        else:
-            points = random_points(TrainConfig().random_points, *scene.bounds, np.random.default_rng(0))
-            gaussians = from_points(*points, sh_degree=0, origin=scene.origin)
+        gaussians = from_scene(scene, TrainConfig().random_points, np.random.default_rng(0))
     view = (scene.train_views or scene.views)[0]
     camera = view.camera.resized(*size) if size else view.camera
     pixels = view.load(camera.width, camera.height)[:, :, :3]
-    camera, gaussians = camera.from_origin(gaussians.origin), replace(gaussians, origin=np.zeros(3))
+    camera, gaussians = gaussians.local(camera), replace(gaussians, origin=np.zeros(3))
     return Subject(str(path), gaussians, camera, np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
 
 

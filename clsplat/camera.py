@@ -14,6 +14,10 @@ Float64 = NDArray[np.float64]
 Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
 
 FRAME_CLAMP = 0.3
+NEAR = 0.01
+"""World units: the near plane of a camera that has none of its own, before a model that has none either."""
+NEARS = 1000.0
+"""Near planes in the extent of a scene that is too small for the usual one."""
 LARGEST_FOCAL = 1e12
 """Pixels: float32 has no digits left of a position long before."""
 
@@ -42,7 +46,8 @@ class Camera:
     projection, and what a pixel is a multiple of there (docs/cameras.md has the equations): perspective, x/z and y/z;
     orthographic, x and y, so 1 / fx is world units a pixel; fisheye (equidistant), the angle from the axis in radians;
     equirectangular, longitude and latitude in radians. near, far: depths in world units between which something is
-    seen; depth is z, for fisheye and equirectangular the distance. Nothing applies `far` yet.
+    seen; depth is z, for fisheye and equirectangular the distance. A near of NEAR, the default,
+    stands for the model's (`Gaussians.near`). Nothing applies `far` yet.
 
     window: where the picture is a part of a frame, or more than it: width and height are the picture's, cx and cy are
     measured from the frame's corner. What both show has the same bits where x and y are multiples of a tile and the
@@ -57,7 +62,7 @@ class Camera:
     cy: float
     rotation: Float64
     translation: Float64
-    near: float = 0.01
+    near: float = NEAR
     far: float = math.inf
     projection: Projection = "perspective"
     window: Window | None = None
@@ -73,6 +78,10 @@ class Camera:
         if not origin.any():
             return self
         return replace(self, translation=self.translation + self.rotation @ origin)
+
+    def before(self, near: float) -> Camera:
+        """The same view of a model whose near plane is at `near`: that counts unless the camera has its own."""
+        return replace(self, near=near) if self.near == NEAR != near else self
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view on another pixel grid: pixel centres at +0.5 make this a pure scaling.

@@ -63,4 +63,4 @@ def largest_contributions(
 
 
 def _from_origin(cameras: Iterable[Camera], gaussians: Gaussians) -> Iterable[Camera]:
-    return (camera.from_origin(gaussians.origin) for camera in cameras)
+    return (gaussians.local(camera) for camera in cameras)

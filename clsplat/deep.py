@@ -52,7 +52,7 @@ def bin_bounds(gaussians: Gaussians, camera: Camera, config: DeepConfig) -> Floa
 
 def depths_in_view(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
     """Depths of the means that are in front of the camera and, if it has an image plane, in its frame."""
-    camera = camera.from_origin(gaussians.origin)
+    camera = gaussians.local(camera)
     p = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
     if camera.projection not in ("perspective", "orthographic"):
         distances: NDArray[np.float64] = np.linalg.norm(p, axis=1)

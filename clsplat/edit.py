@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
+from clsplat.camera import NEAR, Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Float32, Float64, Gaussians
 from clsplat.reference.sh import sh_basis
@@ -36,6 +36,7 @@ def take(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.int64]) -> G
         gaussians.opacity_logits[rows],
         gaussians.sh[rows],
         gaussians.origin,
+        gaussians.near,
     )
 
 
@@ -84,6 +85,7 @@ def merge(models: Sequence[Gaussians]) -> Gaussians:
         np.concatenate([model.opacity_logits for model in models]),
         np.concatenate([sh(model) for model in models]),
         origin,
+        min(model.near for model in models),
     )
 
 
@@ -123,6 +125,7 @@ def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILAR) ->
         gaussians.opacity_logits,
         gaussians.sh if upright else rotate_sh(gaussians.sh, turn),
         origin,
+        scale * gaussians.near,
     )
 
 
@@ -136,7 +139,8 @@ def transform_camera(camera: Camera, matrix: Float64) -> Camera:
     scale, turn, shift = decompose(matrix)
     rotation = camera.rotation @ turn.T
     translation = scale * camera.translation - rotation @ shift
-    return replace(camera, rotation=rotation, translation=translation, near=scale * camera.near, far=scale * camera.far)
+    near = NEAR if camera.near == NEAR else scale * camera.near  # the model's, which moves with it
+    return replace(camera, rotation=rotation, translation=translation, near=near, far=scale * camera.far)
 
 
 def _turned(quaternions: Float32, turn: Float64) -> Float32:

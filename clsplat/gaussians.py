@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.camera import NEAR, Camera
+
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
@@ -23,7 +25,8 @@ class Gaussians:
     means (N, 3); quaternions (N, 4), w x y z, not normalised; log_scales (N, 3), natural logs of the standard
     deviations; opacity_logits (N,); sh (N, K, 3), K = (degree + 1)^2 real SH coefficients per channel,
     colour = 0.5 + sum of basis times coefficient. All float32, C-contiguous. origin (3,) float64: the place in the
-    world that the means count from; 0 but for scenes far from it, which float32 would blur (docs/decisions/0017).
+    world that the means count from; 0 but for scenes far from it, which float32 would blur (docs/decisions/0017). near:
+    where cameras without a near plane of their own begin to see, world units (docs/decisions/0019).
     """
 
     means: Float32
@@ -32,6 +35,7 @@ class Gaussians:
     opacity_logits: Float32
     sh: Float32
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
+    near: float = NEAR
 
     def __len__(self) -> int:
         return len(self.means)
@@ -40,6 +44,10 @@ class Gaussians:
     def sh_degree(self) -> int:
         """0 to 3."""
         return round(float(np.sqrt(self.sh.shape[1]))) - 1
+
+    def local(self, camera: Camera) -> Camera:
+        """A camera in the world as one that counts from where the means do, with the model's near plane."""
+        return camera.from_origin(self.origin).before(self.near)
 
     def check(self) -> None:
         """Raise ValueError naming the array whose dtype or shape is not as the class says."""
@@ -60,6 +68,8 @@ class Gaussians:
                 raise ValueError(f"{name} is {array.dtype} {array.shape}, expected float32 {shape}")
         if self.origin.dtype != np.float64 or self.origin.shape != (3,):
             raise ValueError(f"origin is {self.origin.dtype} {self.origin.shape}, expected float64 (3,)")
+        if not 0 < self.near < np.inf:
+            raise ValueError(f"near is {self.near}, expected a distance of more than 0")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Gaussians:

@@ -4,31 +4,58 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clsplat.camera import NEAR
 from clsplat.errors import InputError
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+
+if TYPE_CHECKING:
+    from clsplat.scene import Scene
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 INITIAL_OPACITY = 0.1
 MIN_SQUARED_DISTANCE = 1e-7
-"""The authors' floor under the mean squared distance, world units squared: keeps points that coincide alive."""
+"""The authors' floor under the mean squared distance, which keeps points that coincide alive: world units squared in
+scenes whose extent is one of ORDINARY_EXTENTS, and in others as much of the extent as at the nearer end."""
+ORDINARY_EXTENTS = (1.0, 100.0)
+LEAST_COLOUR = 1 / 512
+"""Half a step of an 8 bit image. A channel that starts at 0 is at the clamp of colours, where it has no gradient, and
+rounding may keep it there for good."""
 NEIGHBOURS = 3
 
 Float64 = NDArray[np.float64]
 
 
-def from_points(points: ArrayLike, colors: ArrayLike, *, sh_degree: int, origin: Float64 | None = None) -> Gaussians:
+def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
+    """Those of degree 0 of the scene's points, or of so many random ones where it has none."""
+    points: NDArray[Any] = scene.points
+    colors: NDArray[Any] = scene.point_colors
+    if len(points) == 0:
+        points, colors = random_points(random_count, *scene.bounds, rng)
+    return from_points(points, colors, sh_degree=0, origin=scene.origin, extent=scene.extent, near=scene.near)
+
+
+def from_points(
+    points: ArrayLike,
+    colors: ArrayLike,
+    *,
+    sh_degree: int,
+    origin: Float64 | None = None,
+    extent: float = 1.0,
+    near: float = NEAR,
+) -> Gaussians:
     """One Gaussian a point.
 
     points (N, 3), world units; colors (N, 3), float in [0, 1] or uint8; sh_degree 0 to 3: the higher coefficients
-    are there and 0; origin (3,): where the means count from, the world's own if not given. The standard deviation is
-    the root of the mean squared distance to the three nearest other points (fewer where there are fewer; a lone point
-    gets the floor). Opacity 0.1, quaternions 1 0 0 0.
+    are there and 0; origin (3,): where the means count from, the world's own if not given; extent: the scene's,
+    world units; near: the model's near plane. The standard deviation is the root of the mean squared distance to the
+    three nearest other points (fewer where there are fewer; a lone point gets the floor). Opacity 0.1, quaternions
+    1 0 0 0.
     Raises InputError for no points or points that are not finite, ValueError for wrong shapes.
     """
     xyz = np.asarray(points, np.float64)
@@ -46,11 +73,11 @@ def from_points(points: ArrayLike, colors: ArrayLike, *, sh_degree: int, origin:
         raise InputError(f"point {int(np.argmin(np.isfinite(xyz).all(axis=1)))} is not finite")
 
     origin = np.zeros(3) if origin is None else origin
-    log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), MIN_SQUARED_DISTANCE))
+    log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), squared_floor(extent)))
     quaternions = np.zeros((count, 4), np.float32)
     quaternions[:, 0] = 1
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (rgb - 0.5) / SH_C0
+    sh[:, 0] = (np.maximum(rgb, LEAST_COLOUR) - 0.5) / SH_C0
     return Gaussians(
         means=np.ascontiguousarray(xyz - origin, np.float32),
         quaternions=quaternions,
@@ -58,7 +85,14 @@ def from_points(points: ArrayLike, colors: ArrayLike, *, sh_degree: int, origin:
         opacity_logits=np.full(count, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), np.float32),
         sh=sh,
         origin=origin,
+        near=near,
     )
+
+
+def squared_floor(extent: float) -> float:
+    """Under the mean squared distance of a scene's points, world units squared."""
+    low, high = ORDINARY_EXTENTS
+    return MIN_SQUARED_DISTANCE * (extent / min(max(extent, low), high)) ** 2
 
 
 def mean_squared_distance(points: Float64) -> Float64:

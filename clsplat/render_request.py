@@ -87,6 +87,7 @@ def read_job(verb: Render) -> Job:
         warn(warning)
     model = model_file(verb.model)
     gaussians = Gaussians.load(model)
+    tasks = [task.seen_from(gaussians.near) for task in tasks]
     recorded = recorded_space(model)
     colours = Colours(options.pictures.colour, recorded)
     extension = Path(verb.output).suffix.lower()

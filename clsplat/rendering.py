@@ -361,7 +361,7 @@ class Renderer:
         contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting.
         """
         if isinstance(gaussians, Gaussians):
-            camera = camera.from_origin(gaussians.origin)
+            camera = gaussians.local(camera)
         on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
         return self._result(self._forward(on_device, camera, background), contiguous=contiguous)
 
@@ -387,7 +387,8 @@ class Renderer:
                 f"motion goes from a camera to one that is {after.projection}, expected {camera.projection}"
             )
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
-        camera, after = camera.from_origin(origin), after.from_origin(origin)
+        if isinstance(gaussians, Gaussians):
+            camera, after = gaussians.local(camera), gaussians.local(after)
         on_device = self._hold(gaussians, camera, of.floats) if isinstance(gaussians, Gaussians) else gaussians
         frame = self._forward(on_device, camera, background)
         if self._after is None:
@@ -414,7 +415,7 @@ class Renderer:
     def render_deep(self, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
         """(bins, H, W, 6): the view in slices by depth, the next of which begins at each of the bounds (bins - 1,):
         red, green, blue, associated with alpha; alpha; least and largest depth. All 0 where there is nothing."""
-        bins, camera = len(bounds) + 1, camera.from_origin(gaussians.origin)
+        bins, camera = len(bounds) + 1, gaussians.local(camera)
         on_device = self._hold(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
         frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
         found = self._rasterizer.deep(frame, upload(self.device, np.append(bounds, np.inf).astype(np.float32)))

@@ -64,7 +64,7 @@ class Bundle:
 def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
     """Write `folder`/trouble-step-STEP.npz of what happened; the path."""
     photograph = trainer.photographs.load(incident.view, trainer.sizes.factor(incident.step))
-    camera = trainer.views[incident.view].camera.resized(photograph.shape[1], photograph.shape[0])
+    camera = trainer.views[incident.view].camera.resized(photograph.shape[1], photograph.shape[0]).before(trainer.near)
     device = trainer.device
     record: dict[str, Any] = {
         "step": incident.step,

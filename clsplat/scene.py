@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat import colmap, transforms
-from clsplat.camera import Camera
+from clsplat.camera import NEAR, NEARS, Camera
 from clsplat.config import TEST_EVERY
 from clsplat.errors import InputError, examples, plain
 from clsplat.files import digest, short_digest
@@ -36,6 +36,8 @@ MAX_SIZE = 1600
 FAR = 64.0
 """Where a scene is farther from the world's origin than so many of its own sizes, its means count from its middle:
 float32 there knows places to 64 * 2^-24 of the size, a hundredth of a pixel of 2600 across the scene."""
+ROUNDING = 1e-12
+"""Cameras that are nearer than this to each other, as a part of how far they are from the origin, are in one place."""
 BLENDER_CUBE = 1.3
 """Half the side of the cube that the synthetic scenes lie in, as the authors' code has it for random points."""
 
@@ -165,10 +167,20 @@ class Scene:
     def extent(self) -> float:
         """The authors' cameras_extent, world units: 1.1 times the farthest training camera's distance from their mean.
 
-        1 if the cameras are all in one place, as it scales the learning rates.
+        If the cameras are all in one place, the median distance of the points from there, or 1 if there are none: it
+        scales the learning rates.
         """
         centres = np.stack([view.camera.position for view in self.train_views or self.views])
-        return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or 1.0
+        middle = centres.mean(axis=0)
+        spread = float(np.linalg.norm(centres - middle, axis=1).max())
+        if spread > ROUNDING * float(np.abs(centres).max()):
+            return 1.1 * spread
+        return (float(np.median(np.linalg.norm(self.points - middle, axis=1))) if len(self.points) else 0.0) or 1.0
+
+    @cached_property
+    def near(self) -> float:
+        """The near plane of a model of this scene, world units (docs/decisions/0019)."""
+        return min(NEAR, self.extent / NEARS)
 
 
 def detect(path: Path) -> Kind:

@@ -48,6 +48,11 @@ class Task:
         """The camera of the whole frame at a time in frames from the frame."""
         return self.camera if time == 0 or self.stretch is None else self.stretch.at(time)
 
+    def seen_from(self, near: float) -> Task:
+        """The frame of a model whose near plane is there."""
+        after = self.after.before(near) if self.after is not None else None
+        return replace(self, camera=self.camera.before(near), after=after)
+
     @property
     def is_video(self) -> bool:
         """Whether the file holds other frames too."""

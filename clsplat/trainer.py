@@ -21,7 +21,7 @@ from clsplat.device.layout import SlotFields
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluate import background_colour
 from clsplat.gaussians import Gaussians
-from clsplat.initialise import from_points, random_points
+from clsplat.initialise import from_scene
 from clsplat.needs import plan_step
 from clsplat.quarantine import Patience
 from clsplat.rendering import Rasterizer
@@ -134,7 +134,7 @@ class Trainer:
         self._mark: _Mark | None = None
         self._second_halves: set[tuple[object, ...]] = set()
         device, initial = self.device, self.given if self.given is not None else self._initial()
-        self.origin = initial.origin
+        self.origin, self.near = initial.origin, self.scene.near
         self._make_plan(len(initial))
         if self.plan.streamed:
             self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
@@ -142,11 +142,7 @@ class Trainer:
             self._set_parameters(upload_gaussians(device, initial))
 
     def _initial(self) -> Gaussians:
-        scene = self.scene
-        if len(scene.points) > 0:
-            return from_points(scene.points, scene.point_colors, sh_degree=0, origin=scene.origin)
-        points = random_points(self.config.random_points, *scene.bounds, self.rng)
-        return from_points(*points, sh_degree=0, origin=scene.origin)
+        return from_scene(self.scene, self.config.random_points, self.rng)
 
     def _make_plan(self, count: int) -> None:
         """How so many Gaussians go through the device's memory, with all of their SH coefficients in the end."""
@@ -222,7 +218,7 @@ class Trainer:
         self._raise_sh_degree()
         view, factor = self._next_view(), self.sizes.factor(self.step)
         image = self.photographs.load(view, factor)
-        camera = self.views[view].camera.resized(image.shape[1], image.shape[0]).from_origin(self.origin)
+        camera = self.local(self.views[view].camera.resized(image.shape[1], image.shape[0]))
         self.background.set(colour := self._background_colour())
 
         planes = target(device, work, image, self.background)
@@ -443,12 +439,16 @@ class Trainer:
         self._set_parameters(*(self._placed(model) for model in (parameters, first, second)))
         self.statistics.load(statistics)
 
+    def local(self, camera: Camera) -> Camera:
+        """A camera in the world as one for the model in training: see `Gaussians.local`."""
+        return camera.from_origin(self.origin).before(self.near)
+
     def gaussians(self) -> Gaussians:
         """The model so far, on the host, with room for the SH degree it is trained to."""
         model = download_gaussians(self.parameters)
         full = np.zeros((len(model), (self.config.sh_degree + 1) ** 2, 3), np.float32)
         full[:, : model.sh.shape[1]] = model.sh
-        model.sh, model.origin = full, self.origin
+        model.sh, model.origin, model.near = full, self.origin, self.near
         return model
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,8 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsplat import run_scene
+from clsplat import doubts, run_scene
+from clsplat.camera import Camera
 from clsplat.colour import photos_space
 from clsplat.config import TrainConfig
 from clsplat.device.child import TrialInterrupted
@@ -28,6 +29,7 @@ from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.locks import locked
 from clsplat.memory import Plan, parse_bytes
+from clsplat.point_colours import is_colourless, photographed
 from clsplat.process import Interrupted, endings
 from clsplat.quarantine import RETURNS, WINDOW
 from clsplat.rendering import Renderer
@@ -207,7 +209,7 @@ class _Session:
         trainer, background = self.trainer, background_colour(self.trainer.config.background)
 
         def render(view: View) -> NDArray[Any]:
-            return self.renderer.render(trainer.parameters, view.camera.from_origin(trainer.origin), background).image
+            return self.renderer.render(trainer.parameters, trainer.local(view.camera), background).image
 
         return evaluate(
             render,
@@ -246,6 +248,18 @@ class _Session:
             record["contributions"] = found
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
+    def doubt(self) -> None:
+        """A warning where the pictures are none."""
+        trainer, renderer = self.trainer, self.renderer
+        background = background_colour(trainer.config.background)
+
+        def draw(camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+            drawn = renderer.render(trainer.parameters, trainer.local(camera), background)
+            return drawn.image, drawn.alpha
+
+        if text := doubts.of_pictures(draw, trainer.views):
+            warnings.warn(f"step {trainer.step}: {text}")
+
     def times_stages(self, step: int) -> bool:
         """Whether it is measured what each stage of the step takes: only where that is written down."""
         config = self.trainer.config
@@ -268,6 +282,8 @@ class _Session:
         if self.go_back():
             return
         step = trainer.step
+        if step == doubts.LOOK_AT and step < config.iterations:
+            self.doubt()
         evaluating = step in config.eval_at and bool(trainer.scene.test_views)
         if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
             report = self.report(result)
@@ -317,6 +333,7 @@ def train(
     """
     config = config or TrainConfig()
     config.check()
+    scene.require_training_views()
     opened = device if isinstance(device, Device) else open_device(device, parse_bytes(max_device_mem))
     if run is None:
         return _train(scene, config, opened, None, on_step=on_step, on_plan=on_plan, between=between)
@@ -339,6 +356,12 @@ def _train(
     between: Between | None,
 ) -> Gaussians:
     """As `train`, alone in the run's folder."""
+    if not (resume and run is not None and run.checkpoints()):
+        for text in doubts.of_scene(scene, config.background):
+            warnings.warn(text)
+        if is_colourless(scene):
+            warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
+            scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
     session = _Session(Trainer(scene, config, opened), run, on_plan)
     trainer = session.trainer
     if resume:
@@ -357,6 +380,7 @@ def _train(
         session.tell_the_rest()
         if trainer.step < config.iterations:
             raise Interrupted(interrupted.number)
+        session.doubt()
     model = trainer.gaussians()
     if run is not None:
         run.save_model(model, photos_space(view.path for view in scene.views))

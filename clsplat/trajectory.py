@@ -62,7 +62,7 @@ def focus_point(cameras: Sequence[Camera]) -> Float64:
         if np.mean(np.einsum("nj,nj->n", forward, point - positions) > 0) > 0.5:
             return point
     spread = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
-    return np.asarray(positions.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(spread, 1.0))
+    return np.asarray(positions.mean(axis=0) + ahead / np.linalg.norm(ahead) * (spread or 1.0))
 
 
 def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -78,7 +78,8 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     offsets = np.stack([camera.position for camera in cameras]) - focus
     heights = offsets @ up
     level = offsets - heights[:, None] * up
-    first = level[0] if np.linalg.norm(level[0]) > 1e-9 else np.cross(up, cameras[0].rotation[0])
+    aside = np.linalg.norm(level[0]) > 1e-9 * np.linalg.norm(offsets[0])
+    first = level[0] if aside else np.cross(up, cameras[0].rotation[0])
     east = first / np.linalg.norm(first)
     north = np.cross(up, east)
     azimuths = np.arctan2(level @ north, level @ east)

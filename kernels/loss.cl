@@ -3,6 +3,10 @@
 // needs no margin, into planes with PAD zero columns on either side, then horizontal without bounds checks. A second
 // pair of passes convolves the three partial derivatives, the adjoint of the first.
 //
+// E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So whatever a window is added up of counts from the pixel in
+// its middle (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is one of
+// differences between a pixel and its neighbours.
+//
 // `first` is the channel of the image that is the first of a launch's: all three go at once, or one after the other where
 // memory is short, `channels` of them.
 //
@@ -23,12 +27,6 @@ static inline void clear_margins(__global float *row, int stride) {
   for (int i = 0; i < PAD; ++i) row[i - PAD] = row[stride + i] = 0.0f;
 }
 
-static inline floatL horizontal(__global const float *row, int x) {
-  floatL sum = (floatL)(0.0f);
-  for (int tap = 0; tap < TAPS; ++tap) sum = fmaL((floatL)(window[tap]), LOADL(row + x + tap - REACH), sum);
-  return sum;
-}
-
 #define OWN_ROWS                                                                                                      \
   const int y = get_global_id(1), channel = get_global_id(2), channels = get_global_size(2);                          \
   const int step = get_global_size(0) * LANES, x_first = get_global_id(0) * LANES;                                    \
@@ -37,19 +35,23 @@ static inline floatL horizontal(__global const float *row, int x) {
   const size_t padded_plane = (size_t)padded * height;                                                                \
   const size_t padded_row = padded_plane * channel + (size_t)padded * y + PAD;
 
-// image, target (3, rows, stride) -> moments (5, channels, height, stride + 2 PAD): vertical windows of x, y, xx, yy,
-// xy.
+// image, target (3, rows, stride) -> moments (5, channels, height, stride + 2 PAD), of vertical windows: means of x and y,
+// variances of x and y, covariance.
 __kernel void loss_vertical(const int first, const int height, const int stride, const int plane,
                             __global const float *image, __global const float *target, __global float *moments) {
   OWN_ROWS
   if (get_global_id(0) == 0)
     for (int m = 0; m < 5; ++m) clear_margins(moments + channels * padded_plane * m + padded_row, stride);
   const int tap0 = max(0, REACH - y), tap1 = min(TAPS, height + REACH - y);
+  float beyond = 0.0f; // what of the window is outside the image, where all is 0
+  for (int tap = 0; tap < TAPS; ++tap) beyond += tap < tap0 || tap >= tap1 ? window[tap] : 0.0f;
   for (int x = x_first; x < stride; x += step) {
-    floatL a = (floatL)(0.0f), b = a, aa = a, bb = a, ab = a;
+    const floatL p0 = LOADL(image + row + x), q0 = LOADL(target + row + x);
+    floatL a = -beyond * p0, b = -beyond * q0;
+    floatL aa = -(a * p0), bb = -(b * q0), ab = -(a * q0);
     for (int tap = tap0; tap < tap1; ++tap) {
       const size_t at = row + x + (long)(tap - REACH) * stride;
-      const floatL p = LOADL(image + at), q = LOADL(target + at);
+      const floatL p = LOADL(image + at) - p0, q = LOADL(target + at) - q0;
       const floatL wp = window[tap] * p, wq = window[tap] * q;
       a += wp;
       b += wq;
@@ -58,36 +60,48 @@ __kernel void loss_vertical(const int first, const int height, const int stride,
       ab = fmaL(wp, q, ab);
     }
     __global float *out = moments + padded_row + x;
-    STOREL(a, out);
-    STOREL(b, out + channels * padded_plane);
-    STOREL(aa, out + 2 * channels * padded_plane);
-    STOREL(bb, out + 3 * channels * padded_plane);
-    STOREL(ab, out + 4 * channels * padded_plane);
+    STOREL(p0 + a, out);
+    STOREL(q0 + b, out + channels * padded_plane);
+    STOREL(fmaL(-a, a, aa), out + 2 * channels * padded_plane);
+    STOREL(fmaL(-b, b, bb), out + 3 * channels * padded_plane);
+    STOREL(fmaL(-a, b, ab), out + 4 * channels * padded_plane);
   }
 }
 
-// moments -> partials (3, channels, height, stride): dSSIM by the windowed x, xx and xy, 0 right of the image;
-// sums (3, 3, height, strips)[0]: SSIM.
+// image, target, moments -> partials (3, channels, height, stride): dSSIM by the mean of x as far as it counts from the
+// pixel in the middle, by the variance and by the covariance, 0 right of the image; sums (3, 3, height, strips)[0]: SSIM.
 __kernel void loss_ssim(const int first, const int width, const int height, const int stride, const int plane,
-                        __global const float *moments, __global float *partials, __global float *sums) {
+                        __global const float *image, __global const float *target, __global const float *moments,
+                        __global float *partials, __global float *sums) {
   OWN_ROWS
   const size_t out_plane = (size_t)stride * height;
   floatL total = (floatL)(0.0f);
   for (int x = x_first; x < stride; x += step) {
     __global const float *in = moments + padded_row;
-    const floatL mu1 = horizontal(in, x);
-    const floatL mu2 = horizontal(in + channels * padded_plane, x);
-    const floatL var1 = horizontal(in + 2 * channels * padded_plane, x) - mu1 * mu1;
-    const floatL var2 = horizontal(in + 3 * channels * padded_plane, x) - mu2 * mu2;
-    const floatL covariance = horizontal(in + 4 * channels * padded_plane, x) - mu1 * mu2;
+    const floatL p = LOADL(image + row + x), q = LOADL(target + row + x);
+    floatL off1 = (floatL)(0.0f), off2 = off1, var1 = off1, var2 = off1, covariance = off1; // off: means from p and q
+    for (int tap = 0; tap < TAPS; ++tap) {
+      __global const float *at = in + x + tap - REACH;
+      const floatL e1 = LOADL(at) - p, e2 = LOADL(at + channels * padded_plane) - q;
+      const floatL w1 = window[tap] * e1, w2 = window[tap] * e2, w = (floatL)(window[tap]);
+      off1 += w1;
+      off2 += w2;
+      var1 = fmaL(w, LOADL(at + 2 * channels * padded_plane), fmaL(w1, e1, var1));
+      var2 = fmaL(w, LOADL(at + 3 * channels * padded_plane), fmaL(w2, e2, var2));
+      covariance = fmaL(w, LOADL(at + 4 * channels * padded_plane), fmaL(w1, e2, covariance));
+    }
+    var1 = fmaL(-off1, off1, var1);
+    var2 = fmaL(-off2, off2, var2);
+    covariance = fmaL(-off1, off2, covariance);
+    const floatL mu1 = p + off1, mu2 = q + off2, apart = mu2 - mu1;
     const floatL a = 2.0f * (mu1 * mu2) + C1, b = 2.0f * covariance + C2;
     const floatL c = mu1 * mu1 + mu2 * mu2 + C1, d = var1 + var2 + C2;
     const floatL inverse = 1.0f / (c * d);
     const floatL ssim = a * b * inverse;
     const floatL by_covariance = 2.0f * a * inverse;
     const floatL by_variance = -ssim / d;
-    const floatL by_mean =
-        2.0f * (mu2 * b * inverse - mu1 * ssim / c) - 2.0f * (mu1 * by_variance) - mu2 * by_covariance;
+    const floatL by_mu = 2.0f * b * inverse * fmaL(mu1 / c, apart * apart, apart);
+    const floatL by_mean = by_mu - 2.0f * (off1 * by_variance) - off2 * by_covariance;
     const floatL column = (floatL)(x) + LANE_INDEX;
     const intL inside = column < (floatL)(width);
     const floatL zero = (floatL)(0.0f);
@@ -100,22 +114,35 @@ __kernel void loss_ssim(const int first, const int width, const int height, cons
   sums[((size_t)(first + channel) * height + y) * get_global_size(0) + get_global_id(0)] = sumL(total);
 }
 
-// partials -> moments (3, channels, height, stride + 2 PAD): their vertical windows.
+// image, target, partials -> moments (5, channels, height, stride + 2 PAD): the partials' vertical windows, the first with
+// what the pixels differ by from the one in the middle; image and target, with margins.
 __kernel void loss_vertical_grad(const int first, const int height, const int stride, const int plane,
+                                 __global const float *image, __global const float *target,
                                  __global const float *partials, __global float *moments) {
   OWN_ROWS
   const size_t in_plane = (size_t)stride * height;
   const int tap0 = max(0, REACH - y), tap1 = min(TAPS, height + REACH - y);
-  for (int m = 0; m < 3; ++m) {
-    __global const float *in = partials + in_plane * (channels * m + channel);
-    __global float *out = moments + channels * padded_plane * m + padded_row;
-    if (get_global_id(0) == 0) clear_margins(out, stride);
-    for (int x = x_first; x < stride; x += step) {
-      floatL sum = (floatL)(0.0f);
-      for (int tap = tap0; tap < tap1; ++tap)
-        sum = fmaL((floatL)(window[tap]), LOADL(in + x + (size_t)stride * (y + tap - REACH)), sum);
-      STOREL(sum, out + x);
+  if (get_global_id(0) == 0)
+    for (int m = 0; m < 5; ++m) clear_margins(moments + channels * padded_plane * m + padded_row, stride);
+  for (int x = x_first; x < stride; x += step) {
+    const floatL p0 = LOADL(image + row + x), q0 = LOADL(target + row + x);
+    floatL by_mean = (floatL)(0.0f), by_variance = by_mean, by_covariance = by_mean;
+    for (int tap = tap0; tap < tap1; ++tap) {
+      __global const float *in = partials + in_plane * channel + x + (size_t)stride * (y + tap - REACH);
+      const size_t at = row + x + (long)(tap - REACH) * stride;
+      const floatL p = LOADL(image + at) - p0, q = LOADL(target + at) - q0;
+      const floatL w = (floatL)(window[tap]);
+      const floatL v = w * LOADL(in + channels * in_plane), c = w * LOADL(in + 2 * channels * in_plane);
+      by_mean = fmaL(w, LOADL(in), by_mean) - fmaL(2.0f * p, v, q * c);
+      by_variance += v;
+      by_covariance += c;
     }
+    __global float *out = moments + padded_row + x;
+    STOREL(by_mean, out);
+    STOREL(by_variance, out + channels * padded_plane);
+    STOREL(by_covariance, out + 2 * channels * padded_plane);
+    STOREL(p0, out + 3 * channels * padded_plane);
+    STOREL(q0, out + 4 * channels * padded_plane);
   }
 }
 
@@ -129,13 +156,17 @@ __kernel void loss_grad(const int first, const int width, const int height, cons
   for (int x = x_first; x < stride; x += step) {
     __global const float *in = moments + padded_row;
     const floatL p = LOADL(image + row + x), q = LOADL(target + row + x);
-    const floatL by_mean = horizontal(in, x);
-    const floatL by_variance = horizontal(in + channels * padded_plane, x);
-    const floatL by_covariance = horizontal(in + 2 * channels * padded_plane, x);
+    floatL ssim = (floatL)(0.0f);
+    for (int tap = 0; tap < TAPS; ++tap) {
+      __global const float *at = in + x + tap - REACH;
+      const floatL by_p = 2.0f * (p - LOADL(at + 3 * channels * padded_plane));
+      const floatL by_q = q - LOADL(at + 4 * channels * padded_plane);
+      const floatL here = fmaL(by_q, LOADL(at + 2 * channels * padded_plane), LOADL(at));
+      ssim = fmaL((floatL)(window[tap]), fmaL(by_p, LOADL(at + channels * padded_plane), here), ssim);
+    }
     const floatL difference = p - q;
     const floatL sign = difference > 0.0f ? (floatL)(l1_scale)
                                           : (difference < 0.0f ? (floatL)(-l1_scale) : (floatL)(0.0f));
-    const floatL ssim = fmaL(2.0f * p, by_variance, fmaL(q, by_covariance, by_mean));
     const floatL column = (floatL)(x) + LANE_INDEX;
     const floatL g = fmaL((floatL)(-ssim_scale), ssim, sign);
     STOREL(column < (floatL)(width) ? g : (floatL)(0.0f), gradient + row + x);

@@ -28,13 +28,13 @@ BOUNDS = {
     "log2": 2.4e-7,
     "sigmoid": 3.6e-7,
     "exp2": 2.1e-7,
-    "loss": 1e-5,
-    "loss gradient": 4e-4,
+    "loss": 1e-6,
+    "loss gradient": 1e-5,
     "adam": 1e-4,
 }
 """exp, sigmoid: 2 and 3 ulp; exp2: 0.8e-7 of its polynomial and rounding. log2: absolute under 1. loss: relative to at
-least 1, a sum of partial sums. loss gradient: in norm; a variance is a difference of windowed moments, of values up to
-1.5 three roundings of 1.3e-7 each, which C2 = 9e-4 is added to. adam: of a step, as beta2 in float32 is 1e-8 off in
+least 1, a sum of partial sums. loss gradient: in norm; differences of pixels are exact to 1e-7 of the brightness, up to
+1.5, and of the ripple of flat pictures that is more. adam: of a step, as beta2 in float32 is 1e-8 off in
 1 - beta2 = 1e-3, 1e-5 of a step, and a few roundings."""
 
 

@@ -19,7 +19,7 @@ from types import FrameType, TracebackType
 from typing import IO, Any
 
 from clsplat.errors import DriverError, InputError
-from clsplat.process import apart, endings
+from clsplat.process import Interrupted, apart, endings
 
 MARK = "clsplat-child "
 """Beginning of a line that is meant for the parent; drivers print lines of their own."""
@@ -33,7 +33,7 @@ LONGEST_WAIT = 0.5
 """Seconds, so that a signal is seen to on systems where it does not end a wait."""
 
 
-class TrialInterrupted(KeyboardInterrupt):
+class TrialInterrupted(Interrupted):
     """This process was asked to end while it waited for a driver's trial."""
 
 
@@ -83,7 +83,7 @@ def ending_at_once() -> Iterator[None]:
     def interrupt(number: int, frame: FrameType | None) -> None:
         with suppress(KeyboardInterrupt):
             before[number](number, frame)
-        raise TrialInterrupted
+        raise TrialInterrupted(number)
 
     handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, *endings())}
     before = {int(each): handler for each, handler in handlers.items() if callable(handler)}
@@ -171,7 +171,7 @@ class Child:
                 self._process.kill()
                 raise TimeoutError(f"did not come back within {seconds:g} s") from None
         if self._abandoned:
-            raise TrialInterrupted
+            raise TrialInterrupted(signal.SIGINT)
         if line is None:
             return None
         message: dict[str, Any] = json.loads(line)

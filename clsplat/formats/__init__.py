@@ -28,11 +28,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
+from clsplat.camera import NEAR, NEARS
 from clsplat.errors import InputError, plain
 from clsplat.files import is_file, open_input
 from clsplat.gaussians import Gaussians
 
 HEAD_BYTES = 1 << 16
+SAMPLED = 10_000
+"""Means that tell how large a model is."""
+SMALL = 10.0
+"""Near planes in the size of a model that the usual one does not suit."""
 
 
 @functools.cache
@@ -119,7 +126,16 @@ def load(path: str | os.PathLike[str]) -> Gaussians:
     module = format_of(path)
     tell_kind(path, module)
     gaussians: Gaussians = module.read(path)
+    if gaussians.near == NEAR:
+        gaussians.near = _near_of(gaussians)
     return gaussians
+
+
+def _near_of(gaussians: Gaussians) -> float:
+    """The near plane of a model that comes without one: the usual, unless the model would be lost behind it."""
+    some = gaussians.means[:: max(len(gaussians) // SAMPLED, 1)].astype(np.float64)
+    size = float(np.median(np.linalg.norm(some - np.median(some, axis=0), axis=1)))
+    return size / NEARS if 0 < size < SMALL * NEAR else NEAR
 
 
 def save(path: str | os.PathLike[str], gaussians: Gaussians, **options: Any) -> None:

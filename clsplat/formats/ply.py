@@ -24,6 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.camera import NEAR
 from clsplat.errors import InputError, examples, plain
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
@@ -57,6 +58,7 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 ORIGIN = ["comment", "clsplat", "origin"]
+NEAR_PLANE = ["comment", "clsplat", "near"]
 LOCAL = "clsplat_local"
 """The element that has the means as they count from the origin."""
 REQUIRED = (*POSITION, *DC, "opacity", *SCALE, *ROTATION)
@@ -78,12 +80,13 @@ class Element:
 @dataclass
 class Header:
     """format: "ascii" or a key of BYTE_ORDERS; size: the header's length in bytes, `end_header` included; origin: of
-    the element LOCAL."""
+    the element LOCAL; near: the near plane, where it is not the usual one."""
 
     format: str
     elements: list[Element]
     size: int
     origin: NDArray[np.float64] | None = None
+    near: float = NEAR
     comments: list[str] = field(default_factory=list)
 
     def row_type(self, element: Element) -> np.dtype[Any]:
@@ -114,6 +117,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         gaussians = _assemble(read_vertices(file, header, path, "Gaussian"), vertex.count, rest, path)
         if header.origin is not None:
             _count_from(header.origin, gaussians, _local_means(file, header, vertex, skipped, path), path)
+        gaussians.near = header.near
         return gaussians
 
 
@@ -179,6 +183,7 @@ def write(
     far, count = bool(gaussians.origin.any()), len(gaussians)
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     lines += [" ".join([*ORIGIN, *(repr(float(value)) for value in gaussians.origin)])] if far else []
+    lines += [" ".join([*NEAR_PLANE, repr(float(gaussians.near))])] if gaussians.near != NEAR else []
     lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
     lines += [f"element {LOCAL} {count}", *(f"property float {name}" for name in POSITION)] if far else []
     lines += ["end_header", ""]
@@ -216,7 +221,7 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     form = ""
     elements: list[Element] = []
     comments: list[str] = []
-    origin = None
+    origin, near = None, NEAR
     for _ in range(MAX_HEADER_LINES):
         line = file.readline(4096)
         if not line.endswith(b"\n"):
@@ -224,13 +229,14 @@ def read_header(file: BinaryIO, path: Path) -> Header:
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
             origin = _origin(words) if words[:3] == ORIGIN else origin
+            near = _near(words) if words[:3] == NEAR_PLANE else near
             comments += [" ".join(words[1:])] if words else []
             continue
         if words == ["end_header"]:
             if form not in ("ascii", *BYTE_ORDERS):
                 expected = "ascii, binary_little_endian or binary_big_endian"
                 raise InputError(f"{path}: PLY header has the format {form or 'missing'!r}, expected {expected}")
-            return Header(form, elements, file.tell(), origin, comments)
+            return Header(form, elements, file.tell(), origin, near, comments)
         try:
             match words:
                 case ["format", name, _]:
@@ -257,6 +263,15 @@ def _origin(words: list[str]) -> NDArray[np.float64] | None:
     except ValueError:
         return None
     return origin if origin.shape == (3,) and np.isfinite(origin).all() else None
+
+
+def _near(words: list[str]) -> float:
+    """The usual one where the comment is not one of ours after all."""
+    try:
+        near = float(words[3])
+    except (ValueError, IndexError):
+        return NEAR
+    return near if len(words) == 4 and 0 < near < np.inf else NEAR
 
 
 def _local_means(

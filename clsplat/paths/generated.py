@@ -39,7 +39,8 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     offsets = np.stack([camera.position for camera in cameras]) - focus
     heights = offsets @ up
     level = offsets - heights[:, None] * up
-    first = level[0] if np.linalg.norm(level[0]) > 1e-9 else np.cross(up, cameras[0].rotation[0])
+    aside = np.linalg.norm(level[0]) > 1e-9 * np.linalg.norm(offsets[0])
+    first = level[0] if aside else np.cross(up, cameras[0].rotation[0])
     east = first / np.linalg.norm(first)
     north = np.cross(up, east)
     azimuths = np.arctan2(level @ north, level @ east)
@@ -85,7 +86,7 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     rotations = Rotation.from_matrix(np.stack([camera.rotation.T for camera in smooth]))
     moves = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     turns = (rotations[:-1].inv() * rotations[1:]).magnitude() if len(smooth) > 1 else np.zeros(0)
-    steps = np.hypot(_in_medians(moves), _in_medians(turns))
+    steps = np.hypot(_in_medians(moves, 1e-12 * np.abs(positions).max()), _in_medians(turns, 1e-9))
     keys = [Key(0.0, smooth[0])]
     for camera, step in zip(smooth[1:], steps, strict=True):
         if step > 1e-6:  # a camera that stands where the one before it does
@@ -93,9 +94,9 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     return interpolate(keys, list(np.linspace(0.0, keys[-1].frame, frames)))
 
 
-def _in_medians(lengths: Float64) -> Float64:
-    """lengths (n,) over the median of those that are something."""
-    there = lengths[lengths > 1e-9]
+def _in_medians(lengths: Float64, rounding: float) -> Float64:
+    """lengths (n,) over the median of those that are more than rounding."""
+    there = lengths[lengths > rounding]
     return lengths / np.median(there) if len(there) else np.zeros_like(lengths)
 
 

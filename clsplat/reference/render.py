@@ -55,7 +55,7 @@ def forward(
     margins: bool = False,
 ) -> Forward:
     """Project, sort, blend; sh_degree None uses all bands there are."""
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     projected = project(**parameters(gaussians), camera=camera, sh_degree=degree)
     order = depth_order(projected.depths, projected.visible)
     return Forward(projected, order, blend(projected, order, camera.width, camera.height, background, margins))
@@ -80,7 +80,7 @@ def render_grad(
     sh_degree: int | None = None,
 ) -> Gradients:
     """Gradients of a loss with dL/dimage = d_image (H, W, 3)."""
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     arrays = parameters(gaussians)
     projected = project(**arrays, camera=camera, sh_degree=degree)
     order = depth_order(projected.depths, projected.visible)

@@ -103,7 +103,7 @@ def largest_contributions(trainer: Trainer, seconds: float = SECONDS) -> tuple[N
     largest: NDArray[np.float32] = np.zeros(trainer.parameters.count, np.float32)
     start = time.perf_counter()
     for index in _spread(len(views)):
-        camera = views[index].camera.from_origin(trainer.origin)
+        camera = trainer.local(views[index].camera)
         frame = rasterizer.forward(trainer.parameters, camera, trainer.background)
         slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=fields)  # weights are of any gradient
         sums = slots.values

@@ -64,8 +64,9 @@ def loss(
     kernels = device.kernels("loss")
     for first in range(0, 3, channels):
         launch_grid(device, kernels.loss_vertical, grid, first, height, stride, plane, image, target, moments)
-        launch_grid(device, kernels.loss_ssim, grid, first, width, height, stride, plane, moments, partials, sums)
-        launch_grid(device, kernels.loss_vertical_grad, grid, first, height, stride, plane, partials, moments)
+        pictures, rows_of = (image, target), (height, stride, plane)
+        launch_grid(device, kernels.loss_ssim, grid, first, width, *rows_of, *pictures, moments, partials, sums)
+        launch_grid(device, kernels.loss_vertical_grad, grid, first, *rows_of, *pictures, partials, moments)
         launch_grid(
             device,
             kernels.loss_grad,

@@ -105,7 +105,7 @@ def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
     if not seen.any():
         return np.zeros((*depth.shape, 3), np.uint8), "nothing is seen"
     near, far = (float(value) for value in np.quantile(depth[seen], [0.02, 0.98]))
-    shade = (far - depth.astype(np.float64)) / max(far - near, 1e-9)
+    shade = (far - depth.astype(np.float64)) / ((far - near) or 1.0)
     return _shaded(shade, alpha), f"depth {near:.3g} (bright) to {far:.3g}"
 
 

@@ -119,7 +119,7 @@ class LiveModel:
         ):
             raise InputError("this training has just the memory that it needs: only colour and alpha can be shown")
         if key is None:
-            local = camera.from_origin(trainer.origin)
+            local = trainer.local(camera)
             return render_picture(self._renderer, trainer.parameters, local, look, self.background)
         if self._edited is None or self._edited[0] != (trainer.step, key):
             self._edited = ((trainer.step, key), edited(trainer.gaussians(), key))

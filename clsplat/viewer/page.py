@@ -87,7 +87,7 @@ class ViserPage:
         size = gui.add_slider("Size", *SIZES, 0.05, 1.0)
         opacity = gui.add_slider("Opacity", *OPACITIES, 0.05, 1.0)
         low, high = self.world.box
-        reach = np.maximum(high - low, 1e-6)
+        reach = np.maximum(high - low, 1e-6 * (float((high - low).max()) or 1.0))
         low, high = low - 0.5 * reach, high + 0.5 * reach
         with gui.add_folder("Crop", expand_by_default=False):
             crop = gui.add_checkbox("Crop", initial_value=False)

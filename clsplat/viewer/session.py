@@ -124,8 +124,9 @@ def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
         first, focus, up = cameras[0], focus_point(cameras), up_axis(cameras)
         ahead = first.rotation[2]
         distance = float((focus - first.position) @ ahead)
-        if not distance > 1e-6:
-            distance = float(np.linalg.norm(focus - first.position)) or 1.0
+        away = float(np.linalg.norm(focus - first.position))
+        if not distance > 1e-6 * away:
+            distance = away or 1.0
         fov = 2 * math.atan2(0.5 * first.height, first.fy) if first.projection == "perspective" else FIELD
         return Start(first.position, first.position + distance * ahead, up, fov)
     low, high = extent_of(points)
