@@ -33,7 +33,7 @@ def endings() -> tuple[signal.Signals, ...]:
 class Interrupted(KeyboardInterrupt):
     """As a Ctrl-C, by the signal of this number."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__()
         self.number = number
 
