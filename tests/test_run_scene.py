@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from calls import Capture
 from calls import train as command_train
+from quick import quick
 from tiny import short, write_scene
 
 from clsplat import run_scene
@@ -175,34 +176,26 @@ def test_a_scene_elsewhere_cannot_be_accepted(scene: Path, tmp_path: Path) -> No
         run_scene.check(run, far, tmp_path, 0, accept=True)
 
 
-DISPLAY = [
-    ["--json"],
-    ["--view"],
-    ["--port", "9"],
-    ["--host", "::1"],
-    ["--paths", "p"],
-    ["--device", "cpu"],
-    ["--max-device-mem", "1GiB"],
-    ["--accept-changes"],
-    ["--no-report"],
-]
+DISPLAY = (
+    *("--json", "--view", "--port 9", "--host ::1", "--paths p", "--device cpu", "--max-device-mem 1GiB"),
+    *("--accept-changes", "--no-report"),
+)
 
 
-@pytest.mark.parametrize("given", DISPLAY, ids=" ".join)
-def test_what_is_given_beside_resume(given: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("given", quick(DISPLAY, "--json", "--view", "--no-report"))
+def test_what_is_given_beside_resume(given: str, tmp_path: Path) -> None:
     """Each is what it would be without --resume, and the run's settings hold."""
     Run.create(tmp_path, replace(FEW, report=True))
-    for order in (["--resume", *given], [*given, "--resume"]):
-        verb = parse(["train", "-o", str(tmp_path), *order])
-        fresh = parse(["train", "-o", str(tmp_path), *given])
-        assert isinstance(verb, Train)
-        assert isinstance(fresh, Train)
-        assert replace(verb, resume=False, config=fresh.config) == fresh
-        assert verb.config == replace(FEW, report="--no-report" not in given)
+    verb = parse(["train", "-o", str(tmp_path), "--resume", *given.split()])
+    fresh = parse(["train", "-o", str(tmp_path), *given.split()])
+    assert isinstance(verb, Train)
+    assert isinstance(fresh, Train)
+    assert replace(verb, resume=False, config=fresh.config) == fresh
+    assert verb.config == replace(FEW, report="--no-report" not in given)
 
 
 def test_all_display_options_beside_resume(tmp_path: Path) -> None:
     Run.create(tmp_path, FEW)
-    verb = parse(["train", "-o", str(tmp_path), "--resume", *[word for given in DISPLAY for word in given]])
+    verb = parse(["train", "-o", str(tmp_path), "--resume", *" ".join(DISPLAY).split()])
     assert isinstance(verb, Train)
     assert (verb.json, verb.view, verb.port, verb.accept_changes, verb.resume) == (True, True, 9, True, True)

@@ -30,6 +30,7 @@ from stress_kills import write_scene
 LONG, SHORT = 100_000, 20
 DEADLINE = 300.0
 """Seconds that a process may take to end."""
+MARKER = ".at-work"
 FULL = 48 << 10
 """Bytes that a full disk still takes."""
 TRAINING = (
@@ -41,36 +42,46 @@ TRAINING = (
 @dataclass(frozen=True)
 class Verb:
     """A call. words: of the command line, with {scene}, {photos}, {run}, {other}, {model} and {out}, the folder that it
-    may write to; writes: whether it writes files; ready: what is there, below {out}, when it is at work; where that is
-    None half of its time is waited for."""
+    may write to; writes: whether it writes files; ready: when it is at work: something is there below {out} (/NAME), a
+    module is imported, or an audit event of Python (!NAME) has come."""
 
     name: str
     words: str
+    ready: str
     writes: bool = True
-    ready: str | None = None
 
 
 TRAIN = " ".join(["train {scene} -o {out}/run --iterations", str(LONG), *(word or "''" for word in TRAINING)])
 VERBS = (
-    Verb("devices", "devices", writes=False),
-    Verb("demo", "demo -o {out}/demo --iterations 100", ready="demo/photos"),
-    Verb("sfm", "sfm {photos} -o {out}/scene", ready=".scene-sfm-*/database.db"),
-    Verb("train", TRAIN, ready="run/metrics.jsonl"),
-    Verb("eval", "eval {out}/run"),
-    Verb(
-        "render",
-        "render {model} --cameras {scene} --path turntable --count 200 -o {out}/a.####.png",
-        ready="a.0002.png",
-    ),
-    Verb("view", "view {model} --port 0", writes=False),
-    Verb("report", "report {out}/run"),
-    Verb("compare", "compare {run} {other} -o {out}/a.html"),
-    Verb("convert", "convert {model} {out}/a.sog"),
-    Verb("info", "info {model}", writes=False),
-    Verb("bench", "bench --gaussians 5000 --size 320x240 --repeat 3", writes=False),
-    Verb("tune", "tune", writes=False),
-    Verb("selftest", "selftest", writes=False),
+    Verb("devices", "devices", "pyopencl", writes=False),
+    Verb("demo", "demo -o {out}/demo --iterations 100", "/demo/photos"),
+    Verb("sfm", "sfm {photos} -o {out}/scene", "/.scene-sfm-*/database.db"),
+    Verb("train", TRAIN, "/run/metrics.jsonl"),
+    Verb("eval", "eval {out}/run", "clsplat.progress"),
+    Verb("render", "render {model} --cameras {scene} --path turntable --count 200 -o {out}/a.####.png", "/a.0002.png"),
+    Verb("view", "view {model} --port 0", "!socket.bind", writes=False),
+    Verb("report", "report {out}/run", "clsplat.report.page"),
+    Verb("compare", "compare {run} {other} -o {out}/a.html", "clsplat.report.compare"),
+    Verb("convert", "convert {model} {out}/a.sog", "clsplat.fidelity"),
+    Verb("info", "info {model}", "clsplat.model_info", writes=False),
+    Verb("bench", "bench --gaussians 5000 --size 320x240 --repeat 3", "clsplat.tradeoff", writes=False),
+    Verb("tune", "tune", "clsplat.tune", writes=False),
+    Verb("selftest", "selftest", "!subprocess.Popen", writes=False),
 )
+WATCHED = """
+import os, sys
+marker, wanted = sys.argv[1:3]
+sys.argv[:3] = ["clsplat"]
+
+def hook(event, arguments):
+    if event == wanted[1:] if wanted[0] == "!" else (event, *arguments[:1]) == ("import", wanted):
+        os.close(os.open(marker, os.O_CREAT | os.O_WRONLY))
+
+sys.addaudithook(hook)
+from clsplat.__main__ import main
+sys.exit(main())
+"""
+"""The command line, which says in a file that it is at work."""
 SIGNALS = {"SIGINT": 1, "SIGINT twice": 2, "SIGTERM": 1, "SIGHUP": 1}
 STREAMS = (">&-", "2>&-", "| head -c 0", "2>&1 | head -c 0")
 EVENTS = (*SIGNALS, "full disk", *STREAMS, "second process")
@@ -108,7 +119,7 @@ class Bench:
     """A folder with what the verbs need."""
 
     def __init__(self, folder: Path, verbs: Sequence[Verb]) -> None:
-        self.folder, self.seconds = folder, dict[str, float]()
+        self.folder = folder
         self.names = {name: str(folder / name) for name in ("scene", "photos", "run", "other")}
         self.names["model"] = str(folder / "run" / "model.ply")
         write_scene(folder / "scene")
@@ -132,22 +143,12 @@ class Bench:
         words = verb.words.format(out=out, **self.names).split(" ")
         return ["" if word == "''" else word for word in words]
 
-    def time_of(self, verb: Verb) -> float:
-        """Seconds of a verb that nobody disturbs, measured once."""
-        if verb.name == "view":
-            return 12.0
-        for _ in range(2 if verb.name not in self.seconds else 0):  # the first may build kernels
-            with fresh(self.folder) as out:
-                words = self.words(verb, out)
-                start = time.monotonic()
-                self.call(words)
-                self.seconds[verb.name] = time.monotonic() - start
-        return self.seconds[verb.name]
 
-
-def command(words: Sequence[str]) -> list[str]:
-    """Of a process."""
-    return [sys.executable, "-m", "clsplat", *words]
+def command(words: Sequence[str], verb: Verb | None = None, marker: Path | None = None) -> list[str]:
+    """Of a process; verb and marker: one that says there when it is at work."""
+    if verb is None or verb.ready.startswith("/"):
+        return [sys.executable, "-m", "clsplat", *words]
+    return [sys.executable, "-c", WATCHED, str(marker), verb.ready, *words]
 
 
 def keep_apart(folder: Path) -> None:
@@ -199,7 +200,7 @@ def result_of(verb: Verb, event: str, done: tuple[int | None, str], out: Path, n
     told = lines[-1] if lines else ""
     for name, path in {"OUT": str(out), **{name.upper(): path for name, path in names.items()}}.items():
         told = told.replace(path, name)
-    hidden = [path for path in out.rglob(".*") if path.name != ".clsplat-lock" or status != 2]
+    hidden = [path for path in out.rglob(".*") if path.name != MARKER]
     left = sorted(str(path.relative_to(out)) for path in hidden)
     return Outcome(verb.name, event, status, told, left, "Traceback (most recent call last)" in text)
 
@@ -215,39 +216,45 @@ def wait(process: subprocess.Popen[str]) -> tuple[int | None, str]:
     return process.returncode, (output or "") + (errors or "")
 
 
-def wait_until_at_work(bench: Bench, verb: Verb, process: subprocess.Popen[str], out: Path, share: float = 0.5) -> None:
-    """Until the file is there that says so, or a part of its time has gone."""
-    until = time.monotonic() + (DEADLINE if verb.ready else share * bench.time_of(verb))
+def wait_until_at_work(verb: Verb, process: subprocess.Popen[str], out: Path) -> bool:
+    """True if it is; False where it has ended before."""
+    until = time.monotonic() + DEADLINE
+    pattern = verb.ready[1:] if verb.ready.startswith("/") else MARKER
     while process.poll() is None and time.monotonic() < until:
-        if verb.ready and any(out.glob(verb.ready)):
-            return
+        if any(out.glob(pattern)):
+            return True
         time.sleep(0.02)
+    return False
 
 
-def start(words: Sequence[str], **options: object) -> subprocess.Popen[str]:
+def start(verb: Verb, words: Sequence[str], out: Path, **options: object) -> subprocess.Popen[str]:
     """A process, both of its streams read unless said otherwise."""
     streams: dict[str, object] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
-    return subprocess.Popen(command(words), text=True, encoding="utf-8", errors="replace", **streams)  # type: ignore[call-overload, no-any-return]
+    line = command(words, verb, out / MARKER)
+    return subprocess.Popen(line, text=True, encoding="utf-8", errors="replace", **streams)  # type: ignore[call-overload, no-any-return]
+
+
+def finish(verb: Verb, process: subprocess.Popen[str], out: Path) -> tuple[int | None, str]:
+    """As `wait`; a viewer is ended by Ctrl-C, as it says."""
+    if verb.name == "view" and wait_until_at_work(verb, process, out):
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+    return wait(process)
 
 
 def signalled(bench: Bench, verb: Verb, event: str) -> Outcome:
-    """A signal in the middle; earlier where the process had ended by then."""
-    if verb.ready is None:
-        bench.time_of(verb)
-    for share in (0.5, 0.35, 0.2):
-        with fresh(bench.folder) as out:
-            process = start(bench.words(verb, out))
-            wait_until_at_work(bench, verb, process, out, share)
-            running = process.poll() is None
-            number = getattr(signal, event.partition(" ")[0])
-            for index in range(SIGNALS[event]):
-                time.sleep(0.05 * index)
-                with suppress(ProcessLookupError):
-                    process.send_signal(number)
-            found = result_of(verb, event, wait(process), out, bench.names)
-        if running and found.status != 0:
-            break
-    if found.status == -number:  # Python ends so by itself, where a Ctrl-C came while it was starting or ending
+    """A signal in the middle."""
+    with fresh(bench.folder) as out:
+        process = start(verb, bench.words(verb, out), out)
+        if not wait_until_at_work(verb, process, out):
+            raise SystemExit(f"{verb.name}: has ended before it was at work: {wait(process)}")
+        number = getattr(signal, event.partition(" ")[0])
+        for index in range(SIGNALS[event]):
+            time.sleep(0.05 * index)
+            with suppress(ProcessLookupError):
+                process.send_signal(number)
+        found = result_of(verb, event, wait(process), out, bench.names)
+    if found.status == -number:  # Python ends so by itself, where a Ctrl-C came while it was ending
         found.status = 128 + number
     return found
 
@@ -256,11 +263,8 @@ def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
     """Files, or standard output."""
     if not verb.writes:
         with fresh(bench.folder) as out, open("/dev/full", "w") as full:
-            process = start(bench.words(verb, out), stdout=full)
-            if verb.name == "view":
-                time.sleep(bench.time_of(verb))
-                process.send_signal(signal.SIGINT)
-            return result_of(verb, "full disk", wait(process), out, bench.names)
+            process = start(verb, bench.words(verb, out), out, stdout=full)
+            return result_of(verb, "full disk", finish(verb, process, out), out, bench.names)
     inside = "{out}/run" in verb.words and verb.name != "train"
     before = sum(path.stat().st_size + 4096 for path in (bench.folder / "run").rglob("*")) if inside else 0
     with full_disk(bench.folder, before) as (out, limit):
@@ -270,7 +274,7 @@ def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
         if inside or limit is None:
             with suppress(OSError), open(out / "filler", "wb") as filler:
                 filler.write(bytes(max(shutil.disk_usage(out).free - FULL // 4, 0)))
-        return result_of(verb, "full disk", wait(start(words, preexec_fn=limit)), out, bench.names)
+        return result_of(verb, "full disk", wait(start(verb, words, out, preexec_fn=limit)), out, bench.names)
 
 
 def with_a_stream(bench: Bench, verb: Verb, event: str) -> Outcome:
@@ -285,14 +289,12 @@ def with_a_stream(bench: Bench, verb: Verb, event: str) -> Outcome:
             read, write = os.pipe()
             os.close(read)
             kept = {} if event.startswith("2>&1") else {"stderr": subprocess.PIPE}
-            process = start(words, **{"stdout": write, "stderr": write, **kept})
+            process = start(verb, words, out, **{"stdout": write, "stderr": write, **kept})
             os.close(write)
         else:
-            process = subprocess.Popen(["sh", "-c", f"cd {out}; exec {line}", "sh", *command(words)], text=True)
-        if verb.name == "view":
-            time.sleep(bench.time_of(verb))
-            process.send_signal(signal.SIGINT)
-        status, text = wait(process)
+            call = command(words, verb, out / MARKER)
+            process = subprocess.Popen(["sh", "-c", f"cd {out}; exec {line}", "sh", *call], text=True)
+        status, text = finish(verb, process, out)
         text += said.read_text("utf-8", errors="replace") if said.exists() else ""
         return result_of(verb, event, (status, text), out, bench.names)
 
@@ -304,15 +306,12 @@ def beside_another(bench: Bench, verb: Verb) -> Outcome:
         first, ready = words, verb
         if "{out}/run" in verb.words and verb.name != "train":
             resumed = ["train", "-o", str(out / "run"), "--resume", "--iterations", str(LONG)]
-            first, ready = resumed, Verb("train", TRAIN, ready="run/.clsplat-lock")
-        other = start(first, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            first, ready = resumed, Verb("train", TRAIN, "/run/.clsplat-lock")
+        other = start(ready, first, out, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
-            wait_until_at_work(bench, ready, other, out)
-            process = start(words)
-            if verb.name == "view":
-                time.sleep(bench.time_of(verb))
-                process.send_signal(signal.SIGINT)
-            done = wait(process)
+            wait_until_at_work(ready, other, out)
+            (out / MARKER).unlink(missing_ok=True)
+            done = finish(verb, start(verb, words, out), out)
         finally:
             other.kill()
             other.wait()
