@@ -8,7 +8,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -24,7 +24,7 @@ from clsplat.colour import photos_space
 from clsplat.config import TrainConfig
 from clsplat.device.child import TrialInterrupted
 from clsplat.device.context import Device, open_device
-from clsplat.errors import ClsplatError, DriverError
+from clsplat.errors import CapacityError, ClsplatError, DriverError
 from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.locks import locked
@@ -249,7 +249,7 @@ class _Session:
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """A warning where the pictures are none."""
+        """A warning where the pictures are none. Nothing where the memory is too little for a look."""
         trainer, renderer = self.trainer, self.renderer
         background = background_colour(trainer.config.background)
 
@@ -257,8 +257,9 @@ class _Session:
             drawn = renderer.render(trainer.parameters, trainer.local(camera), background)
             return drawn.image, drawn.alpha
 
-        if text := doubts.of_pictures(draw, trainer.views):
-            warnings.warn(f"step {trainer.step}: {text}")
+        with suppress(CapacityError):
+            if text := doubts.of_pictures(draw, trainer.views):
+                warnings.warn(f"step {trainer.step}: {text}")
 
     def times_stages(self, step: int) -> bool:
         """Whether it is measured what each stage of the step takes: only where that is written down."""

@@ -149,7 +149,7 @@ def test_a_home_that_is_no_folder_or_cannot_be_read(
         assert shape_of(device) == default_shape(device)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     saved_path().mkdir(parents=True)  # what cannot be read by root either
-    with pytest.warns(UserWarning, match=r"shapes\.json: cannot be read \(Is a directory\)"):
+    with pytest.warns(UserWarning, match=r"shapes\.json: cannot be read \(it is a folder\)"):
         assert shape_of(device) == default_shape(device)
 
 
