@@ -133,6 +133,26 @@ def test_a_signal_waits_where_nobody_may_be_disturbed() -> None:
 
 @posix
 @pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_while_pyopencl_is_imported(number: signal.Signals) -> None:
+    """An exception that is raised in the import of its binary part aborts the process."""
+    code = (
+        "import os, sys\n"
+        "def hook(event, arguments):\n"
+        "    inside = event == 'object.__setattr__' and arguments[0].__module__ == 'pyopencl._cl'\n"
+        "    if inside and 'sent' not in sys.__dict__:\n"
+        "        sys.sent = True\n"
+        f"        os.kill(os.getpid(), {int(number)})\n"
+        "sys.addaudithook(hook)\n"
+        "sys.argv = ['clsplat', 'devices']\n"
+        "from clsplat.__main__ import main\n"
+        "sys.exit(main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
+
+
+@posix
+@pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
     """pycolmap takes a Ctrl-C for a sign that it is not installed."""
     code = (

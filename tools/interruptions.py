@@ -271,9 +271,10 @@ def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
         words = bench.words(verb, out)
         if verb.name == "train":  # to its end, in which it writes most
             words[words.index(str(LONG))] = str(SHORT)
-        if inside or limit is None:
-            with suppress(OSError), open(out / "filler", "wb") as filler:
-                filler.write(bytes(max(shutil.disk_usage(out).free - FULL // 4, 0)))
+        left = FULL // 4 if verb.ready.startswith("/") else 0  # of those some find out in the middle of the work
+        if limit is None:
+            with suppress(OSError), open(out / "filler", "wb", buffering=0) as filler:
+                filler.write(bytes(max(shutil.disk_usage(out).free - left, 0)))
         return result_of(verb, "full disk", wait(start(verb, words, out, preexec_fn=limit)), out, bench.names)
 
 
