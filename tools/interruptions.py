@@ -237,7 +237,7 @@ def start(verb: Verb, words: Sequence[str], out: Path, **options: object) -> sub
 def finish(verb: Verb, process: subprocess.Popen[str], out: Path) -> tuple[int | None, str]:
     """As `wait`; a viewer is ended by Ctrl-C, as it says."""
     if verb.name == "view" and wait_until_at_work(verb, process, out):
-        time.sleep(1.0)
+        time.sleep(4.0)  # until its page is there
         process.send_signal(signal.SIGINT)
     return wait(process)
 
