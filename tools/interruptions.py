@@ -121,7 +121,7 @@ class Bench:
     def __init__(self, folder: Path, verbs: Sequence[Verb]) -> None:
         self.folder = folder
         self.names = {name: str(folder / name) for name in ("scene", "photos", "run", "other")}
-        self.names["model"] = str(folder / "run" / "model.ply")
+        self.names.update(model=str(folder / "run" / "model.ply"), cache=str(folder / "cache"))
         write_scene(folder / "scene")
         if any(verb.name == "sfm" for verb in verbs):
             from clsplat.demo_scene import ignore_progress, write_photos
