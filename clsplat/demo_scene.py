@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsplat.camera import Camera
-from clsplat.errors import ClsplatError
-from clsplat.files import native_name, remove, replace
+from clsplat.images import write_spec
 from clsplat.trajectory import look_at
 
 Float32 = NDArray[np.float32]
@@ -417,17 +416,7 @@ def write_jpeg(path: Path, image: Float32) -> None:
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
     spec.attribute("Compression", "jpeg:97")
     spec.attribute("jpeg:subsampling", "4:4:4")
-    # under another name until it is whole: a later start must not take half a photo for one
-    part = path.with_name(f".{path.name}")
-    name = native_name(part)
-    output = oiio.ImageOutput.create(name)
-    if output is None or not output.open(name, spec) or not output.write_image(pixels) or not output.close():
-        reason = oiio.geterror() if output is None else output.geterror()
-        if output is not None:
-            output.close()  # Windows removes no file that is open
-        remove(part)
-        raise ClsplatError(f"{path}: cannot write the photo: {reason}")
-    replace(part, path)
+    write_spec(path, [pixels], [spec], "jpeg")
 
 
 def write_photos(

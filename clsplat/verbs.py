@@ -126,12 +126,14 @@ def sfm(verb: Sfm) -> int:
 def train(verb: Train) -> int:
     """Scene to run. Everything that can be wrong with the call is found before the run's folder is touched."""
     from clsplat.locks import locked
-    from clsplat.runs import check_output
+    from clsplat.runs import check_output, is_run
 
-    check_output(verb.output, resume=verb.resume, overwrite=verb.overwrite)
-    if verb.accept_changes and not verb.resume:
-        raise InputError("--accept-changes is for --resume, expected both")
     with ExitStack() as held:
+        if is_run(verb.output):
+            held.enter_context(locked(verb.output, "train"))
+        check_output(verb.output, resume=verb.resume, overwrite=verb.overwrite)
+        if verb.accept_changes and not verb.resume:
+            raise InputError("--accept-changes is for --resume, expected both")
         if verb.output.is_dir():
             held.enter_context(locked(verb.output, "train"))
         return _train_checked(verb, held)

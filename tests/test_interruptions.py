@@ -133,6 +133,26 @@ def test_a_signal_waits_where_nobody_may_be_disturbed() -> None:
 
 @posix
 @pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_while_pyopencl_is_imported(number: signal.Signals) -> None:
+    """An exception that is raised in the import of its binary part aborts the process."""
+    code = (
+        "import os, sys\n"
+        "def hook(event, arguments):\n"
+        "    inside = event == 'object.__setattr__' and arguments[0].__module__ == 'pyopencl._cl'\n"
+        "    if inside and 'sent' not in sys.__dict__:\n"
+        "        sys.sent = True\n"
+        f"        os.kill(os.getpid(), {int(number)})\n"
+        "sys.addaudithook(hook)\n"
+        "sys.argv = ['clsplat', 'devices']\n"
+        "from clsplat.__main__ import main\n"
+        "sys.exit(main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
+
+
+@posix
+@pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
     """pycolmap takes a Ctrl-C for a sign that it is not installed."""
     code = (
@@ -182,15 +202,15 @@ def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("call", ["train S -o {run}", "train -o {run} --resume", "train S -o {run} --overwrite"])
-def test_writers_wait_for_nobody(call: str, tmp_path: Path, capsys: Capture) -> None:
+@pytest.mark.parametrize("flag", ["", "--resume", "--overwrite", "new"])
+def test_a_second_training_changes_nothing(flag: str, tmp_path: Path, capsys: Capture) -> None:
     run = tmp_path / "run"
     run.mkdir()
-    if "--" in call:
+    if flag != "new":
         Run.create(run, TrainConfig())
     files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     with holder(run) as other:
-        assert main(call.format(run=run).split()) == 2
+        assert main(["train", str(tmp_path), "-o", str(run), *([flag] if flag.startswith("--") else [])]) == 2
         assert f"is being written by clsplat train (process {other.pid})" in error_line(capsys)
         left = {path: path.read_bytes() for path in run.rglob("*") if path.is_file() and path.name != locks.NAME}
     assert left == files

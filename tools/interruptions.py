@@ -121,7 +121,7 @@ class Bench:
     def __init__(self, folder: Path, verbs: Sequence[Verb]) -> None:
         self.folder = folder
         self.names = {name: str(folder / name) for name in ("scene", "photos", "run", "other")}
-        self.names["model"] = str(folder / "run" / "model.ply")
+        self.names.update(model=str(folder / "run" / "model.ply"), cache=str(folder / "cache"))
         write_scene(folder / "scene")
         if any(verb.name == "sfm" for verb in verbs):
             from clsplat.demo_scene import ignore_progress, write_photos
@@ -237,7 +237,7 @@ def start(verb: Verb, words: Sequence[str], out: Path, **options: object) -> sub
 def finish(verb: Verb, process: subprocess.Popen[str], out: Path) -> tuple[int | None, str]:
     """As `wait`; a viewer is ended by Ctrl-C, as it says."""
     if verb.name == "view" and wait_until_at_work(verb, process, out):
-        time.sleep(1.0)
+        time.sleep(4.0)  # until its page is there
         process.send_signal(signal.SIGINT)
     return wait(process)
 
@@ -271,9 +271,10 @@ def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
         words = bench.words(verb, out)
         if verb.name == "train":  # to its end, in which it writes most
             words[words.index(str(LONG))] = str(SHORT)
-        if inside or limit is None:
-            with suppress(OSError), open(out / "filler", "wb") as filler:
-                filler.write(bytes(max(shutil.disk_usage(out).free - FULL // 4, 0)))
+        left = FULL // 4 if verb.ready.startswith("/") else 0  # of those some find out in the middle of the work
+        if limit is None:
+            with suppress(OSError), open(out / "filler", "wb", buffering=0) as filler:
+                filler.write(bytes(max(shutil.disk_usage(out).free - left, 0)))
         return result_of(verb, "full disk", wait(start(verb, words, out, preexec_fn=limit)), out, bench.names)
 
 
