@@ -147,9 +147,7 @@ def test_the_checkpoint_of_a_late_failure_gives_the_same_bytes(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("verb", "how"), [("render", "hang"), ("eval", "empty"), ("convert", "abort"), ("demo", "launch")]
-)
+@pytest.mark.parametrize(("verb", "how"), [("render", "hang"), ("eval", "empty"), ("convert", "launch")])
 def test_a_late_failure_of_other_verbs(
     verb: str, how: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, default_device: Device,
     capsys: Capture, monkeypatch: pytest.MonkeyPatch,
