@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 import clsplat
 from clsplat import density
 from clsplat.camera import Camera
 from clsplat.config import TrainConfig
+from clsplat.device import cl
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
 from clsplat.device.layout import SPLAT, SlotFields

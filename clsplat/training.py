@@ -15,13 +15,13 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsplat import doubts, run_scene
 from clsplat.camera import Camera
 from clsplat.colour import photos_space
 from clsplat.config import TrainConfig
+from clsplat.device import cl
 from clsplat.device.child import TrialInterrupted
 from clsplat.device.context import Device, open_device
 from clsplat.errors import CapacityError, ClsplatError, DriverError

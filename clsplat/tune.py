@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pyopencl as cl
 
 from clsplat.bench import synthetic, wall_ms
+from clsplat.device import cl
 from clsplat.device.buffers import upload
 from clsplat.device.child import Child, end_with_parent, patience, python_module, tell
 from clsplat.device.context import Device, all_devices

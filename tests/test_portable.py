@@ -421,3 +421,13 @@ def test_frames_of_reports() -> None:
         "╭─ Value error ─╮\n│ Error parsing it │\n│ of -- two lines │\n│ ──────── │\n│ For full helptext │\n╰────╯\n"
     )
     assert _unboxed(plain) == _unboxed(boxed) == "Error parsing it of -- two lines"
+
+
+def test_pyopencl_is_imported_in_one_room() -> None:
+    """Its first import needs a variable and a signal's handler: `clsplat/device/__init__.py` sees to both."""
+    names = [
+        path.relative_to(ROOT).as_posix()
+        for path in PACKAGE
+        if "import pyopencl" in path.read_text("utf-8") and path.parent.name != "device"
+    ]
+    assert names == []

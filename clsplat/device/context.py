@@ -10,10 +10,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-# Drivers cache what they build, keyed by the whole text that they get; a second cache in front of theirs only adds
-# binaries that some of them fail to load again.
-os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
-
 import numpy as np
 import pyopencl as cl
 

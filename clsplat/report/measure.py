@@ -12,10 +12,10 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 import clsplat
+from clsplat.device import cl
 from clsplat.device.context import Device
 from clsplat.device.layout import SlotFields
 from clsplat.errors import CapacityError

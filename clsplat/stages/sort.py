@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pyopencl as cl
 
+from clsplat.device import cl
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
