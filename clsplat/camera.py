@@ -16,7 +16,7 @@ Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"
 FRAME_CLAMP = 0.3
 NEAR = 0.01
 """World units: the near plane of a camera that has none of its own, before a model that has none either."""
-NEARS = 1000.0
+NEARS = 100.0
 """Near planes in the extent of a scene that is too small for the usual one."""
 LARGEST_FOCAL = 1e12
 """Pixels: float32 has no digits left of a position long before."""
