@@ -94,11 +94,14 @@ def test_a_folder_that_takes_nothing_is_no_error(fresh: Device, tmp_path: Path) 
 def test_the_oldest_files_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(binaries, "MOST_BYTES", 30)
     for age in range(5):
-        path = tmp_path / f"{age}.bin"
+        path = tmp_path / f"{age:032x}.bin"
         path.write_bytes(bytes(10))
         os.utime(path, (1000 - age, 1000 - age))
+    other = tmp_path / "a photo.bin"
+    other.write_bytes(bytes(100))
+    os.utime(other, (1, 1))
     binaries._make_room(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.bin", "1.bin", "2.bin"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*(f"{age:032x}.bin" for age in range(3)), other.name]
 
 
 def test_only_a_driver_without_a_cache_gets_one() -> None:

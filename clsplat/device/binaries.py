@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import os
 import platform
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -90,6 +91,8 @@ def _make_room(place: Path) -> None:
     """Remove the oldest files beyond MOST_BYTES."""
     files = []
     for entry in os.scandir(place):
+        if not re.fullmatch(r"[0-9a-f]{32}\.bin", entry.name):  # CLSPLAT_BINARIES may name a folder of other files too
+            continue
         with contextlib.suppress(OSError):  # another process removes them too
             status = entry.stat()
             files.append((status.st_mtime, status.st_size, entry.path))
