@@ -81,7 +81,7 @@ def read_job(verb: Render) -> Job:
     tasks = render_job.make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
     _check_pictures(tasks, options)
     render_job.check_folders(tasks)
-    if tasks[0].is_video and tasks[0].path.exists():
+    if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
         check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
     for warning in chosen.warnings:
         warn(warning)

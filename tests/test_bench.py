@@ -401,6 +401,13 @@ def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyP
     result = json.loads(capsys.readouterr().out)
     assert [point["name"] for point in result["settings"]["points"]] == list(some)
     assert path.exists()
+    path.write_bytes(b"precious")
+    assert main(["bench", *SMALL, "--plot", str(path)]) == 2
+    said = f"clsplat: error: {path}: is there already; name another file, or give --overwrite to replace it\n"
+    assert capsys.readouterr() == ("", said)
+    assert path.read_bytes() == b"precious"
+    assert main(["bench", *SMALL, "--plot", str(path), "--overwrite"]) == 0
+    assert path.read_bytes().startswith(b"<?xml")
 
 
 def test_plot_without_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:

@@ -14,6 +14,7 @@ import OpenImageIO as oiio
 import pytest
 from calls import Capture, error_line
 from headers import exr_attributes, png_chunks
+from systems import can_link
 from tiny import HEIGHT, WIDTH, hidden_model
 
 from clsplat.cli import main
@@ -295,6 +296,27 @@ def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
         lumas = [16 + 219 * np.clip(image, 0, 1) @ [0.2126, 0.7152, 0.0722] for image in means]
         errors = [np.abs(frame[:HEIGHT] - luma).mean() for luma in lumas]
         assert index == 5 or errors[0] < errors[1]
+
+
+@pytest.mark.needs("av")
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_a_video_that_is_there_is_replaced_only_if_asked(
+    kind: str, shot: list[str], tmp_path: Path, capsys: Capture
+) -> None:
+    video, target = tmp_path / "a.mp4", tmp_path / "real.mp4"
+    if kind == "file":
+        video.write_bytes(b"precious")
+    elif can_link():
+        video.symlink_to(target)
+    else:
+        pytest.skip("this user may not make symbolic links")
+    assert render(shot, tmp_path, "", "a.mp4") == 2
+    said = f"clsplat: error: {video}: is there already; name another file, or give --overwrite to replace it\n"
+    assert capsys.readouterr().err == said
+    assert not target.exists() and (kind == "link" or video.read_bytes() == b"precious")
+    assert render(shot, tmp_path, "--dry-run", "a.mp4") == 0, "which writes nothing"
+    assert render(shot, tmp_path, "--overwrite", "a.mp4") == 0
+    assert video.read_bytes()[4:8] == b"ftyp"
 
 
 @pytest.mark.needs("av")

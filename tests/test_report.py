@@ -301,6 +301,20 @@ def test_json_and_another_file(copied: Path, tmp_path: Path, capfd: Capture) -> 
     assert (copied / "report.html").read_bytes() == before
 
 
+def test_a_page_that_is_there_is_replaced_only_if_asked(copied: Path, tmp_path: Path, capsys: Capture) -> None:
+    page, own = tmp_path / "sent.html", copied / "report.html"
+    for output in (page, own, copied / "model.ply"):
+        output.write_bytes(b"precious")
+        assert main(["report", str(copied), "-o", str(output)]) == 2
+        said = f"clsplat: error: {output}: is there already; name another file, or give --overwrite to replace it\n"
+        assert capsys.readouterr().err == said
+        assert output.read_bytes() == b"precious"
+    assert main(["report", str(copied), "-o", str(page), "--overwrite"]) == 0
+    assert main(["report", str(copied)]) == 0, "the run's own, which nobody named"
+    assert page.read_text("utf-8").startswith("<!DOCTYPE html>")
+    assert own.read_text("utf-8").startswith("<!DOCTYPE html>")
+
+
 def test_wrong_calls_are_one_line(reported: Path, tmp_path: Path, capsys: Capture) -> None:
     for call, words in (
         (["report", str(tmp_path)], "not a run"),

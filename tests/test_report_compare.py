@@ -61,6 +61,18 @@ def test_the_page_has_the_runs_figures(runs: list[Path], tmp_path: Path) -> None
         assert views[name] == [repr(evaluation(run)["views"][index]["psnr"]) for run in runs[:2]]
 
 
+def test_a_page_that_is_there_is_replaced_only_if_asked(runs: list[Path], tmp_path: Path, capsys: Capture) -> None:
+    page = tmp_path / "page.html"
+    page.write_bytes(b"precious")
+    call = ["compare", *map(str, runs), "-o", str(page)]
+    assert main(call) == 2
+    said = f"clsplat: error: {page}: is there already; name another file, or give --overwrite to replace it\n"
+    assert capsys.readouterr() == ("", said)
+    assert page.read_bytes() == b"precious"
+    assert main([*call, "--overwrite"]) == 0
+    assert page.read_text("utf-8").startswith("<!DOCTYPE html>")
+
+
 def test_curves_are_overlaid(runs: list[Path], tmp_path: Path) -> None:
     charts = charts_of(parse(compare(runs, tmp_path / "page.html")))
     for label, run in zip(("a/run", "b/run", "c/run"), runs, strict=True):
