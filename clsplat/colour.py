@@ -95,6 +95,13 @@ def linear_to_srgb(values: Float32) -> Float32:
     return np.where(values > edge, curve, values * np.float32(12.92)).astype(np.float32, copy=False)
 
 
+def displayed(rgb: NDArray[Any], space: str) -> Float32:
+    """(H, W, 3) of a model's space as PNG and JPEG files show it: in sRGB, within [0, 1]. Raises InputError for a space
+    that is not known."""
+    colours = Colours(ColourConfig(colorspace=SRGB), space)
+    return np.clip(colours.convert(np.asarray(rgb, np.float32), None, colours.model, SRGB), 0, 1)
+
+
 class Colours:
     """The spaces of one job. model, light, output: SRGB, LINEAR or names of the configuration; light is linear."""
 

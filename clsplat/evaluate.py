@@ -58,15 +58,20 @@ def evaluate(
     step: int | None,
     gaussians: int,
     seconds: float | None,
+    space: str = "sRGB",
 ) -> dict[str, Any]:
     """Measure every view; the result is what eval.json holds.
 
     render: gives a view's image (H, W, 3), float, over `background` (3,), at the size of `view.load()`; save_dir: the
-    renders go there as PNG, under the view's name. step, gaussians, seconds are passed through. Without views the
+    renders go there as PNG in sRGB, under the view's name. space: the colour space of renders and photographs, in
+    which they are measured. step, gaussians, seconds are passed through. Without views the
     mean is empty; lpips_missing says why there is no LPIPS, where there is none. Raises ClsplatError where a render is
-    not finite, InputError naming a view that is too small.
+    not finite, InputError naming a view that is too small, or a space that is not known.
     """
     records: list[dict[str, Any]] = []
+    if save_dir is not None:
+        from clsplat.colour import displayed
+        from clsplat.images import write_image
     names = picture_names([view.name for view in views])
     for view, name in zip(views, names, strict=True):
         truth = composite(view.load(), background)
@@ -86,11 +91,9 @@ def evaluate(
             record["lpips"] = perceptual
         records.append(record)
         if save_dir is not None:
-            from clsplat.images import write_image
-
             path = save_dir / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_image(path, np.clip(image, 0, 1).astype(np.float32))
+            write_image(path, displayed(image, space))
     keys = [key for key in ("psnr", "ssim", "lpips") if records and key in records[0]]
     mean = {key: float(np.mean([record[key] for record in records])) for key in keys}
     result: dict[str, Any] = {"step": step, "gaussians": gaussians, "seconds": seconds, "mean": mean, "views": records}

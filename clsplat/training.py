@@ -219,6 +219,7 @@ class _Session:
             step=trainer.step,
             gaussians=trainer.parameters.count,
             seconds=self.seconds,
+            space=photos_space(view.path for view in trainer.scene.views),
         )
 
     def record(

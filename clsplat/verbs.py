@@ -233,6 +233,7 @@ def _train_verb(scene: Scene, run: Run, device: Device, between: Between | None 
 def evaluate(verb: Eval, *, held: bool = False) -> int:
     """Model and scene to numbers. held: a run's folder is locked."""
     from clsplat import report
+    from clsplat.colour import recorded_space
     from clsplat.config import TrainConfig
     from clsplat.device.context import open_device
     from clsplat.evaluate import background_colour
@@ -277,6 +278,7 @@ def evaluate(verb: Eval, *, held: bool = False) -> int:
         step=trained_for.get("step"),
         gaussians=len(gaussians),
         seconds=trained_for.get("seconds"),
+        space=recorded_space(file),
     )
     if given_run:
         given_run.write_eval(result)

@@ -83,6 +83,19 @@ def test_picture_names() -> None:
     assert picture_names(["a.jpg", "a.png", "b.jpg"]) == ["a.jpg.png", "a.png.png", "b.png"]
 
 
+def test_renders_in_other_spaces_are_left_as_srgb(tmp_path: Path) -> None:
+    from skimage.io import imread
+
+    views = photos()[1:2]
+    linear = evaluate(half, views, (0, 0, 0), tmp_path, step=1, gaussians=1, seconds=0.0, space="lin_rec709")
+    assert linear == evaluate(half, views, (0, 0, 0), step=1, gaussians=1, seconds=0.0), "they are measured as they are"
+    values = half(views[0]).astype(np.float64)
+    curve = np.where(values > 0.0031308, 1.055 * values ** (1 / 2.4) - 0.055, 12.92 * values)  # IEC 61966-2-1
+    np.testing.assert_allclose(imread(tmp_path / "a.png") / 255, curve, atol=0.5 / 255 + 1e-6)
+    with pytest.raises(InputError, match="the model's colour space nowhere: not in the configuration"):
+        evaluate(half, views, (0, 0, 0), tmp_path, step=1, gaussians=1, seconds=0.0, space="nowhere")
+
+
 def test_renders_are_left_as_pictures(tmp_path: Path) -> None:
     from skimage.io import imread
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,12 +19,16 @@ import OpenImageIO as oiio
 import pytest
 from calls import Capture, flags, one_error, train
 from compare import assert_close
+from pages import parse
 from quick import quick
 from systems import posix
 from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, short, write_scene
 
 import clsplat
 from clsplat.cli import main
+from clsplat.colour import srgb_to_linear
+from clsplat.images import read_image, write_image
+from clsplat.report.pictures import data_uri
 from clsplat.runs import Run
 
 # From photographs to pictures
@@ -64,6 +69,28 @@ def test_eval_finds_what_training_found(trained: Path, scene: Path, capfd: Captu
     out = capfd.readouterr().out
     assert "5 held-out views" in out
     (trained / "eval.json").write_text(json.dumps(stored))
+
+
+def test_pictures_of_a_linear_model_are_srgb(scene: Path, tmp_path: Path, capfd: Capture) -> None:
+    """As everybody who opens a PNG takes them: what training and evaluation leave, and the report's photographs."""
+    linear, run = Path(shutil.copytree(scene, tmp_path / "linear")), tmp_path / "run"
+    for photo in (linear / "images").iterdir():
+        write_image(photo.with_suffix(".exr"), srgb_to_linear(read_image(photo)))
+        photo.unlink()
+    listed = linear / "sparse" / "0" / "images.txt"
+    listed.write_text(listed.read_text().replace(".png", ".exr"))
+    assert train(linear, run, short(iterations=4, eval_at=(), stages_every=0)) == 0
+    left = (run / "test" / "00.png").read_bytes()
+    frames = ["render", str(run), "--cameras", str(linear), "-o", str(tmp_path / "{name}.png"), "--frames", "1"]
+    assert main([*frames, "--colorspace", "sRGB"]) == 0
+    expected = read_image(tmp_path / "00.png")
+    np.testing.assert_array_equal(read_image(run / "test" / "00.png"), expected)
+    assert np.abs(srgb_to_linear(expected) - expected).max() > 0.1, "the curve is seen"
+    (run / "test" / "00.png").unlink()
+    assert main(["eval", str(run)]) == 0
+    assert (run / "test" / "00.png").read_bytes() == left
+    photo = parse((run / "report.html").read_text("utf-8")).all("figure", class_="view")[0].all("img")[0]
+    assert photo.attributes["src"] == data_uri(read_image(scene / "images" / "00.png"))
 
 
 @pytest.mark.smoke

@@ -16,6 +16,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
+from clsplat.colour import displayed, photos_space
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluate import composite, picture_names
 from clsplat.files import native_name
@@ -90,13 +91,14 @@ def show(
     except ValueError:  # a name that no file has, such as ""
         return []
     views = {view.name: view for view in scene.views} if scene is not None else {}
+    space = photos_space(view.path for view in views.values())
 
     def one(index: int) -> Shown | None:
         path = run.test_path / paths[index]
         if not _is_within(path, run.test_path):
             return None
         try:
-            return _shown(names[index], path, views.get(names[index]), background)
+            return _shown(names[index], path, views.get(names[index]), background, space)
         except InputError:
             return None
 
@@ -140,7 +142,7 @@ def _is_within(path: Path, folder: Path) -> bool:
         return False
 
 
-def _shown(name: str, path: Path, view: View | None, background: ArrayLike) -> Shown:
+def _shown(name: str, path: Path, view: View | None, background: ArrayLike, space: str) -> Shown:
     render = read_image(path, orient=False)[:, :, :3]
     height, width = render.shape[:2]
     scale = min(1.0, MAX_SIDE / max(width, height))
@@ -149,10 +151,10 @@ def _shown(name: str, path: Path, view: View | None, background: ArrayLike) -> S
     if view is None:
         return Shown(name, *size, data_uri(small))
     try:
-        photo = composite(view.load(width, height), background).astype(np.float32)
+        photo = displayed(composite(view.load(width, height), background), space)
     except InputError as reason:
         trouble = str(reason).replace(str(view.path), view.path.name)
         return Shown(name, *size, data_uri(small), trouble=trouble)
-    error = np.abs(np.clip(photo, 0, 1) - render).mean(axis=2, keepdims=True, dtype=np.float32)
+    error = np.abs(photo - render).mean(axis=2, keepdims=True, dtype=np.float32)
     colors = error_colors(downscale(error, *size)[:, :, 0])
     return Shown(name, *size, data_uri(small), data_uri(downscale(photo, *size)), data_uri(colors))
