@@ -208,7 +208,9 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextmanager
 def locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
-    """Inside, no other process is inside with this file, which need not be there: FILE.lock beside it says so.
+    """Inside, no other process is inside with this file, which need not be there: FILE.lock beside it says so. No lock
+    of the system's, as `locks.locked` has: those do not keep a process's own threads apart, and homes on a network,
+    where this is used, may have none.
 
     One that is older than so many seconds is of a process that was killed, and is taken away. Whoever has waited for
     twice as long goes on without. Raises OSError where the folder cannot be written.
