@@ -85,9 +85,10 @@ class Sfm:
     """Lens model to fit, by COLMAP's name; the scene's images are undistorted with it.
     auto is OPENCV for a camera with 20 photos or more, else SIMPLE_RADIAL."""
     threads: Annotated[int | None, arg(metavar="INT")] = None
-    """CPU threads; all cores if not given."""
+    """Number of CPU threads; if not given, one for each core."""
     seed: int = 0
-    """Seed of the robust estimators."""
+    """Seed of what is random in matching and reconstruction. The same seed gives the same cameras, for up to 80
+    photos."""
     overwrite: Flag = False
     """Replace a scene in the output folder that was made of other photos or with other settings."""
     json: Flag = False
@@ -129,11 +130,11 @@ class Train:
     json: Flag = False
     """Print the final evaluation as JSON on standard output."""
     preset: Preset = "default"
-    """Bundle of settings: exact has nothing approximate, nor has default; fast takes less than half of the time for
-    0.3 dB at most on the scenes it was made on. Other flags go before it."""
+    """Bundle of settings. exact and default approximate nothing and are the same; fast takes less than half of the
+    time, and lost at most 0.3 dB of PSNR on the scenes it was made on. Flags that are given override it."""
     schedule: Schedule | None = None
-    """Bundle of rates and steps: the paper's, made for 30,000 steps, or the short one's, for --iterations of about
-    7000. Other flags go before it. If not given: paper, and with --preset fast short."""
+    """Bundle of learning rates and of the steps at which things happen: paper, made for 30,000 steps; short, for
+    --iterations of about 7000. Flags that are given override it. If not given: paper, but short with --preset fast."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
 
 
@@ -149,11 +150,11 @@ class Eval:
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None
     """Folder with the scene; the one the run was trained on if not given."""
     test_every: Annotated[int | None, arg(metavar="INT")] = None
-    """Every n-th view by name is held out; as the run has it, or 8."""
+    """Every n-th view by name is held out, and measured. If not given: as the run has it, else 8."""
     resolution: Annotated[int | None, arg(metavar="INT")] = None
-    """Longest image side; as the run has it, or 0: the images' size up to 1600."""
+    """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: as the run has it, else 0."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
-    """Background behind the Gaussians and behind images with alpha; as the run has it, or black."""
+    """Background behind the Gaussians and behind images with alpha. If not given: as the run has it, else black."""
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
@@ -198,20 +199,21 @@ class Render:
     exr: ExrDepth = EXR_DEPTH
     """Floats of 16 or 32 bits in EXR, for colour, alpha and normals; depths, positions and motion are always of 32."""
     parts: Parts = "one"
-    """EXR files of one part, or of one for colour with alpha and one for each other channel."""
+    """one: all channels of an EXR file in one part; several: a part for colour with alpha and one for each other
+    channel."""
     compression: Compression = "zip"
-    """Of EXR files; pxr24, dwaa and dwab lose some of the values."""
+    """Compression of EXR files. pxr24, dwaa and dwab change the values a little; the others keep every bit."""
     bits: Literal[8, 16] = 8
-    """Of a channel in PNG and TIFF."""
+    """Bits of each channel in PNG and TIFF files."""
     quality: int = 95
-    """Of JPEG, from 1 to 100."""
+    """Quality of JPEG files, from 1 to 100, the best."""
     width: Annotated[int | None, arg(metavar="INT")] = None
     """Width in pixels; follows from the height, or from the camera, if not given. With a height of another shape than
     the camera's the vertical angle of view is kept."""
     height: Annotated[int | None, arg(metavar="INT")] = None
     """Height in pixels; follows from the width, or from the camera, if not given."""
     scale: float = 1.0
-    """Size relative to the camera's, where neither width nor height is given."""
+    """Factor on the camera's width and height, such as 0.5, where neither --width nor --height is given."""
     colour: Annotated[ColourConfig, arg(name="")] = field(default_factory=ColourConfig)
     framing: Annotated[FramingConfig, arg(name="")] = field(default_factory=FramingConfig)
     sampling: Annotated[SamplingConfig, arg(name="")] = field(default_factory=SamplingConfig)
@@ -220,8 +222,8 @@ class Render:
     slices: Annotated[DeepConfig, arg(name="deep")] = field(default_factory=DeepConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
     preset: Annotated[Preset | None, arg(metavar="exact|default|fast")] = None
-    """Bundle of rasterizer settings; the run's own, or the default's, if not given. A --rasterizer flag goes before
-    it."""
+    """Bundle of rasterizer settings: exact and default approximate nothing, fast does a little. A --rasterizer flag
+    overrides it. If not given: the run's own settings, else default."""
     overwrite: Flag = False
     """Replace a video that is there. Pictures of frames are replaced in any case, but for --skip-existing."""
     skip_existing: Flag = False
@@ -233,14 +235,16 @@ class Render:
     """auto: a bar on a terminal, and a line for each frame written; json: an object a line for each frame, on standard
     output, or with --json on standard error; openjd: what Open Job Description shows as progress."""
     profile: Flag = False
-    """Measure what part of the time the device is at work; in --json by frame."""
+    """Measure what part of the time the device is at work, and with --json how long on each frame."""
     device: Annotated[str | None, arg(metavar="DEVICE,...|all")] = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them; several, with commas,
     share the frames. If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
     workers: Annotated[int | None, arg(metavar="INT")] = None
-    """Render with so many processes of this machine, a Dask cluster. Needs the extra: pip install 'clsplat[farm]'."""
+    """Render in this many processes on this machine, as a Dask cluster. Needs the extra: pip install
+    'clsplat[farm]'."""
     scheduler: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Render on the Dask cluster of this scheduler, such as tcp://host:8786, whose workers see the same files."""
+    """Render on the Dask cluster of the scheduler at this address, such as tcp://host:8786. Its workers need the model
+    and the output folder under the same paths."""
     max_device_mem: Memory = None
     """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
     If not given: all that the device has."""
@@ -262,13 +266,14 @@ class Bench:
     gaussians: int = 200_000
     """Gaussians of the made-up scene."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
-    """Size of the frame; the camera's, or 1024x768, if not given."""
+    """Size of the frame in pixels. If not given: the camera's, or 1024x768 for the made-up scene."""
     repeat: int = 5
-    """Frames and steps of each kind, of which the median is taken."""
+    """How often each kind of frame and step is measured; the median of these times is printed."""
     preset: Preset = "default"
-    """Bundle of rasterizer settings; a --rasterizer flag goes before it."""
+    """Bundle of rasterizer settings: exact and default approximate nothing, fast does a little. A --rasterizer flag
+    overrides it."""
     plot: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Measure every setting of the rasterizer too, and plot run time against error: .svg or .png."""
+    """Measure every setting of the rasterizer too, and plot run time against error into this file: .svg or .png."""
     overwrite: Flag = False
     """Replace the plot that is there."""
     device: Device = None
@@ -286,8 +291,8 @@ class Bench:
 class Tune:
     """Find the quickest shape of the kernels for a device by a short trial, and keep it for later runs.
 
-    A run that is resumed, or repeated for the same bytes, wants the shape that it had. CLSPLAT_SHAPE=LANESxITEMS goes
-    before what is kept.
+    A shape is how many pixels a kernel works on at once, and how many work-items share a tile. A run that is resumed,
+    or repeated for the same bytes, wants the shape that it had. CLSPLAT_SHAPE=LANESxITEMS overrides what is kept.
     """
 
     device: Device = None
@@ -303,9 +308,9 @@ class Tune:
 class Selftest:
     """Test every device: build the kernels, run each stage on frozen scenes, compare with float64 and stored digests.
 
-    Exit status 1 where a driver cannot be trusted. train, eval, render, view, bench and demo make a short form of this
-    test the first time they meet a device; CLSPLAT_TRUST_DRIVER=1 leaves that out. A shape of the kernels in which a
-    driver failed is tried anew here.
+    Exit status 1 where a driver cannot be trusted. train, eval, render, view, bench, demo and, where it renders,
+    convert make a short form of this test the first time they meet a device; CLSPLAT_TRUST_DRIVER=1 leaves that out. A
+    shape of the kernels in which a driver failed is tried anew here.
     """
 
     device: Device = "all"

@@ -25,12 +25,12 @@ class View:
     docs/viewer.md has what the page can do.
     """
 
-    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL.ply")]
+    model: Annotated[Positional[Path], arg(metavar="RUN|MODEL")]
     """A run's folder or a model file; for a file in a run's folder that run's settings hold."""
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None
     """Folder with the scene, for its cameras and photos; the one the run was trained on if not given."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
-    """Background behind the Gaussians; as the run has it, or black."""
+    """Background behind the Gaussians. If not given: as the run has it, else black."""
     host: Host = HOST
     """Address that the page is served at: this machine alone, unless another is given."""
     port: int = PORT
@@ -59,7 +59,8 @@ class Report:
     overwrite: Flag = False
     """Replace the file of --output that is there."""
     views: int = 8
-    """Most held-out views with pictures: the worst, the best and some between. All are in the table."""
+    """Number of held-out views that are shown with pictures, at most: the worst, the best and some between. The table
+    has all views."""
     json: Flag = False
     """Print the figures as JSON."""
 
@@ -98,7 +99,7 @@ class Convert:
     crop_sphere: Annotated[str | None, arg(metavar="X,Y,Z,R")] = None
     """Keep the Gaussians with their middle in this sphere."""
     prune_opacity: Annotated[float | None, arg(metavar="FLOAT")] = None
-    """Leave out Gaussians of less opacity, 0 to 1."""
+    """Leave out Gaussians whose opacity is less than this, 0 to 1."""
     prune_contribution: Annotated[float | None, arg(metavar="PIXELS")] = None
     """Leave out Gaussians that add less than this to the picture of every one of --cameras: alpha times transmittance,
     summed over the picture, in pixels, as --density.min-contribution in training."""
@@ -106,11 +107,11 @@ class Convert:
     """Cameras for --prune-contribution, any that `clsplat render` takes."""
     transform: Annotated[str | None, arg(metavar="FILE|M00,M01,...")] = None
     """Move the model by a 4 x 4 matrix of rotation, one scale and translation (a mirror is allowed too), row by row:
-    16 numbers with commas, or a text file with them. SH are turned too."""
+    16 numbers with commas, or a text file with them. Spherical harmonics are turned too."""
     scale: Annotated[float | None, arg(metavar="FLOAT")] = None
-    """Scale the model about the world's origin."""
+    """Multiply positions and sizes by this factor, about the world's origin."""
     drop_sh: Annotated[int | None, arg(metavar="DEGREE")] = None
-    """Leave out SH beyond this degree, 0 to 3."""
+    """Leave out the spherical harmonics (colour by direction) beyond this degree, 0 to 3."""
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None
     """Measure PSNR on this scene's held-out views before and after, and of the two renders against each other."""
     test_every: int = TEST_EVERY

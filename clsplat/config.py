@@ -47,30 +47,30 @@ def _check_steps(flag: str, steps: tuple[int, ...]) -> None:
 
 @dataclass(frozen=True)
 class RasterizerConfig:
-    """What the rasterizer skips. The error of each switch, and the time it buys, are in docs/performance.md.
+    """What the rasterizer skips. Only settings that are marked as approximate change a picture; the others change no
+    bit of a frame, and are there to be measured.
 
-    `extent` "constant", `tile_test`, `depth_sort`, `key_bits`, `last_contributor`, `record_cells` and the `_skip`,
-    `_stop` and `_cull` switches change no bit of a frame; they are there to be measured. The others are approximate
-    where they differ from the default. `sh_tolerance` and `sh_storage` are of frames of a model that is held on the
-    device (`Renderer`), not of training.
+    sh-tolerance and sh-storage are of frames of a model that is held on the device (render, eval), not of training.
+    docs/performance.md has the error of each setting, and the time that it buys.
     """
 
     extent: Literal["opacity", "constant", "3sigma"] = "opacity"
-    """How far a Gaussian reaches: to where its alpha is alpha-min; as far as an opaque one would, whatever its
-    opacity; or three standard deviations, which cuts what is visible of opaque ones (approximate)."""
+    """How far a Gaussian reaches. opacity: to where its alpha is alpha-min; constant: as far as an opaque one would,
+    whatever its opacity; 3sigma: three standard deviations, which cuts what is visible of opaque ones (approximate)."""
     tile_test: Literal["ellipse", "box", "square"] = "ellipse"
-    """A Gaussian is listed in the tiles that its ellipse reaches, or in all of its bounding box's where those are at
-    most 16; in those of its bounding box; or in those that the square of its longest half axis reaches, as in the code
-    of Kerbl et al."""
+    """In which tiles of 16 x 16 pixels a Gaussian is listed. ellipse: those that its ellipse reaches, or all of its
+    bounding box where that has at most 16; box: all of its bounding box; square: those that the square of its longest
+    half axis reaches, as in the code of Kerbl et al."""
     depth_sort: Literal["visible", "pairs"] = "visible"
-    """The visible Gaussians are sorted by depth, and their pairs with tiles, stably, by tile; or all pairs are sorted
-    by tile and depth, as in the code of Kerbl et al."""
+    """What is sorted. visible: the visible Gaussians by depth, then their pairs with tiles, stably, by tile; pairs: all
+    pairs by tile and depth, as in the code of Kerbl et al."""
     key_bits: Literal["needed", "all"] = "needed"
-    """Sort by the bits in which the depths of the frame and its tiles differ, or by 32 of each."""
+    """Which bits are sorted by. needed: those in which the depths of the frame and its tiles differ; all: 32 of
+    each."""
     row_skip: bool = True
-    """Visit only the rows of a tile that the bounding box reaches."""
+    """Visit only the rows of a tile that a Gaussian's bounding box reaches."""
     column_skip: bool = True
-    """Visit only the vectors of a row that the bounding box reaches."""
+    """Visit only the vectors (pixels that are worked on at once) of a row that a Gaussian's bounding box reaches."""
     vector_skip: bool = True
     """Leave a vector of pixels when the Gaussian contributes to none of them. Frames on a CPU have no use for it: their
     vectors are found by the ellipse, so that few are visited in vain."""
@@ -91,15 +91,16 @@ class RasterizerConfig:
     """Leave out a Gaussian whose opacity is not over alpha-min before its colour is worked out; else as with
     frustum-cull off, wherever it lies: it has no extent."""
     sh_degree_limit: int = 3
-    """Leave out the SH bands above this degree (approximate)."""
+    """Leave out the bands of spherical harmonics (SH, colour by direction) above this degree, 0 to 3 (approximate)."""
     sh_tolerance: float = 0.0
-    """Leave out a Gaussian's highest SH bands as long as that changes no channel of its colour by more than this, from
-    any direction: 0 leaves out those that are zero (approximate above 0). Bands that none needs are always left out,
-    those that some need only where that is half of all coefficients: from there on it pays."""
+    """Leave out a Gaussian's highest SH bands as long as that changes no channel of its colour, 0 to 1, by more than
+    this, from any direction: 0 leaves out those that are zero (approximate above 0). Bands that none needs are always
+    left out, those that some need only where that is half of all coefficients: from there on it pays."""
     sh_storage: Literal["float", "half"] = "float"
     """Keep the SH bands above 0 in 32 or in 16 bits (half is approximate, of half the memory)."""
     alpha_min: float = 1 / 255
-    """Skip a Gaussian at a pixel where its alpha is less (approximate above 1/255, less than one 8-bit step)."""
+    """Skip a Gaussian at a pixel where its alpha is less than this (approximate above the default, 1/255: one step of 8
+    bits)."""
     transmittance_min: float = 1e-4
     """A Gaussian that would take a pixel's transmittance to this or less is left out and ends the pixel (approximate
     above 1e-4)."""
@@ -132,35 +133,37 @@ class OptimiserConfig:
     """Learning rates and Adam's constants, a rate per parameter group."""
 
     means_rate: float = 1.6e-4
-    """Rate of the means at the start, times the scene's extent."""
+    """Learning rate of the Gaussians' middles (means) at the first step, in parts of the scene's extent."""
     means_rate_end: float = 1.6e-6
-    """Rate of the means at `means_rate_steps`, times the extent; log-linear in between."""
+    """Learning rate of the means from means-rate-steps on, in parts of the extent; until then it falls to this by the
+    same factor every step."""
     means_rate_steps: int = 30_000
-    """Steps over which the means' rate decays."""
+    """Steps over which the learning rate of the means falls."""
     sh_dc_rate: float = 2.5e-3
-    """Rate of the SH constant term."""
+    """Learning rate of colours: the constant band of the spherical harmonics."""
     sh_rest_rate: float = 2.5e-3 / 20
-    """Rate of the higher SH bands."""
+    """Learning rate of what colours have by direction: the higher bands of the spherical harmonics."""
     opacities_rate: float = 0.025
-    """Rate of the opacity logits."""
+    """Learning rate of the opacities, as logits."""
     scales_rate: float = 5e-3
-    """Rate of the log scales."""
+    """Learning rate of the sizes, as logarithms."""
     quaternions_rate: float = 1e-3
-    """Rate of the raw quaternions."""
+    """Learning rate of the rotations, as quaternions."""
     sparse: bool = False
-    """Leave Gaussians that a step's view does not show as they are, their moments too (approximate)."""
+    """Leave Gaussians that a step's view does not show as they are, Adam's moments too (approximate)."""
     sh_rest_every: int = 1
-    """Steps from one update of the higher SH bands to the next (approximate above 1)."""
+    """Update the higher SH bands in every so many steps (approximate above 1)."""
     cooldown: int = 0
-    """Over the last so many steps every rate falls, exponentially, to `cooldown_to` of itself; 0 for none."""
+    """Over the last so many steps every learning rate falls, by the same factor every step, to the part cooldown-to of
+    itself; 0: none falls."""
     cooldown_to: float = 0.1
-    """What is left of every rate after the cooldown's last step."""
+    """Part of every learning rate that is left after the cooldown's last step, more than 0, at most 1."""
     beta1: float = 0.9
-    """Decay of Adam's first moment."""
+    """Part of Adam's first moment, the mean gradient, that is kept from step to step."""
     beta2: float = 0.999
-    """Decay of Adam's second moment."""
+    """Part of Adam's second moment, the mean squared gradient, that is kept from step to step."""
     epsilon: float = 1e-15
-    """Adam's epsilon."""
+    """Adam's epsilon, which is added to the root of the second moment before dividing by it."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
@@ -180,50 +183,54 @@ class OptimiserConfig:
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """Adaptive density control (Kerbl et al. 2023, section 5)."""
+    """Adaptive density control: where Gaussians are added and taken away (Kerbl et al. 2023, section 5)."""
 
     every: int = 100
-    """Steps between densifications; 0 turns density control off."""
+    """Steps between densifications, in which Gaussians are cloned, split and pruned; 0 turns density control off."""
     start: int = 500
-    """Gaussians are cloned, split and pruned after steps later than this one."""
+    """Last step without densification: Gaussians are cloned, split and pruned after later steps only."""
     stop: int = 15_000
-    """Gaussians are cloned, split, pruned and reset after steps before this one."""
+    """Step from which on Gaussians are no longer cloned, split and pruned, nor opacities reset."""
     gradient_threshold: float = 2e-4
-    """Mean norm of the screen-space position gradient (in NDC units) from which a Gaussian is densified."""
+    """Mean gradient of a Gaussian's place on the screen, in units of half the image, from which on it is densified
+    (cloned or split); less makes more Gaussians."""
     absolute_gradients: bool = False
-    """Use sums of absolute per-pixel gradients (AbsGS) instead; the threshold wants about 8e-4 then."""
+    """Add up the gradients' absolute values pixel by pixel for that (AbsGS); gradient-threshold wants about 8e-4
+    then."""
     dense_fraction: float = 0.01
-    """Gaussians up to this fraction of the scene's extent are cloned, larger ones split."""
+    """Largest size of a Gaussian that is cloned, in parts of the scene's extent; larger ones are split."""
     split_factor: float = 1.6
-    """A split divides the scales by this."""
+    """Factor by which each half of a split Gaussian is smaller."""
     min_opacity: float = 0.005
-    """Gaussians less opaque are pruned."""
+    """Prune Gaussians whose opacity is less than this, 0 to 1."""
     max_world_fraction: float = 0.1
-    """Gaussians larger than this fraction of the extent are pruned, after the first opacity reset."""
+    """Prune Gaussians that are larger than this part of the scene's extent, after the first opacity reset."""
     max_screen_radius: float = 0.0
-    """Gaussians that covered a larger radius in pixels are pruned, after the first opacity reset; 0 prunes none."""
+    """Prune Gaussians that covered a larger radius than this on the screen, in pixels, after the first opacity reset; 0
+    prunes none."""
     opacity_reset_every: int = 3000
-    """Steps between opacity resets, 0 for none; one more at `start` where the background is white."""
+    """Steps between opacity resets, 0 for none; one more at density.start where the background is white."""
     opacity_reset_to: float = 0.01
     """Opacity is lowered to at most this at a reset."""
     max_gaussians: int = 10_000_000
     """Clones and splits stop at this number of Gaussians; where room is short, the largest gradients go first."""
     views_agree: int = 1
-    """Densify only where the gradient was over the threshold in this many views since the last densification, beside
-    its mean; 1 asks for the mean alone, as the paper. A view that came again counts again."""
+    """Densify only where the gradient was over the threshold in this many views since the last densification, and its
+    mean too; 1 asks for the mean alone, as the paper. A view that came again counts again."""
     growth: Growth = "paper"
     """paper: densify what is over the threshold; budget: the number of Gaussians rises along a parabola to
-    max-gaussians at `stop`, the largest gradients first, whatever the threshold (Taming 3DGS)."""
+    max-gaussians at density.stop, the largest gradients first, whatever the threshold (Taming 3DGS)."""
     min_contribution: float = 0.0
-    """Gaussians whose blending weights came to less than so many pixels in every view of an epoch are pruned; 0 prunes
-    none."""
+    """Prune Gaussians that add less than this to every training view of an epoch (a pass through all of them): alpha
+    times transmittance, summed over the picture, in pixels. 0 prunes none."""
     prune_every: int = 0
-    """Steps between prunings by opacity and contribution alone, which go on after `stop`; 0 for none."""
+    """Steps between prunings by opacity and contribution alone, which go on after density.stop; 0 for none."""
     prune_at: tuple[int, ...] = ()
-    """Steps after which the least contributing are pruned, by prune-fraction."""
+    """Steps after which the Gaussians that contribute least are pruned, as many as prune-fraction says."""
     prune_fraction: float = 0.0
-    """Share of the Gaussians, those with the smallest sums of blending weights over an epoch, that goes at each of
-    prune-at (Speedy-Splat): of those whose sums are known, which none are for two epochs after an opacity reset."""
+    """Share of the Gaussians, 0 to 1, that is pruned at each step of prune-at: those that contribute least over an
+    epoch (Speedy-Splat). Not counted are those whose contribution is not known, as of all for two epochs after an
+    opacity reset."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
@@ -263,35 +270,40 @@ class TrainConfig:
     """One training run."""
 
     iterations: int = 30_000
-    """Number of steps; learning rates and density control do not depend on it, but for --optimiser.cooldown."""
+    """Number of training steps. Learning rates and density control do not depend on it, but for --optimiser.cooldown,
+    --schedule short and --preset fast."""
     seed: int = 0
     """Seed of everything random; the same seed on the same device gives the same model."""
     sh_degree: int = 3
-    """Highest spherical-harmonics degree, 0 to 3."""
+    """Highest degree of the spherical harmonics (SH): how finely colours depend on the direction they are seen from, 0
+    (not at all) to 3."""
     sh_degree_every: int = 1000
-    """Steps between increases of the SH degree."""
+    """Steps after which the SH degree in use rises by one, from 0 to sh-degree."""
     dssim_weight: float = 0.2
-    """Weight of D-SSIM in the loss; L1 has the rest."""
+    """Weight of D-SSIM (how unlike structures are) in the loss, 0 to 1; L1 (mean absolute difference) has the rest."""
     background: Background = "black"
-    """Behind the Gaussians, and behind images with alpha; random is a new colour each step, evaluated on black."""
+    """Background behind the Gaussians and behind images with alpha; random: a new colour each step, and black in
+    evaluations."""
     warmup: tuple[int, ...] = (250, 500)
-    """Steps after which the training resolution doubles; two of them start at a quarter, '' at the full size."""
+    """Steps after which the training resolution doubles: with two of them training starts at a quarter of the size,
+    with '' at the full size."""
     frequency_steps: int = 0
-    """Steps within which the training resolution rises from an eighth of the size as the photographs' spectra ask, in
-    place of --warmup; 0 goes by --warmup."""
+    """Steps within which the training resolution rises from an eighth of the size, as fast as the detail in the
+    photographs asks (by their spectra), in place of --warmup; 0 goes by --warmup."""
     resolution: int = 0
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, the first too; 0 holds out none. A data set's own split goes first."""
     random_points: int = 100_000
-    """Initial Gaussians where a scene has no points."""
+    """Number of Gaussians to start from, at random places, where a scene has no points."""
     checkpoint_every: int = 1000
-    """Steps between checkpoints; 0 writes only the last and the one of Ctrl-C."""
+    """Steps between checkpoints; 0 writes one at the end only, or at an interruption."""
     eval_at: tuple[int, ...] = ()
-    """Steps at which the held-out views are evaluated, beside the end."""
+    """Steps at which the held-out views are evaluated, besides the last."""
     stages_every: int = 100
-    """Steps between those in which the time of each stage is measured, for the report, waiting for the device at every
-    seam; in steps that metrics.jsonl has, the last one too. 0 measures none."""
+    """Steps between those in which the time of each stage is measured for the report; such a step is slower, as the
+    device is waited for after every stage. Only steps that metrics.jsonl has count; the last one is measured too. 0
+    measures none."""
     report: bool = True
     """Write report.html at the end."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)

@@ -45,9 +45,11 @@ class FramingConfig:
     """Part of the frame to render alone, X,Y,WIDTH,HEIGHT in pixels from its top left corner; '' renders all of it. In
     EXR files it is the data window."""
     supersample: int = 1
-    """Samples of a pixel across and down: the frame is rendered so many times larger, and filtered in linear light."""
+    """Samples of a pixel across and down: the frame is rendered so many times larger, and made smaller in linear light.
+    1 does without."""
     filter: Filter = "box"
-    """Of supersampling: the mean over the pixel, or a Blackman-Harris window three pixels wide, which is smoother."""
+    """How --supersample makes a pixel. box: the mean over it; blackman-harris: a window three pixels wide, which is
+    smoother."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
@@ -91,21 +93,23 @@ class SamplingConfig:
     """Shutter and lens."""
 
     samples: int = 16
-    """Frames that are rendered for one, where the shutter or the lens is open."""
+    """Pictures that are rendered and averaged for each frame with motion blur or depth of field; more are smoother and
+    take as much longer."""
     shutter_angle: float = 0.0
-    """How long the shutter is open, in degrees of which 360 are from frame to frame, half before the frame and half
-    after it; 0 is a still camera."""
+    """Motion blur: how long the shutter is open, half before the frame and half after it, in degrees of which 360 are
+    from frame to frame; 0 is none."""
     shutter_open: float | None = None
-    """When the shutter opens, in frames from the frame, such as -0.25; in place of the angle, with --shutter-close."""
+    """When the shutter opens, in frames from the frame, such as -0.25; in place of --shutter-angle, with
+    --shutter-close."""
     shutter_close: float | None = None
     """When the shutter closes, in frames from the frame, such as 0.25."""
     f_stop: float | None = None
-    """Depth of field of a lens with this f-number, its focal length that of the camera on a sensor of --sensor-width;
-    none has everything in focus."""
+    """Depth of field: the f-number of a lens, such as 2.8, its focal length that of the camera on a sensor of
+    --sensor-width. If neither this nor --aperture is given, everything is in focus. Wants --focus."""
     aperture: float = 0.0
-    """Radius of the lens in the scene's units, in place of the f-number."""
+    """Depth of field: the radius of the lens in the scene's units, in place of --f-stop; 0 is none. Wants --focus."""
     focus: float = 0.0
-    """Depth that is in focus, along the camera's axis in the scene's units."""
+    """Depth that is in focus, along the camera's axis in the scene's units, for --f-stop and --aperture."""
     sensor_width: float = 36.0
     """Millimetres that the picture's width is on the sensor, for --f-stop."""
     metres: float = 1.0

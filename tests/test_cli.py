@@ -35,7 +35,7 @@ def test_every_training_flag_has_help(capsys: Capture) -> None:
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for part in (
         "--dssim-weight FLOAT Weight of D-SSIM",
-        "--density.split-factor FLOAT A split",
+        "--density.split-factor FLOAT Factor",
         "--eval-at STEP,STEP,",
     ):
         assert part in text
