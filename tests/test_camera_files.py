@@ -87,7 +87,7 @@ def test_camera_path_of_other_cameras(tmp_path: Path) -> None:
         ({"camera_path": [{"camera_to_world": [0] * 16}]}, "key 0: 'camera_to_world' has no rotation in it"),
         (
             {"camera_path": [{"camera_to_world": np.transpose(POSE).ravel().tolist(), "fov": 50}]},
-            "last row [1.0, 2.0, 3.0, 1.0], expected 0 0 0 1, with the position in the last column; it is written column",
+            "row [1.0, 2.0, 3.0, 1.0], expected 0 0 0 1, with the position in the last column; it is written column by",
         ),
         (
             {"camera_path": [{"camera_to_world": [*POSE[:3], [0, 0, 0.5, 1]], "fov": 50}]},
