@@ -72,7 +72,7 @@ def test_frames_of_many_sizes_and_models(default_device: Device) -> None:
 
 def test_too_little_says_how_much_is_needed(default_device: Device) -> None:
     gaussians, camera = random_cloud(4000, 11, 200, 150)
-    with pytest.raises(CapacityError, match=r"4,000 Gaussians .* at least about [\d.]+ MiB of device memory"):
+    with pytest.raises(CapacityError, match=r"4,000 Gaussians .* at least about [\d,]+ KiB of device memory"):
         Renderer(with_limit(default_device, 300 * KIB)).render(gaussians, camera)
 
 
