@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+
+from clsplat.errors import InputError
 
 Float64 = NDArray[np.float64]
 Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
@@ -18,6 +20,8 @@ NEAR = 0.01
 """World units: the near plane of a camera that has none of its own, before a model that has none either."""
 NEARS = 100.0
 """Near planes in the extent of a scene that is too small for the usual one."""
+NO_ROTATION = 1e-2
+"""Most that R^T R may differ from 1: poses are typed with few digits, or float32's."""
 LARGEST_FOCAL = 1e12
 """Pixels: float32 has no digits left of a position long before."""
 
@@ -72,6 +76,35 @@ class Camera:
         """The camera's centre in the world, (3,)."""
         centre: Float64 = -self.rotation.T @ self.translation
         return centre
+
+    def check(self) -> None:
+        """Raise InputError naming the value that no camera has."""
+        for name in ("width", "height"):
+            side = getattr(self, name)
+            if isinstance(side, bool) or not isinstance(side, int | np.integer) or side < 1:
+                raise InputError(f"camera: {name} is {side}, expected a whole number of pixels from 1 on")
+        for name in ("fx", "fy"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"camera: {name} is {getattr(self, name)}, expected a finite number over 0")
+        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
+            raise InputError(f"camera: cx, cy are {self.cx}, {self.cy}, expected finite numbers")
+        for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
+            values = np.asarray(getattr(self, name))
+            if values.shape != shape or values.dtype.kind not in "iuf":
+                raise InputError(f"camera: {name} is {values.dtype} {values.shape}, expected numbers of shape {shape}")
+            if not np.isfinite(values).all():
+                raise InputError(f"camera: {name} has numbers that are not finite: {values.tolist()}")
+        rotation = np.asarray(self.rotation, np.float64)
+        if (off := float(np.abs(rotation.T @ rotation - np.eye(3)).max())) > NO_ROTATION:
+            raise InputError(
+                f"camera: rotation is none, its axes are {off:.2g} off right angles or length 1, expected that of "
+                "cam_from_world; a scale does not belong in it"
+            )
+        if not 0 < self.near < self.far:
+            raise InputError(f"camera: near is {self.near}, far {self.far}, expected 0 < near < far")
+        if self.projection not in get_args(Projection):
+            known = ", ".join(get_args(Projection))
+            raise InputError(f"camera: projection is {self.projection!r}, expected one of {known}")
 
     def from_origin(self, origin: Float64) -> Camera:
         """The same view, for coordinates of the world that are counted from origin (3,)."""

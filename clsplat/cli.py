@@ -225,7 +225,8 @@ class Render:
     """Bundle of rasterizer settings: exact and default approximate nothing, fast does a little. A --rasterizer flag
     overrides it. If not given: the run's own settings, else default."""
     overwrite: Flag = False
-    """Replace a video that is there. Pictures of frames are replaced in any case, but for --skip-existing."""
+    """Replace a video that is there, and pictures that clsplat did not make. Frames of its own are replaced without it,
+    but for --skip-existing."""
     skip_existing: Flag = False
     """Leave out frames whose file is there and can be read to its end, of this size, these channels, this model and,
     as far as it says so (EXR, PNG), made with these cameras and settings."""
@@ -249,8 +250,8 @@ class Render:
     """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
     If not given: all that the device has."""
     json: Flag = False
-    """Print the frames as JSON when all are done: name, frame, path, width, height, seconds, skipped. With --dry-run:
-    the plan."""
+    """Print the frames as JSON when all are done: name, frame, path, width, height, seconds, skipped, blank (nothing of
+    the model is seen). With --dry-run: the plan."""
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
 

@@ -396,9 +396,19 @@ def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT) -> str:
         raise InputError(f"{path}: is not text in UTF-8 (byte {error.start}), expected {expected}") from None
 
 
-def parse_json(text: str | bytes) -> Any:
-    """The value. Raises ValueError for whatever does not parse, nested too deeply too."""
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in found if names.count(name) > 1)
+        raise ValueError(f"the key {twice[:40]!r} is there twice")
+    return found
+
+
+def parse_json(text: str | bytes, *, once: bool = False) -> Any:
+    """The value. Raises ValueError for whatever does not parse, nested too deeply too. once: also for a key that an
+    object has twice, of which the last would count."""
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_once if once else None)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None

@@ -15,6 +15,10 @@ MOST_FRAMES = 10_000_000
 RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?")
 FIELD = re.compile(r"(#+)|%(0\d+)?d|\{(\w*)(?::(0\d+)d?)?\}", re.ASCII)
 
+KNOWN = "{name}, {frame}, #### or %04d"
+ODD = re.compile(r"%[-+ ]?\d*\.?\d*[diouxXeEfgGcsV]|[{}][^{}]*\}?")
+"""What is meant as a field, and is none."""
+
 
 def parse_frames(text: str) -> list[int]:
     """The frames of a list such as 1-100, 1-100:2 or 7,12,30-40, each once, in rising order.
@@ -66,7 +70,9 @@ class Pattern:
     def __post_init__(self) -> None:
         for match in FIELD.finditer(self.text):
             if match[3] not in (None, "frame") and not (match[3] == "name" and match[4] is None):
-                raise InputError(f"{self.text}: {match[0]} is not known, expected {{name}}, {{frame}}, #### or %04d")
+                raise InputError(f"{self.text}: {match[0]} is not known, expected {KNOWN}")
+        if odd := ODD.search(FIELD.sub("", Path(self.text).name)):
+            raise InputError(f"{self.text}: {odd[0]} is not known, expected {KNOWN}")
 
     @property
     def has_frame(self) -> bool:

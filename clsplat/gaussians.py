@@ -51,7 +51,10 @@ class Gaussians:
 
     def check(self) -> None:
         """Raise ValueError naming the array whose dtype or shape is not as the class says."""
-        count = len(self.means)
+        for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
+            if not isinstance(array := getattr(self, name), np.ndarray):
+                raise ValueError(f"{name} is a {type(array).__name__}, expected a NumPy array")
+        count = len(self.means) if self.means.ndim else 0
         coefficients = self.sh.shape[1] if self.sh.ndim == 3 else 0
         if coefficients not in [(degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1)]:
             raise ValueError(f"sh has shape {self.sh.shape}, expected (N, 1, 4, 9 or 16, 3)")
@@ -63,7 +66,7 @@ class Gaussians:
             "sh": (count, coefficients, 3),
         }
         for name, shape in shapes.items():
-            array: Float32 = getattr(self, name)
+            array = getattr(self, name)
             if array.dtype != np.float32 or array.shape != shape:
                 raise ValueError(f"{name} is {array.dtype} {array.shape}, expected float32 {shape}")
         if self.origin.dtype != np.float64 or self.origin.shape != (3,):

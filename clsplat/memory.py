@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from clsplat.errors import CapacityError, InputError
+from clsplat.errors import CapacityError, InputError, amount
 
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 _SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([kmgt]?)(i?b)?\s*", re.IGNORECASE)
@@ -26,6 +26,11 @@ def parse_bytes(text: str | int | None, flag: str = "--max-device-mem") -> int |
     if size < 1:
         raise InputError(f"{flag} {text}: expected a size such as 256MiB, 1.5G or a number of bytes")
     return size
+
+
+def mebibytes(nbytes: int) -> str:
+    """So many bytes for a line of text, to a tenth of a MiB; fewer than 10 MiB in a unit that tells them apart."""
+    return f"{nbytes / 2**20:,.1f} MiB" if nbytes >= 10 * 2**20 else amount(nbytes)
 
 
 @dataclass(frozen=True)
@@ -124,7 +129,7 @@ class Plan:
             how.append(f"the image is done in about {self.groups} groups of tiles")
         if self.channels < 3:
             how.append("the loss is done by channel")
-        needed, allowed = (f"{size / 2**20:,.1f} MiB" for size in (self.needed, self.allowed))
+        needed, allowed = mebibytes(self.needed), mebibytes(self.allowed)
         return f"about {needed} of device memory needed, {allowed} allowed: " + (", ".join(how) or "all at once")
 
 
@@ -157,7 +162,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     if streamed.pairs < 1:
         least = budget - room + alignment * need.model + max(need.gaussians // 8, 1) * need.pair
         raise CapacityError(
-            f"{need.gaussians:,} Gaussians at this size of image need at least about {least / 2**20:,.1f} MiB of device"
-            f" memory, {need.total / 2**20:,.1f} MiB to be done at once, and {budget / 2**20:,.1f} MiB are allowed"
+            f"{need.gaussians:,} Gaussians at this size of image need at least about {mebibytes(least)} of device "
+            f"memory, {mebibytes(need.total)} to be done at once, and {mebibytes(budget)} are allowed"
         )
     return streamed

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.camera import NEAR
 from clsplat.colour import recorded_space
 from clsplat.files import is_file, open_input
 from clsplat.formats import format_of, model_path, packing, ply, tell_kind
@@ -132,6 +133,8 @@ def text(info: dict[str, Any]) -> str:
         lines += [(name, _listed(info[name])) for name in ("scale", "opacity")]
     if any(info["origin"]):
         lines.append(("origin", " ".join(map(repr, info["origin"]))))
+    if info.get("near", NEAR) != NEAR:
+        lines.append(("near plane", f"{info['near']:.6g}"))
     lines.append(("colour space", info["colorspace"]))
     lines += [("comment", line) for line in info.get("comments", [])]
     if info.get("ignored"):

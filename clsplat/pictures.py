@@ -12,6 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from clsplat.big_frames import in_strips, strip_rows, write_in_strips
 from clsplat.camera import Camera
 from clsplat.colour import SRGB, Colours
@@ -23,6 +25,10 @@ from clsplat.sampling import sample_cameras, sampled
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.rendering import Renderer
+
+
+UNSEEN = 1e-6
+"""Most that a colour differs from the background's where nothing is seen: averages of equal samples are rounded."""
 
 
 class Pictures:
@@ -82,6 +88,18 @@ class Pictures:
         colours, rows = self.colours, self.rows(camera, names)
         made = (in_strips(draw, rows) if rows < camera.height else draw)(camera, names)
         return made, lambda layers: in_space(layers, colours, space, colours.output)
+
+    def is_blank(self, layers: Layers) -> bool | None:
+        """Whether layers of `unfinished` show nothing but the background, None where none of them tells."""
+        for name in ("alpha", "count", "depth"):
+            if name in layers:
+                return not layers[name].any()
+        if "rgb" not in layers:
+            return None
+        behind = np.array(self._background, np.float32).reshape(1, 1, 3)
+        if self.config.sampling.on or self.config.framing.supersample > 1:
+            behind = self.colours.convert(behind, None, self.colours.model, self.colours.light)
+        return bool(np.abs(layers["rgb"] - behind).max() <= UNSEEN)
 
     def layers(self, at: Callable[[float], Camera], names: Collection[str], after: Camera | None = None) -> Layers:
         """The picture's layers, all at once; its window is `camera(at).window`."""

@@ -26,7 +26,7 @@ from clsplat import layers
 from clsplat.camera import Camera
 from clsplat.device.child import abandon
 from clsplat.errors import InputError, reason_of
-from clsplat.files import abandoned
+from clsplat.files import abandoned, is_file
 from clsplat.frame_settings import SETTINGS
 from clsplat.frames import output_paths
 from clsplat.paths import Shot
@@ -50,8 +50,9 @@ COPIES = 3
 
 @dataclass(frozen=True)
 class Record:
-    """What became of a frame. seconds: of rendering and writing it, without waiting; skipped: it was there; kernel_ms,
-    transfer_ms: the device's, where that was asked for."""
+    """What became of a frame. seconds: of rendering and writing it, without waiting; skipped: it was there; blank:
+    nothing of the model is in it, None where nobody looked; kernel_ms, transfer_ms: the device's, where that was asked
+    for."""
 
     name: str
     frame: int
@@ -60,6 +61,7 @@ class Record:
     height: int
     seconds: float
     skipped: bool = False
+    blank: bool | None = None
     kernel_ms: float | None = None
     transfer_ms: float | None = None
 
@@ -155,6 +157,13 @@ def untold(tasks: Sequence[Task]) -> list[Path]:
         return [task.path for task, value in zip(tasks, said, strict=True) if value is None]
 
 
+def foreign(tasks: Sequence[Task]) -> list[Path]:
+    """Those of the tasks' files that are pictures of others than clsplat."""
+    there = [task.path for task in tasks if is_file(task.path)]
+    with ThreadPoolExecutor(MOST_WRITERS) as pool:
+        return [path for path, others in zip(there, pool.map(layers.is_foreign, there), strict=True) if others]
+
+
 def stamp(path: Path) -> tuple[int, ...] | None:
     """What tells a file from one that takes its place; None for no file."""
     try:
@@ -184,7 +193,8 @@ def video_frame(task: Task, shaded: Shaded, options: RenderOptions) -> tuple[Rec
 
 def _record(task: Task, shaded: Shaded, options: RenderOptions, start: float) -> Record:
     seconds = shaded.seconds + time.monotonic() - start
-    return record_of(task, options, seconds=seconds, kernel_ms=shaded.kernel_ms, transfer_ms=shaded.transfer_ms)
+    measured = {"kernel_ms": shaded.kernel_ms, "transfer_ms": shaded.transfer_ms}
+    return record_of(task, options, seconds=seconds, blank=shaded.blank, **measured)
 
 
 def record_of(task: Task, options: RenderOptions, **values: Any) -> Record:

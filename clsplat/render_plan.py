@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from clsplat import render_job
-from clsplat.errors import examples
+from clsplat.errors import amount, examples
 from clsplat.frames import ranges
 from clsplat.framing import COLOUR, crop, finer, on_tiles, renderer_channels
 from clsplat.picture_config import FPS
@@ -56,7 +56,7 @@ def dry_run(job: Job) -> int:
     for each in plans:
         strips = f"; {each.strips} strips a frame" if each.strips > 1 else ""
         print(f"device    {each.device}: {each.plan}{strips}")
-    print(f"host      about {host / 2**20:,.0f} MiB for frames that wait to be written")
+    print(f"host      about {amount(host)} for frames that wait to be written")
     if verb.skip_existing:
         listed = f": {ranges(sorted(there))}" if there else ""
         print(f"skipped   {len(there)}{listed}")

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import clsplat
@@ -27,6 +27,13 @@ from clsplat.picture_config import ColourConfig, DeepConfig, PictureConfig, Vide
 from clsplat.runs import model_file
 from clsplat.shading import RenderOptions, Task, picture_camera
 
+_PICTURES = (".png", ".tif", ".tiff")
+_USED_BY = {
+    **dict.fromkeys(("exr", "parts", "compression"), (".exr",)),
+    "bits": _PICTURES,
+    "quality": (".jpg", ".jpeg"),
+}
+"""The files that each of the encoding's flags is for."""
 Colour = tuple[float, float, float]
 
 
@@ -83,6 +90,7 @@ def read_job(verb: Render) -> Job:
     render_job.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
         check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
+    _tell_unused(verb, options.channels)
     for warning in chosen.warnings:
         warn(warning)
     model = model_file(verb.model)
@@ -114,6 +122,32 @@ def frames_there(job: Job) -> set[int]:
             f"{unknown[0]}: they are kept, whatever their cameras, precision and other settings are"
         )
     return there
+
+
+def check_foreign(job: Job, there: Collection[int]) -> None:
+    """Raise InputError where a frame that is not `there` would take the place of somebody else's picture."""
+    if job.verb.overwrite or job.is_video:
+        return
+    if others := render_job.foreign([task for task in job.tasks if task.number not in there]):
+        raise InputError(
+            f"{examples(others)}: there already, and no frames of clsplat; name other files, or give --overwrite to "
+            "replace pictures that it did not make"
+        )
+
+
+def _tell_unused(verb: Render, channels: Collection[str]) -> None:
+    """A warning of flags that the files have no use for."""
+    extension, usual = Path(verb.output).suffix.lower(), {each.name: each.default for each in fields(Render)}
+    given = [
+        name
+        for name, used in _USED_BY.items()
+        if extension not in used and getattr(verb, name) != usual[name] and not (name == "exr" and verb.deep)
+    ]
+    if "rgb" not in channels and verb.background is not None:
+        given.append("background")
+    if given:
+        what = extension if "background" not in given else f"{extension} of these channels"
+        warn(f"not used for {what}: {', '.join(f'--{name}' for name in given)}")
 
 
 def _video(verb: Render, shot: Shot) -> VideoConfig:
@@ -197,6 +231,10 @@ def _check_pictures(tasks: list[Task], options: RenderOptions) -> None:
             f"{tasks[0].path}: frames are of the sizes {examples(sorted(sizes))}, expected one; give --width and "
             "--height"
         )
+    if tasks[0].is_video:
+        from clsplat.video import check_size
+
+        check_size(tasks[0].path, camera.width, camera.height)
 
 
 def _devices(verb: Render) -> tuple[str | None, ...]:

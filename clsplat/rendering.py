@@ -358,8 +358,10 @@ class Renderer:
         """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object; of what is
         on the device the camera has to count from where the means do.
 
-        contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting.
+        contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting. Raises
+        ValueError for arrays that are not as `Gaussians` says, InputError for a camera that is none.
         """
+        camera.check()
         if isinstance(gaussians, Gaussians):
             camera = gaussians.local(camera)
         on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
@@ -382,6 +384,8 @@ class Renderer:
         """
         of = Features.of(wanted)
         after = after or camera
+        camera.check()
+        after.check()
         if "motion" in wanted and after.projection != camera.projection:
             raise InputError(
                 f"motion goes from a camera to one that is {after.projection}, expected {camera.projection}"
@@ -415,6 +419,7 @@ class Renderer:
     def render_deep(self, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
         """(bins, H, W, 6): the view in slices by depth, the next of which begins at each of the bounds (bins - 1,):
         red, green, blue, associated with alpha; alpha; least and largest depth. All 0 where there is nothing."""
+        camera.check()
         bins, camera = len(bounds) + 1, gaussians.local(camera)
         on_device = self._hold(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
         frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
@@ -440,6 +445,7 @@ class Renderer:
         """The model on the device, or on the host if a frame of this size leaves too little room for it. planes: bytes
         of a pixel beside the picture's."""
         if self._sh is None or self._sh[0] is not gaussians:
+            gaussians.check()
             self._sh = self._held = None
             self._sh = (gaussians, held_sh(gaussians, self._rasterizer.config))
         sh = self._sh[1]
@@ -466,5 +472,5 @@ def render(
     max_device_mem: str | int | None = None,
 ) -> RenderResult:
     """Render one view on the device that `device` names (see `clsplat devices`), with at most `max_device_mem` of its
-    memory, such as "256MiB". Raises DeviceError."""
+    memory, such as "256MiB". Raises DeviceError, and as `Renderer.render`."""
     return Renderer(open_device(device, parse_bytes(max_device_mem))).render(gaussians, camera, background)

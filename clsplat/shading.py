@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from clsplat.camera import Camera
 from clsplat.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.config import RasterizerConfig
 from clsplat.errors import DriverError, InputError
+from clsplat.files import digest, is_file
 from clsplat.frame_settings import SETTINGS, digest_of, encoding_of
 from clsplat.framing import COLOUR, Layers, framed
 from clsplat.layers import VIDEO, Encoding, Header, camera_matrices
@@ -83,13 +85,15 @@ def as_it_is(layers: Layers) -> Layers:
 @dataclass(frozen=True)
 class Shaded:
     """A frame before it is encoded. layers: None for one that was written strip by strip; seconds: that it took;
-    kernel_ms, transfer_ms: the device's, None if not asked for; finish: what is left to do to the layers, for who
+    kernel_ms, transfer_ms: the device's, None if not asked for; blank: whether nothing of the model is in it,
+    None where that was not looked at; finish: what is left to do to the layers, for who
     encodes them, in another thread."""
 
     layers: Layers | None
     seconds: float
     kernel_ms: float | None = None
     transfer_ms: float | None = None
+    blank: bool | None = None
     finish: Callable[[Layers], Layers] = as_it_is
 
 
@@ -122,9 +126,19 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
         cameras += [task.at(opens + (closes - opens) * part / 4) for part in range(5)]
     sampling = pictures.sampling if pictures.sampling.on else None
     made = (options.channels, options.background, options.recorded, options.deep, options.drawn)
-    return digest_of(
-        cameras, made, encoding_of(options.encoding, extension), pictures.colour, pictures.framing, sampling
-    )
+    colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
+    return digest_of(cameras, made, encoding_of(options.encoding, extension), colour, pictures.framing, sampling)
+
+
+def _content(source: str) -> str:
+    """What a file of OpenColorIO's says, as its SHA-256; of another configuration its name."""
+    path = Path(source)
+    return _digest_at(source, path.stat().st_mtime_ns) if source and is_file(path) else source
+
+
+@lru_cache(maxsize=8)
+def _digest_at(path: str, changed: int) -> str:  # noqa: ARG001  # asked anew where the file has changed
+    return digest(path)
 
 
 def header(task: Task, options: RenderOptions) -> Header:
@@ -170,7 +184,8 @@ class FrameShader:
         start, options, pictures = time.monotonic(), self.options, self._pictures
         if options.deep is None and not self._in_strips(task):
             layers, finish = pictures.unfinished(task.at, options.channels, camera_after(task, options))
-            return Shaded(layers, time.monotonic() - start, finish=finish)
+            blank = pictures.is_blank(layers)
+            return Shaded(layers, time.monotonic() - start, blank=blank, finish=finish)
         encoding, head = options.encoding, header(task, options)
         if options.deep is None:
             after = camera_after(task, options)

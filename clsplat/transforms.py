@@ -33,6 +33,8 @@ DRIVE = re.compile(r"\A[A-Za-z]:/")
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 """instant-ngp's defaults: its position is scale times the file's, plus offset."""
+LAST_ROW = 1e-6
+"""Most that a pose's last row may differ from 0 0 0 1: products of float32's matrices are that exact."""
 MAX_NUMBER = 1e30
 """Larger ones are damage; their squares are still finite."""
 PERSPECTIVE = ("", "PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -194,7 +196,7 @@ def short(value: object) -> str:
 def load_document(path: Path, expected: str = "a transforms.json", key: str = "'frames'") -> dict[str, Any]:
     """The JSON object in a file. Raises InputError, which says that `expected`, an object with `key`, was."""
     try:
-        document = parse_json(read_document(path, expected))
+        document = parse_json(read_document(path, expected), once=True)
     except ValueError as error:
         raise InputError(f"{path}: is not JSON: {error}; expected {expected}") from None
     if not isinstance(document, dict):
@@ -304,15 +306,23 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
     return "OPENCV", [k1, k2, p1, p2]
 
 
+def numbers(given: Any) -> Float64:
+    """An array of a list of numbers, or of lists of them; (0,) for what is none. True and false are no numbers."""
+    rows = given if isinstance(given, list) else []
+    if any(isinstance(each, bool) for row in rows for each in (row if isinstance(row, list) else [row])):
+        return np.empty(0)
+    try:
+        return np.array(given, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+
+
 def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64, float]:
     """`cam_from_world` rotation (3, 3) and translation (3,), and the scale that was in it, of a `world_from_cam` matrix
     (4, 4) or (3, 4) in OpenGL's axes. Raises InputError, about `what` in `where`, for what is no pose."""
     if given is None:
         raise InputError(f"{where}: has no {what} (the 4 x 4 pose); {EXPORT_AGAIN}")
-    try:
-        matrix = np.array(given, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.empty(0)
+    matrix = numbers(given)
     if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < MAX_NUMBER).all():
         raise InputError(f"{where}: {what} is {short(given)}, expected 4 x 4 finite numbers")
     # A scaled camera object leaves its scale in the matrix; a camera has none.
@@ -323,6 +333,13 @@ def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64,
         raise InputError(
             f"{where}: {what} has no rotation in it (determinant {determinant:.3g}), expected "
             "world_from_camera in OpenGL's axes; check how it was exported"
+        )
+    if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > LAST_ROW:
+        columns = not matrix[:3, 3].any() and abs(matrix[3, 3] - 1) <= LAST_ROW
+        advice = "it is written column by column, so transpose it" if columns else "check how it was exported"
+        raise InputError(
+            f"{where}: {what} has the last row {short(matrix[3].tolist())}, expected 0 0 0 1, with the position in the "
+            f"last column; {advice}"
         )
     u, _, v = np.linalg.svd(axes)
     cam_from_world: Float64 = (u @ v @ COLMAP_FROM_OPENGL).T

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from math import inf, isfinite
+from math import inf, isclose, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from clsplat import colour, edit, fidelity
 from clsplat.cli_models import Convert, Info
+from clsplat.config import TEST_EVERY
 from clsplat.errors import InputError
 from clsplat.files import check_new, is_file, read_document
 from clsplat.formats import format_of, format_of_name, load, model_path, save, sog
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 QUICK = 2.0
 """Seconds that writing a file may take without a word."""
+NEAR_SLACK = 0.05
+"""A part of a near plane: where a file has none it follows from positions, which a format may have rounded."""
 MAX_MATRIX = 1 << 16
 """Bytes of a file with a matrix."""
 
@@ -50,19 +53,28 @@ def convert(verb: Convert) -> int:
     for each in beside(verb.target):
         if each.suffix == ".bin" or each.stem.partition("_")[0] in sog.PICTURES:
             check_new(each, overwrite=verb.overwrite)
-    original = load(source)
-    edited = original if not verb.merge else edit.merge([original, *(load(_file(path)) for path in verb.merge)])
+    original, space = load(source), colour.recorded_space(source)
+    edited = original
+    if verb.merge:
+        others = [(path, load(path)) for path in map(_file, verb.merge)]
+        for path, other in others:
+            _tell_mismatch(path, other, source, original)
+        edited = edit.merge([original, *(other for _, other in others)])
     edited = _thinned(verb, edited)
     if matrix is not None:
         edited = edit.transform(edited, matrix)
     if verb.drop_sh is not None:
         edited = edit.drop_sh(edited, verb.drop_sh)
-    space = colour.recorded_space(source)
     comments = () if space == colour.SRGB else (colour.comment(space),)
     save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK))
     if space != colour.recorded_space(verb.target):
         _warn(f"{verb.target}: {written_by.NAME} has no place for the colour space, which is {space}")
     read = load(verb.target)
+    if not isclose(read.near, edited.near, rel_tol=NEAR_SLACK):
+        _warn(
+            f"{verb.target}: {written_by.NAME} has no place for the near plane, which is {edited.near:.4g}; readers "
+            f"will take {read.near:.4g}"
+        )
     written = edit.take(edited, written_by.order(edited)) if hasattr(written_by, "order") else edited
     found = fidelity.errors(written, read)
     result: dict[str, Any] = {
@@ -87,6 +99,20 @@ def convert(verb: Convert) -> int:
     return 0
 
 
+def _tell_mismatch(path: Path, other: Gaussians, source: Path, first: Gaussians) -> None:
+    """A warning where a model that is merged is in another colour space, or its place is far from the first's."""
+    space, wanted = colour.recorded_space(path), colour.recorded_space(source)
+    if space != wanted:
+        _warn(f"--merge {path}: its colours are of {space}, those of {source} of {wanted}, as which all will count")
+    distance = float(np.linalg.norm(other.origin - first.origin))
+    if len(other) and distance > edit.FAR * float(other.means.std(axis=0).max()):
+        step = float(np.spacing(np.float32(distance)))
+        _warn(
+            f"--merge {path}: counts from a place {distance:.6g} world units from that of {source}; its positions are "
+            f"rounded to {step:.2g}. Is only one of the two georeferenced?"
+        )
+
+
 def check(verb: Convert) -> None:
     """Raise InputError for a number out of its range, and for flags that lack their companion."""
     ranges = {
@@ -102,6 +128,10 @@ def check(verb: Convert) -> None:
         raise InputError(f"--drop-sh {verb.drop_sh}: expected 0 to {MAX_SH_DEGREE}")
     if (verb.prune_contribution is None) != (verb.cameras is None):
         raise InputError("--prune-contribution and --cameras go together: contributions are to these cameras")
+    of_scene = {"test_every": TEST_EVERY, "resolution": 0, "background": "black"}
+    given = [f"--{name.replace('_', '-')}" for name, usual in of_scene.items() if getattr(verb, name) != usual]
+    if verb.scene is None and given:
+        raise InputError(f"{', '.join(given)}: of measuring on a scene, expected --scene with it")
     if verb.test_every < 0 or verb.resolution < 0:
         raise InputError(f"--test-every {verb.test_every} --resolution {verb.resolution}: expected at least 0")
 

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat import render_job
 from clsplat.cli import Render
+from clsplat.errors import examples
 from clsplat.process import endings, interrupt, status_of
 from clsplat.progress import FrameProgress
 from clsplat.render_job import Record
-from clsplat.render_request import Job, frames_there, read_job, warn
+from clsplat.render_request import Job, check_foreign, frames_there, read_job, warn
 from clsplat.shading import Task, open_shader
 
 if TYPE_CHECKING:
@@ -49,9 +50,10 @@ def _run(job: Job) -> int:
     if threading.current_thread() is threading.main_thread():
         for each in endings():  # again, as pycolmap and compilers of kernels install handlers of their own
             signal.signal(each, interrupt)
+    there = frames_there(job)
+    check_foreign(job, there)
     render_job.make_folders(tasks)
     render_job.remove_temporaries(tasks)
-    there = frames_there(job)
     records: dict[int, Record] = {}
     lines = sys.stdout if not verb.json else sys.stderr if verb.progress in ("json", "openjd") else None
     start = time.monotonic()
@@ -79,6 +81,11 @@ def _run(job: Job) -> int:
         with suppress(OSError):  # the terminal may be gone
             print(f"clsplat: interrupted after {count}; {advice}", file=sys.stderr)
         return status_of(error)
+    if blank := [number for number, record in sorted(records.items()) if record.blank]:
+        warn(
+            f"{len(blank)} of {len(tasks)} frames show nothing of the model: {examples(blank)}; are the cameras in the "
+            "model's world?"
+        )
     if verb.profile:
         _print_profile(records.values(), time.monotonic() - start, len(shaders))
     if verb.json:

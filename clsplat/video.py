@@ -39,6 +39,12 @@ SMALL = 128
 48x40 had other bytes on a busy machine, none of 225 of 320x240. It saves a quarter of a larger video's bytes."""
 
 
+LARGEST_SIDE = 16384
+"""Pixels: x264's MAX_RESOLUTION."""
+LARGEST_AREA = 260
+"""Megapixels, about: FFmpeg's av_image_check_size wants 8 (width + 128) (height + 128) under 2^31."""
+
+
 def check_video(path: Path) -> None:
     """Raise InputError where this installation cannot write a video there."""
     if path.suffix.lower() != VIDEO:
@@ -47,6 +53,15 @@ def check_video(path: Path) -> None:
         raise InputError(f"{path}: {reason}")
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: no such folder to write {path.name} to")
+
+
+def check_size(path: Path, width: int, height: int) -> None:
+    """Raise InputError where frames are larger than the encoder takes."""
+    if max(width, height) > LARGEST_SIDE or 8 * (width + 128) * (height + 128) >= 1 << 31:
+        raise InputError(
+            f"{path}: frames of {width}x{height}, expected at most {LARGEST_SIDE:,} pixels a side and {LARGEST_AREA} "
+            "megapixels, which is what H.264 is encoded of here; give a smaller --width, or write pictures"
+        )
 
 
 def yuv420(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -136,6 +151,7 @@ class VideoWriter:
     def _open(self, width: int, height: int) -> None:
         import av
 
+        check_size(self._path, width, height)
         config = self._config
         rate = rate_of(FPS if config.fps is None else config.fps)
         self._container = av.open(native_name(self._temporary), "w", format="mp4", options={"movflags": "+faststart"})

@@ -85,6 +85,18 @@ def test_camera_path_of_other_cameras(tmp_path: Path) -> None:
         ({"camera_path": [{"fov": 50}]}, "key 0: has no 'camera_to_world'"),
         ({"camera_path": [{"camera_to_world": [1, 2]}]}, "key 0: 'camera_to_world' is [1, 2], expected 4 x 4"),
         ({"camera_path": [{"camera_to_world": [0] * 16}]}, "key 0: 'camera_to_world' has no rotation in it"),
+        (
+            {"camera_path": [{"camera_to_world": np.transpose(POSE).ravel().tolist(), "fov": 50}]},
+            "row [1.0, 2.0, 3.0, 1.0], expected 0 0 0 1, with the position in the last column; it is written column by",
+        ),
+        (
+            {"camera_path": [{"camera_to_world": [*POSE[:3], [0, 0, 0.5, 1]], "fov": 50}]},
+            "has the last row [0.0, 0.0, 0.5, 1.0], expected 0 0 0 1, with the position in the last column; check how",
+        ),
+        (
+            {"camera_path": [{"camera_to_world": [[0, 0, -1, True], *POSE[1:]], "fov": 50}]},
+            "'camera_to_world' is [[0, 0, -1, True], ",
+        ),
         ({"camera_path": [{"camera_to_world": POSE}]}, "key 0: has no 'fov'"),
         ({"camera_path": [{"camera_to_world": POSE, "fov": 180}]}, "key 0: 'fov' is 180, expected the vertical angle"),
         ({"camera_path": [{"camera_to_world": POSE, "fov": 10**400}]}, "'fov' is 1000"),
@@ -100,6 +112,13 @@ def test_camera_paths_that_cannot_be(changes: dict[str, Any], message: str, tmp_
         read_shot(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert message in str(caught.value)
+
+
+def test_a_key_that_is_there_twice(tmp_path: Path) -> None:
+    path = tmp_path / "camera_path.json"
+    path.write_text(json.dumps(camera_path()).replace('"fov": 51.0', '"fov": 51.0, "fov": 20'))
+    with pytest.raises(InputError, match=r"camera_path\.json: is not JSON: the key 'fov' is there twice; expected"):
+        read_shot(path)
 
 
 def transforms(**keys: Any) -> dict[str, Any]:
@@ -229,6 +248,7 @@ def test_lenses_of_own_format(tmp_path: Path) -> None:
         ({"keys": [key(), key(frame=1e9)]}, "has the frames 1 to 1e+09, expected at most 100,000"),
         ({"loop_frames": 4}, "'loop_frames' is 4, expected more than the 4 that the keys span"),
         ({"keys": [key(position=None)]}, "key 0: has no 'position', expected a list of 3 numbers"),
+        ({"keys": [key(position=[1, 2, True])]}, "key 0: 'position' is [1, 2, True], expected a list of 3 numbers"),
         ({"keys": [key(position=[1, 2, float("nan")])]}, "key 0: 'position' is [1, 2, nan]"),
         ({"keys": [key(world_from_cam=[1, 2])]}, "key 0: 'world_from_cam' is [1, 2], expected a list of 4 numbers"),
         ({"keys": [key(world_from_cam=[0, 0, 0, 0])]}, "expected a unit quaternion [w, x, y, z]"),

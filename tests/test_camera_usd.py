@@ -229,3 +229,31 @@ def test_without_usd_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     (tmp_path / "a.json").write_text("{}")
     with pytest.raises(InputError, match=r"--usd-camera cam: .*a.json is no USD stage"):
         read_shot(tmp_path / "a.json", usd_camera="cam")
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ('token projection = "fisheyePolynomial"', "projection"),
+        ('token cameraProjectionType = "fisheyeSpherical"', "cameraProjectionType"),
+        ('token omni:lensdistortion:model = "opencvFisheye"', "omni:lensdistortion:model"),
+    ],
+)
+def test_a_lens_that_is_no_pinhole(stage: Path, line: str, name: str) -> None:
+    stage.write_text(STAGE.replace("float horizontalAperture = 36", f"float horizontalAperture = 36\n        {line}"))
+    with pytest.raises(InputError, match=f"/rig/shot at 1001: {name} is .*, expected perspective or orthographic"):
+        read_shot(stage, size=(64, None))
+    usual = "perspective" if name == "projection" else "pinhole"
+    stage.write_text(stage.read_text().replace(line, f'{line.partition(chr(34))[0]}"{usual}"'))
+    assert len(read_shot(stage, size=(64, None)).frames) == 5
+
+
+@pytest.mark.parametrize("quaternion", ["(0, 0, 0, 0)", "(nan, 0, 0, 0)"])
+def test_a_turn_that_is_none(stage: Path, quaternion: str) -> None:
+    turn = "float3 xformOp:rotateXYZ.timeSamples = { 1001: (20, 30, 40), 1005: (40, 20, 60) }"
+    text = STAGE.replace(turn, f"quatf xformOp:orient = {quaternion}").replace(
+        '"xformOp:rotateXYZ"', '"xformOp:orient"'
+    )
+    stage.write_text(text)
+    with pytest.raises(InputError, match=r"/rig/shot at 1001: xformOp:orient of /rig/shot is .*expected a unit quat"):
+        read_shot(stage, size=(64, None))

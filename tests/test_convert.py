@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture
+from calls import Capture, error_line
 from models import assert_equal, random_gaussians
 from scipy.spatial.transform import Rotation
 from systems import can_link
@@ -16,6 +16,7 @@ from tiny import cameras, hidden_model
 
 from clsplat import colour, edit, formats
 from clsplat.cli import main
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 
 
@@ -286,7 +287,8 @@ def test_info_of_every_format(suffix: str, model: Path, capsys: Capture) -> None
     assert "\nGaussians     300\n" in said
 
 
-def test_info_counts_what_a_reader_refuses(model: Path, capsys: Capture) -> None:
+def test_info_counts_what_a_reader_refuses(model: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setattr("clsplat.formats.packing.require_finite", lambda *_, **__: None)
     gaussians = Gaussians.load(model)
     gaussians.means[3, 1] = np.nan
     gaussians.opacity_logits[[3, 7]] = np.inf
@@ -335,3 +337,78 @@ def test_a_folder_of_pictures_is_a_model(trained: Path, scene: Path, tmp_path: P
     (folder / "meta.json").unlink()
     assert main(["render", str(folder), "--cameras", str(scene), "-o", str(tmp_path / "{name}.png")]) == 2
     assert "not a run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["means", "quaternions", "log_scales", "opacity_logits", "sh"])
+def test_nothing_is_written_that_no_reader_takes(model: Path, name: str) -> None:
+    gaussians, before = Gaussians.load(model), model.read_bytes()
+    getattr(gaussians, name)[5] = np.nan
+    with pytest.raises(InputError, match=r"model\.ply: cannot be written: .* is not finite"):
+        gaussians.save(model)
+    assert model.read_bytes() == before
+
+
+def test_models_that_do_not_go_together(model: Path, tmp_path: Path, capsys: Capture) -> None:
+    light, far, near = (tmp_path / f"{name}.ply" for name in ("light", "far", "near"))
+    random_gaussians(20, 1).save(light, comments=[colour.comment(colour.LINEAR)])
+    placed = random_gaussians(20, 1)
+    placed.origin = np.array([4e5, 0, 3e5])
+    placed.save(far)
+    placed.origin = np.array([4e5, 1.0, 3e5])
+    placed.save(near)
+    assert convert(model, tmp_path / "a.ply", "--merge", light) == 0
+    assert (
+        f"warning: --merge {light}: its colours are of {colour.LINEAR}, those of {model} of sRGB"
+        in capsys.readouterr().err
+    )
+    assert convert(model, tmp_path / "b.ply", "--merge", far) == 0
+    assert (
+        f"--merge {far}: counts from a place 500000 world units from that of {model}; its pos"
+        in capsys.readouterr().err
+    )
+    assert convert(near, tmp_path / "c.ply", "--merge", far) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_near_plane_that_a_format_does_not_keep(model: Path, tmp_path: Path, capsys: Capture) -> None:
+    gaussians = Gaussians.load(model)
+    gaussians.near = 0.2
+    gaussians.save(model)
+    assert main(["info", str(model), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["near"] == 0.2
+    assert main(["info", str(model)]) == 0
+    assert "\nnear plane    0.2\n" in capsys.readouterr().out
+    assert convert(model, tmp_path / "a.ply") == 0
+    assert capsys.readouterr().err == ""
+    assert convert(model, tmp_path / "a.splat") == 0
+    said = "splat has no place for the near plane, which is 0.2; readers will take 0.01"
+    assert said in capsys.readouterr().err
+
+
+def test_what_mip_splatting_adds(model: Path, capsys: Capture) -> None:
+    head, _, data = model.read_bytes().partition(b"end_header\n")
+    rows = np.frombuffer(data, np.uint8).reshape(300, -1)
+    rows = np.concatenate([rows, np.full((300, 1), 0.1, "<f4").view(np.uint8)], axis=1)
+    model.write_bytes(head + b"property float filter_3D\nend_header\n" + rows.tobytes())
+    with pytest.warns(UserWarning, match=r"model\.ply: filter_3D, mip-splatting's filter, is ignored; fuse it first"):
+        assert len(Gaussians.load(model)) == 300
+    assert main(["info", str(model), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ignored"] == ["filter_3D"]
+
+
+def test_pictures_of_sh_that_are_no_more(tmp_path: Path) -> None:
+    high, low, target, other = (tmp_path / name for name in ("high.ply", "low.ply", "meta.json", "mine.webp"))
+    other.write_bytes(b"mine")
+    random_gaussians(30, 1).save(high)
+    random_gaussians(30, 0).save(low)
+    assert convert(high, target) == 0
+    assert len(list(tmp_path.glob("shN_*.webp"))) == 2
+    assert convert(low, target, "--overwrite") == 0
+    assert not list(tmp_path.glob("shN_*.webp"))
+    assert other.exists()
+
+
+@pytest.mark.parametrize("flags", [("--resolution", 200), ("--background", "white"), ("--test-every", 4)])
+def test_flags_of_a_scene_without_one(model: Path, flags: tuple[object, ...], capsys: Capture) -> None:
+    assert convert(model, model.with_name("a.splat"), *flags) == 2
+    assert f"{flags[0]}: of measuring on a scene, expected --scene with it" in error_line(capsys)

@@ -91,10 +91,17 @@ def test_more_digits_than_the_pattern_has_and_negative_ones() -> None:
     assert Pattern("a.####.exr").path(-5, "x") == Path("a.-005.exr")
 
 
-@pytest.mark.parametrize("pattern", ["{nmae}.png", "{}.png", "{name:04}.png", "{frames}.png"])
+@pytest.mark.parametrize(
+    "pattern",
+    ["{nmae}.png", "{}.png", "{name:04}.png", "{frames}.png", "a.%x.png", "a.%4d.png", "{frame:4d}.png", "{a b}.png"],
+)
 def test_fields_that_are_not_known(pattern: str) -> None:
     with pytest.raises(InputError, match=r"is not known, expected \{name\}, \{frame\}, #### or %04d"):
         output_paths(pattern, [(1, "a")])
+
+
+def test_what_is_no_field() -> None:
+    assert Pattern("{8f-2c}/100%/50%.png").path(1, "a") == Path("{8f-2c}/100%/50%.png")
 
 
 def test_every_frame_has_a_file_of_its_own() -> None:

@@ -25,8 +25,9 @@ from clsplat.files import temporary_name
 from clsplat.framing import Layers
 from clsplat.layers import LAYERS, Encoding
 from clsplat.paths.shot import Frame, Shot, numbered
+from clsplat.picture_config import ColourConfig, PictureConfig
 from clsplat.render_job import Record, is_complete, make_tasks, run_tasks, write_frame
-from clsplat.shading import FrameShader, RenderOptions, Shaded, Task
+from clsplat.shading import FrameShader, RenderOptions, Shaded, Task, settings_digest
 from clsplat.shutter import camera_after, stretches
 
 EVERYTHING = tuple(LAYERS)
@@ -330,3 +331,18 @@ def test_folders_are_looked_at_first(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system")))
     with pytest.raises(InputError, match="cannot be made: the disk is read-only"):
         render_job.make_folders(tasks_in(tmp_path / "new" / "shot"))
+
+
+def test_the_digest_goes_by_what_a_colour_configuration_says(tmp_path: Path) -> None:
+    here, there = tmp_path / "a.ocio", tmp_path / "b.ocio"
+    here.write_text("one")
+    there.write_text("one")
+
+    def found(path: Path) -> str:
+        pictures = PictureConfig(ColourConfig(ocio_config=str(path)))
+        return settings_digest(tasks_in(tmp_path)[0], replace(OPTIONS, pictures=pictures))
+
+    before = found(here)
+    assert found(there) == before
+    there.write_text("two")
+    assert found(there) != before

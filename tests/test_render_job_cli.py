@@ -15,6 +15,7 @@ import OpenImageIO as oiio
 import pytest
 import stress_render_kills
 from calls import Capture, error_line, left_behind
+from needs import require
 from quick import quick
 from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
@@ -293,3 +294,66 @@ def test_the_kill_test_finds_damage(shot: list[str], tmp_path: Path, monkeypatch
     monkeypatch.setattr(stress_render_kills, "kill", spoil)
     assert stress_render_kills.main(["-o", str(tmp_path), "--kills", "1", "--", *shot]) == 1
     assert json.loads(capsys.readouterr().out)["damaged"] == ["frame.0001.exr"]
+
+
+def test_frames_that_show_nothing(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    away = hidden_model(5)
+    away.means += np.float32(1000)
+    away.save(tmp_path / "away.ply")
+    for channels in ("rgb", "rgb,alpha"):
+        call = [str(tmp_path / "away.ply"), *shot[1:]]
+        assert render(call, tmp_path, "--json", "--channels", channels, "--overwrite") == 0
+        captured = capsys.readouterr()
+        assert [record["blank"] for record in json.loads(captured.out)] == [True] * COUNT
+        said = "6 of 6 frames show nothing of the model: 1, 2, 3 and 3 more; are the cameras in the model's world?"
+        assert captured.err.splitlines() == [f"clsplat: warning: {said}"]
+    assert render(shot, tmp_path, "--json", "--frames", "2") == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)[0]["blank"] is False
+    assert captured.err == ""
+
+
+@pytest.mark.parametrize("extension", ["png", "jpg", "tif", "exr"])
+def test_pictures_of_others_are_left(extension: str, shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    pattern, photo = f"a.####.{extension}", tmp_path / f"a.0002.{extension}"
+    pixels = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+    output = oiio.ImageOutput.create(str(photo))
+    assert output.open(str(photo), oiio.ImageSpec(WIDTH, HEIGHT, 3, "uint8" if extension != "exr" else "half"))
+    assert output.write_image(pixels)
+    output.close()
+    before = photo.read_bytes()
+    assert render(shot, tmp_path, pattern=pattern) == 2
+    assert f"{photo}: there already, and no frames of clsplat; name other files, or give --over" in error_line(capsys)
+    assert list(tmp_path.iterdir()) == [photo]
+    assert photo.read_bytes() == before
+    assert render(shot, tmp_path, "--overwrite", pattern=pattern) == 0
+    assert photo.read_bytes() != before
+    assert render(shot, tmp_path, pattern=pattern) == 0, "frames of its own are replaced"
+
+
+def test_flags_that_the_files_have_no_use_for(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    flags = ("--frames", "1", "--exr", "half", "--compression", "piz", "--quality", "50")
+    assert render(shot, tmp_path, *flags, pattern="a.####.png") == 0
+    assert "warning: not used for .png: --exr, --compression, --quality\n" in capsys.readouterr().err
+    assert render(shot, tmp_path, "--frames", "1", "--channels", "depth", "--background", "white", "--bits", "16") == 0
+    assert "warning: not used for .exr of these channels: --bits, --background\n" in capsys.readouterr().err
+
+
+def test_a_frame_with_a_hole_is_not_whole(shot: list[str], tmp_path: Path) -> None:
+    """Blocks that a machine did not write before it stopped: the last row is there, those in the middle are not."""
+    large = ("--width", "400", "--frames", "1", "--exr", "float")
+    assert render(shot, tmp_path, *large) == 0
+    path = tmp_path / "a.0001.exr"
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    assert len(whole) > 30_000
+    path.write_bytes(whole[:middle] + bytes(8192) + whole[middle + 8192 :])
+    assert render(shot, tmp_path, *large, "--skip-existing") == 0
+    assert path.read_bytes() == whole
+
+
+def test_a_video_that_is_too_large(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    require("av")
+    assert render(shot, tmp_path, "--width", "17000", "--height", "16", pattern="a.mp4") == 2
+    assert "a.mp4: frames of 17000x16, expected at most 16,384 pixels a side and 260 megapixels" in error_line(capsys)
+    assert not list(tmp_path.iterdir())

@@ -15,7 +15,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike, NDArray
 
-from clsplat.errors import CapacityError, InputError
+from clsplat.errors import CapacityError, InputError, amount
 
 if TYPE_CHECKING:
     from clsplat.device.context import Device
@@ -119,7 +119,7 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
     limit = device.max_allocation
     if nbytes > limit:
         raise CapacityError(
-            f"a buffer of {nbytes / 2**20:.0f} MiB is needed and {device.name} allows {limit / 2**20:.0f} MiB: "
+            f"a buffer of {amount(nbytes)} is needed and {device.name} allows {amount(limit)}: "
             "use a smaller resolution or fewer Gaussians (--density.max-gaussians)"
         )
     device.memory.check(nbytes)
@@ -127,8 +127,8 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
         buffer = _Buffer(device.context, cl.mem_flags.READ_WRITE, nbytes)
     except cl.MemoryError:
         raise CapacityError(
-            f"{device.name} has no memory left for a buffer of {nbytes / 2**20:.0f} MiB, beside the "
-            f"{device.memory.used / 2**20:.0f} MiB in use: give --max-device-mem less than that"
+            f"{device.name} has no memory left for a buffer of {amount(nbytes)}, beside the "
+            f"{amount(device.memory.used)} in use: give --max-device-mem less than that"
         ) from None
     device.memory.add(buffer, nbytes)
     if (word := _poison()) is not None:

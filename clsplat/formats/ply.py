@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from clsplat.camera import NEAR
 from clsplat.errors import InputError, examples, plain
 from clsplat.files import atomic_writer, open_input
+from clsplat.formats import packing
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 
 NAME = "3DGS PLY"
@@ -59,6 +60,8 @@ SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 ORIGIN = ["comment", "clsplat", "origin"]
 NEAR_PLANE = ["comment", "clsplat", "near"]
+FILTER = "filter_3D"
+"""Mip-splatting's property: what its renderer adds to the scales."""
 LOCAL = "clsplat_local"
 """The element that has the means as they count from the origin."""
 REQUIRED = (*POSITION, *DC, "opacity", *SCALE, *ROTATION)
@@ -104,14 +107,16 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read a 3DGS PLY: ascii or binary of either byte order, properties in any order, of any numeric type.
 
     SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45); of degree 4 (72) the fourth is left out, with a
-    warning. Other properties are ignored. Bytes after the data give a warning. Raises InputError, one line with the
-    path: not a PLY, truncated, a property missing, values that are not finite, no Gaussians, no such file.
+    warning. Other properties are ignored; FILTER, and bytes after the data, give a warning. Raises InputError, one line
+    with the path: not a PLY, truncated, a property missing, values that are not finite, no Gaussians, no such file.
     """
     path = Path(path)
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
         vertex, skipped = _vertex_element(header, path)
         rest = _check_properties(vertex, path)
+        if FILTER in dict(vertex.properties):
+            warnings.warn(plain(f"{path}: {FILTER}, mip-splatting's filter, is ignored; fuse it first"), stacklevel=4)
         if vertex.count == 0:
             raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
         gaussians = _assemble(read_vertices(file, header, path, "Gaussian"), vertex.count, rest, path)
@@ -156,7 +161,7 @@ def describe(path: Path) -> dict[str, Any]:
     vertex, _ = _vertex_element(header, path)
     known = {*REQUIRED, "nx", "ny", "nz"}
     ignored = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
-    return {"encoding": header.format, "comments": header.comments, "ignored": ignored}
+    return {"encoding": header.format, "comments": header.comments, "ignored": ignored, "near": header.near}
 
 
 def write(
@@ -170,10 +175,11 @@ def write(
 
     sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given. comments: lines of
     the header, such as `colour.comment`. Raises ValueError where the degree is lower than the model's, a comment is no
-    line of ASCII, or an array is not as `Gaussians` says.
+    line of ASCII, or an array is not as `Gaussians` says; InputError for values that are not finite.
     """
     check_comments(comments)
     gaussians.check()
+    packing.require_finite(Path(path), gaussians, writing=True)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
         raise ValueError(f"sh_degree {degree}: expected {gaussians.sh_degree} (the model's) to {MAX_SH_DEGREE}")

@@ -63,6 +63,7 @@ Progress = Callable[[str, float | None], None]
 META = "meta.json"
 PICTURES = ("means", "quats", "scales", "sh0", "shN")
 """Beginnings of the pictures' names that are written."""
+SH_PICTURES = ("shN_centroids.webp", "shN_labels.webp")
 MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
 LARGEST_TAG = 252
@@ -334,6 +335,8 @@ def write(
                 with atomic_writer(path.with_name(each.name), each.stat().st_size) as file, each.open("rb") as source:
                     shutil.copyfileobj(source, file)
             atomic_write(path, text)
+            for name in {*SH_PICTURES} - {each.name for each in files}:  # of a model that had more SH
+                path.with_name(name).unlink(missing_ok=True)
             return
         total = sum(each.stat().st_size for each in files)
         with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:  # stored: WebP is compressed
@@ -404,9 +407,10 @@ def _palette(
     rows = -(-size // PALETTE_COLUMNS)
     table = np.zeros((rows * PALETTE_COLUMNS, width, 3), np.uint8)
     table[:size] = _indices(entries, sets).reshape(size, width, 3)
-    _write_webp(folder / "shN_centroids.webp", table.reshape(rows, PALETTE_COLUMNS * width, 3))
+    centroids, marks = SH_PICTURES
+    _write_webp(folder / centroids, table.reshape(rows, PALETTE_COLUMNS * width, 3))
     halves = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)
-    files = ["shN_centroids.webp", picture("shN_labels.webp", [halves])]
+    files = [centroids, picture(marks, [halves])]
     return {"count": size, "bands": bands, "codebook": entries.tolist(), "files": files}
 
 

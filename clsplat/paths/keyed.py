@@ -17,7 +17,7 @@ from clsplat.errors import InputError
 from clsplat.paths.keys import Key, interpolate
 from clsplat.paths.nerfstudio import image_side
 from clsplat.paths.shot import MOST_FRAMES, Frame, Shot
-from clsplat.transforms import Keys, short
+from clsplat.transforms import Keys, numbers, short
 
 Float64 = NDArray[np.float64]
 
@@ -138,10 +138,7 @@ def _rotation(keys: Keys) -> Float64:
 
 def _vector(keys: Keys, name: str, size: int) -> Float64:
     given = keys.get(name)
-    try:
-        vector = np.array(given, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        vector = np.empty(0)
+    vector = numbers(given)
     if vector.shape != (size,) or not np.isfinite(vector).all():
         found = f"has no '{name}'" if given is None else f"'{name}' is {short(given)}"
         raise InputError(f"{keys.where}: {found}, expected a list of {size} numbers")

@@ -18,10 +18,13 @@ from clsplat.errors import InputError, examples
 from clsplat.files import native_name
 from clsplat.formats.usd import readable, survive
 from clsplat.paths.shot import MOST_FRAMES, Frame, Shot
-from clsplat.transforms import opengl_pose
+from clsplat.transforms import opengl_pose, short
 
 ORTHOGRAPHIC_UNIT = 0.1
 """USD measures apertures in tenths of a world unit; only of an orthographic camera that is more than a ratio."""
+
+PINHOLES = ("", "perspective", "orthographic", "pinhole")
+"""What a camera's projection may be called."""
 
 
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
@@ -186,9 +189,36 @@ def _size(path: Path, stage: Any, size: tuple[int | None, int | None], aspect: f
     return width, height
 
 
+def _check_projection(where: str, camera: Any, code: int) -> None:
+    """Raise InputError for a lens that is neither pinhole nor orthographic, in USD's words or in Omniverse's."""
+    for name in ("projection", "cameraProjectionType", "omni:lensdistortion:model"):
+        attribute = camera.GetPrim().GetAttribute(name)
+        value = attribute.Get(code) if attribute else None
+        if value is not None and str(value) not in PINHOLES:
+            raise InputError(
+                f"{where}: {name} is {short(str(value))}, expected perspective or orthographic; of other lenses "
+                "write a clsplat camera file"
+            )
+
+
+def _check_turns(where: str, camera: Any, code: int) -> None:
+    """Raise InputError for a quaternion without a length, of the camera or of what it is in: USD takes it for none."""
+    from pxr import UsdGeom
+
+    prim = camera.GetPrim()
+    while prim and not prim.IsPseudoRoot():
+        for op in UsdGeom.Xformable(prim).GetOrderedXformOps() if prim.IsA(UsdGeom.Xformable) else ():
+            turn = op.Get(code) if op.GetOpType() == UsdGeom.XformOp.TypeOrient else None
+            if turn is not None and not 1e-6 < turn.GetLength() < math.inf:
+                raise InputError(f"{where}: {op.GetOpName()} of {prim.GetPath()} is {turn}, expected a unit quaternion")
+        prim = prim.GetParent()
+
+
 def _camera(where: str, camera: Any, code: int, width: int, height: int) -> Camera:
     from pxr import UsdGeom
 
+    _check_projection(where, camera, code)
+    _check_turns(where, camera, code)
     # USD's vectors are rows, so its matrices are the transposes of ours
     matrix = np.array(camera.ComputeLocalToWorldTransform(code), np.float64).T
     rotation, translation, scale = opengl_pose(matrix, where, "transform")

@@ -13,6 +13,7 @@ from typing import Any
 from markupsafe import Markup
 
 import clsplat
+from clsplat.errors import amount
 from clsplat.evaluate import background_colour
 from clsplat.files import atomic_write
 from clsplat.gaussians import Gaussians
@@ -243,7 +244,7 @@ def machine_rows(figures: Figures) -> list[tuple[str, str]]:
         rows += [("kernels' shape", each["shape"])] if "shape" in each else []
         rows += [("system", each["system"])] if "system" in each else []
         if each["memory_limit"] is not None:
-            rows.append(("memory limit", f"{each['memory_limit'] / 2**20:,.0f} MiB"))
+            rows.append(("memory limit", amount(each["memory_limit"])))
         versions = each.get("versions", {})
         rows.append(("versions", ", ".join(f"{name} {text}" for name, text in versions.items()) or "not known"))
     rows.append(("seed", str(run.config.seed)))
