@@ -309,6 +309,7 @@ def _read_colmap(
     model_path = colmap.find_model(path)
     assert model_path is not None  # detect has found it
     model = colmap.read_model(model_path)
+    heard += model.warnings
     if len(model.points) == 0:
         heard.append(f"{model_path}: has no points, training starts from random ones")
     # The model's own folder may be what was given: then the pictures are beside one of those above it.
