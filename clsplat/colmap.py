@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.errors import InputError, plain
 from clsplat.files import is_file, open_input
-from clsplat.undistort import Lens, check_lens, models
+from clsplat.undistort import Lens, absurd, check_lens, models
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -109,7 +109,8 @@ def read_cameras(folder: Path) -> dict[str, Camera]:
     """The cameras of a model by image name, sorted; points and pictures are not looked at.
 
     folder: a model's own or a scene's, as `find_model`. Cameras with distortion become the pinhole cameras that a
-    scene is trained with (`Lens.pinhole`), at full size. Raises InputError and warns as `read_model`.
+    scene is trained with (`Lens.pinhole`), at full size. Raises InputError and warns as `read_model`, and
+    warns of lenses beyond reason.
     """
     model = find_model(Path(folder))
     if model is None:
@@ -117,12 +118,14 @@ def read_cameras(folder: Path) -> dict[str, Camera]:
     pinholes: dict[Lens, Camera] = {}
     cameras = {}
     heard = _passed_over(model)
-    for image in _read_images(model, _read_cameras(model, heard), heard):
+    images = _read_images(model, _read_cameras(model, heard), heard)
+    for image in images:
         if image.lens not in pinholes:
             pinholes[image.lens] = image.lens.pinhole(np.eye(3), np.zeros(3))
         cameras[image.name] = replace(pinholes[image.lens], rotation=image.rotation, translation=image.translation)
-    for text in heard:
-        warnings.warn(plain(text), stacklevel=2)
+    for text in (*heard, absurd([(image.name, image.lens) for image in images])):
+        if text:
+            warnings.warn(plain(text), stacklevel=2)
     return cameras
 
 

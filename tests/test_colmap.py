@@ -246,6 +246,13 @@ def test_read_cameras(tmp_path: Path) -> None:
         read_cameras(tmp_path / "bin")
 
 
+def test_an_absurd_lens_is_told_where_cameras_alone_are_read(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 48 32 40 24 16 5\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n")
+    with pytest.warns(UserWarning, match=r"a\.png bends the picture beyond reason \(SIMPLE_RADIAL 40 24 16 5\)"):
+        read_cameras(tmp_path)
+
+
 def test_rotation_from_quaternion() -> None:
     quaternion = np.array([0.5, 0.1, -0.7, 0.3])
     quaternion /= np.linalg.norm(quaternion)
