@@ -40,6 +40,8 @@ Progress = Callable[[str, float | None], None]
 
 FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")
 """Stages that are measured in a frame; the others in a training step."""
+GAUSSIAN_BYTES = 4 * 59 * 4
+"""Of a Gaussian of SH degree 3 in a training step: parameters, gradients and two moments."""
 
 
 @dataclass(frozen=True, eq=False)

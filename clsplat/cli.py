@@ -38,7 +38,7 @@ from clsplat.config import (
     TrainConfig,
     bundled,
 )
-from clsplat.errors import ClsplatError, InputError, system_trouble
+from clsplat.errors import ClsplatError, InputError, switched_on, system_trouble
 from clsplat.picture_config import ColourConfig, DeepConfig, FramingConfig, SamplingConfig, VideoConfig
 from clsplat.process import reader_has_gone, status_of, terminable
 
@@ -61,7 +61,7 @@ class Demo:
     """Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable."""
 
     output: Output
-    """Folder for everything the demo makes."""
+    """Folder for everything the demo makes: a new one, or one that a demo has made, which is made anew."""
     iterations: int = DEMO_ITERATIONS
     """Training steps. A few hundred show that all works, and less of the scene."""
     device: Device = None
@@ -355,7 +355,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    debug = os.environ.get("CLSPLAT_DEBUG", "") not in ("", "0")
+    try:
+        debug = switched_on("CLSPLAT_DEBUG")
+    except InputError as error:
+        _tell(f"clsplat: error: {error}")
+        return error.exit_status
     with warnings.catch_warnings():
         warnings.showwarning = cast("Any", _show_warning)
         if not debug:

@@ -10,10 +10,12 @@ from __future__ import annotations
 import io
 import math
 import os
+import re
 import struct
+import warnings
 from array import array
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO, TypeVar
 
@@ -21,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.errors import InputError
+from clsplat.errors import InputError, plain
 from clsplat.files import is_file, open_input
-from clsplat.undistort import Lens, check_lens, models
+from clsplat.undistort import Lens, absurd, check_lens, models
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -38,6 +40,11 @@ MAX_LINE = 1 << 26
 MAX_NUMBER = 1e30
 """Coordinates beyond it are damage; their squares are still finite."""
 WINDOW = 1 << 20
+NEWER = 60.0
+"""Seconds by which a text file is newer than its binary one where somebody has edited it since: tools that write both,
+and programs that copy them, are done with the second sooner."""
+ANNOUNCED = re.compile(r"# *Number of (?:cameras|images|points): *(\d{1,18})\b")
+POSE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 EXPECTED = "a file of a COLMAP model"
 
 
@@ -56,11 +63,13 @@ class ModelImage:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """images by name, in order; points (N, 3) float64 in the world; colors (N, 3) float32 in [0, 1]."""
+    """images by name, in order; points (N, 3) float64 in the world; colors (N, 3) float32 in [0, 1]; warnings: what a
+    user should hear, a line each."""
 
     images: list[ModelImage]
     points: Float64
     colors: Float32
+    warnings: list[str] = field(default_factory=list)
 
 
 def find_model(folder: Path) -> Path | None:
@@ -84,31 +93,39 @@ def read_model(folder: Path) -> Model:
     """Read the model in `folder`; each of the three files as .bin if there, else as .txt.
 
     points3D may be missing, there are no points then. Raises InputError, naming the file, for one that is missing,
-    cut short, longer than its contents, damaged, or of a camera model that is unknown.
+    cut short, longer than its contents, damaged, or of a camera model that is unknown. The model's warnings tell of
+    text with less than its header announces, and of text that is newer than the binary file that is read.
     """
-    lenses = _read_cameras(folder)
-    images = _read_images(folder, lenses)
+    heard = _passed_over(folder)
+    lenses = _read_cameras(folder, heard)
+    images = _read_images(folder, lenses, heard)
     if _file(folder, "points3D") is None:
-        return Model(images, np.empty((0, 3)), np.empty((0, 3), np.float32))
-    points, colors = _read_points(folder)
-    return Model(images, points, colors)
+        return Model(images, np.empty((0, 3)), np.empty((0, 3), np.float32), heard)
+    points, colors = _read_points(folder, heard)
+    return Model(images, points, colors, heard)
 
 
 def read_cameras(folder: Path) -> dict[str, Camera]:
     """The cameras of a model by image name, sorted; points and pictures are not looked at.
 
     folder: a model's own or a scene's, as `find_model`. Cameras with distortion become the pinhole cameras that a
-    scene is trained with (`Lens.pinhole`), at full size. Raises InputError as `read_model`.
+    scene is trained with (`Lens.pinhole`), at full size. Raises InputError and warns as `read_model`, and
+    warns of lenses beyond reason.
     """
     model = find_model(Path(folder))
     if model is None:
         raise InputError(f"{folder}: no COLMAP model, expected cameras and images (.bin or .txt) in it or in sparse/0")
     pinholes: dict[Lens, Camera] = {}
     cameras = {}
-    for image in _read_images(model, _read_cameras(model)):
+    heard = _passed_over(model)
+    images = _read_images(model, _read_cameras(model, heard), heard)
+    for image in images:
         if image.lens not in pinholes:
             pinholes[image.lens] = image.lens.pinhole(np.eye(3), np.zeros(3))
         cameras[image.name] = replace(pinholes[image.lens], rotation=image.rotation, translation=image.translation)
+    for text in (*heard, absurd([(image.name, image.lens) for image in images])):
+        if text:
+            warnings.warn(plain(text), stacklevel=2)
     return cameras
 
 
@@ -216,13 +233,40 @@ def _claimed_images(folder: Path) -> int:
     return sum(1 for _ in _image_lines(path))
 
 
-def _read_cameras(folder: Path) -> dict[int, Lens]:
+def _passed_over(folder: Path) -> list[str]:
+    """A warning where somebody has edited text that is not read, as a binary file goes before it."""
+    edited = []
+    for stem in STEMS:
+        binary, text = folder / f"{stem}.bin", folder / f"{stem}.txt"
+        if is_file(binary) and is_file(text) and text.stat().st_mtime > binary.stat().st_mtime + NEWER:
+            edited.append(stem)
+    if not edited:
+        return []
+    read, not_read = (", ".join(stem + extension for stem in edited) for extension in (".bin", ".txt"))
+    return [f"{folder}: {read} is read and not the newer {not_read}; remove what is not meant"]
+
+
+def _check_count(path: Path, found: int, heard: list[str]) -> None:
+    """Text that is cut at the end of a line has nothing else that is wrong."""
+    if path.suffix != ".txt":
+        return
+    announced = 0
+    with open_input(path, EXPECTED) as file:
+        while (line := file.readline(MAX_NAME_BYTES)).lstrip(b"\xef\xbb\xbf").startswith(b"#"):
+            if match := ANNOUNCED.match(line.lstrip(b"\xef\xbb\xbf").decode("utf-8", "replace")):
+                announced = int(match[1])
+    if found < announced:
+        heard.append(f"{path}: its header announces {announced:,}, and it holds {found:,}; is it cut, or edited since?")
+
+
+def _read_cameras(folder: Path, heard: list[str]) -> dict[int, Lens]:
     path = _require(folder, "cameras")
     lenses: dict[int, Lens] = {}
     for key, lens in _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path):
         if key in lenses:
             raise corrupt(path, f"camera {key} is there twice")
         lenses[key] = check_lens(lens, f"{path}: camera {key}")
+    _check_count(path, len(lenses), heard)
     return lenses
 
 
@@ -249,7 +293,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
         yield _parsed(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse, line.split())
 
 
-def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[ModelImage]:
+def _read_images(folder: Path, lenses: dict[int, Lens], heard: list[str]) -> list[ModelImage]:
     path = _require(folder, "images")
     images: dict[str, ModelImage] = {}
     for name, camera, pose in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
@@ -266,6 +310,7 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[ModelImage]:
         images[name] = ModelImage(name, lenses[camera], rotation_from_quaternion(quaternion / norm), translation)
     if not images:
         raise InputError(f"{path}: holds no images, expected at least one")
+    _check_count(path, len(images), heard)
     return [images[name] for name in sorted(images)]
 
 
@@ -281,30 +326,45 @@ def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
             yield name, int(camera), tuple(pose)
 
 
-def _image_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """The first line of each pair; the second, the observations, may be empty, but not missing in the middle."""
-    lines = _lines(path, keep_empty=True)
-    for number, line in lines:
-        if line:
-            yield number, line
-            next(lines, None)
+def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
+    """Number, text and what is expected, of the first line of each pair. The second, the observations, may be empty;
+    some tools leave it out."""
+    after_pose = False
+    for number, line in _lines(path, keep_empty=True):
+        if after_pose and (not line or _are_observations(line)):
+            after_pose = False
+        elif line:
+            yield number, line, f"X Y POINT3D_ID, again and again, or as {POSE}" if after_pose else POSE
+            after_pose = True
+
+
+def _are_observations(line: str) -> bool:
+    """Whether a line is of numbers in threes; the first line of a pair ends with a name."""
+    words = line.split()
+    try:
+        float(words[-1])
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
     def parse(words: list[str]) -> tuple[str, int, tuple[float, ...]]:
+        int(words[0])
         return words[9], int(words[8]), tuple(map(float, words[1:8]))
 
-    for number, line in _image_lines(path):
+    for number, line, expected in _image_lines(path):
         # the name is the rest of the line, blanks and all
-        yield _parsed(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", parse, line.split(maxsplit=9))
+        yield _parsed(path, number, expected, parse, line.split(maxsplit=9))
 
 
-def _read_points(folder: Path) -> tuple[Float64, Float32]:
+def _read_points(folder: Path, heard: list[str]) -> tuple[Float64, Float32]:
     path = _require(folder, "points3D")
     values = array("d")  # a list of tuples would take six times the memory
     for row in _binary_points(path) if path.suffix == ".bin" else _text_points(path):
         values.extend(row)
     table = np.frombuffer(values, np.float64).reshape(-1, 6) if values else np.empty((0, 6))
+    _check_count(path, len(table), heard)
     near = (np.abs(table[:, :3]) < MAX_NUMBER).all(axis=1)
     good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all(axis=1)
     if not good.all():
@@ -327,6 +387,8 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
     def parse(words: list[str]) -> tuple[float, ...]:
         _, x, y, z, red, green, blue, _ = words[:8]
+        if len(words) > 8 and len(words[8].split()) % 2:
+            raise ValueError("a track is of pairs")
         return float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue))
 
     for number, line in _lines(path):

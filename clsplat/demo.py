@@ -12,13 +12,17 @@ from typing import Any
 from clsplat import sfm
 from clsplat.config import DEMO_ITERATIONS, TrainConfig
 from clsplat.demo_scene import Progress, ignore_progress, write_photos
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples
+from clsplat.files import atomic_write, is_file
 from clsplat.locks import locked
 from clsplat.trajectory import turntable
 
 PHOTOS = 40
 WIDTH, HEIGHT = 320, 240
 TURNTABLE_FRAMES = 60
+MARK = ".clsplat-demo"
+"""The file that says of a folder that a demo has made what is in it."""
+MADE = ("photos", "scene", "run", "turntable")
 
 
 def run_demo(
@@ -32,7 +36,21 @@ def run_demo(
     """
     output.mkdir(parents=True, exist_ok=True)
     with locked(output, "demo"):
+        claim(output)
         return _run_demo(output, device=device, iterations=iterations, frames=frames)
+
+
+def claim(output: Path) -> None:
+    """Mark a folder as a demo's. Raises InputError where it has what a demo would replace, and is not marked."""
+    if is_file(output / MARK):
+        return
+    found = [name for name in MADE if (output / name).exists() or (output / name).is_symlink()]
+    if found:
+        raise InputError(
+            f"{output}: holds {examples(found, len(MADE))}, which no demo has made and a demo would replace; choose "
+            "another folder, or remove them"
+        )
+    atomic_write(output / MARK, b"What is beside this file was made by clsplat demo, which may replace it.\n")
 
 
 def _run_demo(output: Path, *, device: str | None, iterations: int, frames: int) -> dict[str, Any]:

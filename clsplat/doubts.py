@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config import Background
+from clsplat.errors import examples
+from clsplat.undistort import absurd
 
 if TYPE_CHECKING:
     from clsplat.scene import Scene, View
@@ -26,19 +28,16 @@ COINCIDENT = 0.05
 """Part of the points that may lie where another one does."""
 BEYOND = 0.5
 """Widths, or heights, of the picture that a principal point may lie beyond its edge."""
-BENT = 0.5
-"""Half widths or heights of the picture by which a lens may move what is at its edge."""
 WHITE, BLACK = 0.98, 0.02
 """From there, and up to there, a channel is taken for white and black."""
 BORDER = 0.9
 """Part of the pictures' border that is the background, where it is one."""
-NAMED = 3
-"""Views that a warning names."""
 
 
 def of_scene(scene: Scene, background: Background) -> list[str]:
     """What is wrong with the scene's points, cameras and photographs, or with the background for them."""
-    found = (_coincident(scene), _principal_points(scene), _lenses(scene), _background(scene, background))
+    lenses = absurd([(view.name, view.lens) for view in scene.views])
+    found = (_coincident(scene), _principal_points(scene), lenses, _one_place(scene), _background(scene, background))
     return [text for text in found if text]
 
 
@@ -100,36 +99,18 @@ def _principal_points(scene: Scene) -> str:
     camera = views[0].camera
     where = f"{camera.cx:g} {camera.cy:g} in {camera.width} x {camera.height} pixels"
     return (
-        f"the principal point of {_listed(views)} lies far outside the picture, at {where}: check cx and cy, which are "
-        "pixels from the upper left corner at the cameras' size"
+        f"the principal point of {examples(view.name for view in views)} lies far outside the picture, at {where}: "
+        "check cx and cy, which are pixels from the upper left corner at the cameras' size"
     )
 
 
-def _lenses(scene: Scene) -> str:
-    views = [view for view in scene.views if not view.lens.is_pinhole and _bends(view)]
-    if not views:
+def _one_place(scene: Scene) -> str:
+    if len(scene.views) < 2 or not scene.in_one_place:
         return ""
-    lens = views[0].lens
-    params = " ".join(f"{value:g}" for value in lens.params)
     return (
-        f"the lens of {_listed(views)} bends the picture beyond reason ({lens.model} {params}): check its "
-        "coefficients, and their order"
+        f"all {len(scene.train_views):,} training cameras stand in one place, from where nothing has a depth: check "
+        "the translations of the poses; of photographs that were taken so, views from elsewhere cannot be learnt"
     )
-
-
-def _bends(view: View) -> bool:
-    """Whether the lens moves what a pinhole camera of its focal length has at the picture's edge by a large part of it.
-    Fisheyes and the like are meant to."""
-    lens = view.lens
-    if lens.model in ("FOV", "EUCM") or "FISHEYE" in lens.model:
-        return False
-    pinhole = lens.pinhole(np.eye(3), np.zeros(3))
-    half = np.array([lens.width, lens.height]) / 2
-    edge = half * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
-    rays = np.concatenate([edge / [pinhole.fx, pinhole.fy], np.ones((len(edge), 1))], axis=1)
-    pixels = lens.img_from_cam(rays)
-    moved = pixels - pixels[len(pixels) // 2] - edge
-    return not bool((np.abs(moved) <= BENT * half).all())
 
 
 def _background(scene: Scene, background: Background) -> str:
@@ -148,8 +129,3 @@ def _background(scene: Scene, background: Background) -> str:
                 f"use --background {name}, else Gaussians have to cover it"
             )
     return ""
-
-
-def _listed(views: Sequence[View]) -> str:
-    names = ", ".join(view.name for view in views[:NAMED])
-    return names if len(views) <= NAMED else f"{names} and {len(views) - NAMED} more"

@@ -84,6 +84,14 @@ def system_trouble(error: OSError) -> str:
     return plain(": ".join([" to ".join(names), reason_of(error)] if names else [reason_of(error)]))
 
 
+def switched_on(variable: str) -> bool:
+    """Whether a variable of the environment is 1; unset, empty and 0 are no. Raises InputError for anything else."""
+    value = os.environ.get(variable, "")
+    if value not in ("", "0", "1"):
+        raise InputError(f"{variable}={value}: expected 1, or 0")
+    return value == "1"
+
+
 class DeviceError(InputError):
     """No OpenCL device, or not the one asked for."""
 
@@ -97,7 +105,11 @@ class KernelBuildError(ClsplatError):
         self.log, self.source = log, source
 
     def __str__(self) -> str:
-        return f"{self.args[0]}\n{self.log}\n{self.source}" if os.environ.get("CLSPLAT_DEBUG") else str(self.args[0])
+        return (
+            f"{self.args[0]}\n{self.log}\n{self.source}"
+            if os.environ.get("CLSPLAT_DEBUG") == "1"
+            else str(self.args[0])
+        )
 
 
 class DriverError(ClsplatError):

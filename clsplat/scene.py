@@ -164,16 +164,27 @@ class Scene:
         return origin
 
     @cached_property
+    def _spread(self) -> tuple[Float64, float]:
+        """The middle of the training cameras, and how far the farthest is from there."""
+        centres = np.stack([view.camera.position for view in self.train_views or self.views])
+        middle: Float64 = centres.mean(axis=0)
+        return middle, float(np.linalg.norm(centres - middle, axis=1).max())
+
+    @cached_property
+    def in_one_place(self) -> bool:
+        """Whether all training cameras are, but for rounding."""
+        centres = np.stack([view.camera.position for view in self.train_views or self.views])
+        return self._spread[1] <= ROUNDING * float(np.abs(centres).max())
+
+    @cached_property
     def extent(self) -> float:
         """The authors' cameras_extent, world units: 1.1 times the farthest training camera's distance from their mean.
 
         If the cameras are all in one place, the median distance of the points from there, or 1 if there are none: it
         scales the learning rates.
         """
-        centres = np.stack([view.camera.position for view in self.train_views or self.views])
-        middle = centres.mean(axis=0)
-        spread = float(np.linalg.norm(centres - middle, axis=1).max())
-        if spread > ROUNDING * float(np.abs(centres).max()):
+        middle, spread = self._spread
+        if not self.in_one_place:
             return 1.1 * spread
         return (float(np.median(np.linalg.norm(self.points - middle, axis=1))) if len(self.points) else 0.0) or 1.0
 
@@ -309,6 +320,7 @@ def _read_colmap(
     model_path = colmap.find_model(path)
     assert model_path is not None  # detect has found it
     model = colmap.read_model(model_path)
+    heard += model.warnings
     if len(model.points) == 0:
         heard.append(f"{model_path}: has no points, training starts from random ones")
     # The model's own folder may be what was given: then the pictures are beside one of those above it.

@@ -21,7 +21,7 @@ from typing import IO, Any, Literal
 
 from clsplat import sfm_photos
 from clsplat.errors import ClsplatError, InputError, examples
-from clsplat.files import parse_json, read_document, replace
+from clsplat.files import is_file, parse_json, read_document, replace
 from clsplat.process import apart
 
 Progress = Callable[[str, float | None], None]
@@ -130,6 +130,7 @@ def reconstruct(
         result = answer["result"]
         missing = sorted({photo.name for photo in photos} - set(result["registered"]))
         record = {"fingerprint": fingerprint, "photos": len(photos), "unregistered": missing, **result}
+        record["files"] = _sizes(work / "result")
         (work / "result" / RECORD).write_bytes((json.dumps(record, indent=2) + "\n").encode())
         if missing:
             lost = _listed([images / name for name in missing], images)
@@ -188,14 +189,30 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
             raise InputError(f"{output}: is not empty and not a result of sfm, expected a new folder") from None
         return False
     complete = (output / "sparse/0/images.bin").is_file() and (output / "images").is_dir()
-    if complete and record.get("fingerprint") == fingerprint:
+    files = record.get("files")
+    was = files if isinstance(files, dict) else {}  # results of before have no such list
+    now = _sizes(output)
+    changed = sorted(name for name, size in was.items() if now.get(name) != size)
+    if complete and not changed and record.get("fingerprint") == fingerprint:
         return True
+    if changed and not overwrite:
+        raise InputError(
+            f"{output}: {examples(changed)} are gone or changed since the cameras were recovered; remove the folder, "
+            "or make it anew with clsplat sfm --overwrite"
+        )
     if not overwrite:
         raise InputError(
             f"{output}: holds cameras recovered from other photos or settings than {images} now; "
             "remove it or choose another folder"
         )
     return False
+
+
+def _sizes(result: Path) -> dict[str, int]:
+    """Bytes of the files of a result, by their names in it."""
+    folders = (result / "images", result / "sparse")
+    found = (path for folder in folders for path in folder.rglob("*"))
+    return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(found) if is_file(path)}
 
 
 def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:

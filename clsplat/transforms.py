@@ -13,18 +13,19 @@ import math
 import os
 import posixpath
 import re
-from dataclasses import dataclass, field
+import warnings
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples, plain
 from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.formats import ply
 from clsplat.images import EXTENSIONS, image_size, require_images
-from clsplat.undistort import Lens, check_lens
+from clsplat.undistort import Lens, absurd, check_lens
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -38,8 +39,13 @@ LAST_ROW = 1e-6
 MAX_NUMBER = 1e30
 """Larger ones are damage; their squares are still finite."""
 PERSPECTIVE = ("", "PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+ROUNDING = 1e-6
+"""What a pose may have in its last row for 0."""
 FISHEYE = ("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 RGB = ("red", "green", "blue")
+AGREE = 0.02
+"""Part by which a focal length may differ from what the angle of view beside it makes of it: tools round angles, and
+some take them before they refine the lens."""
 EXPORT_AGAIN = "export the data set anew or add it"
 
 
@@ -76,16 +82,20 @@ def read_transforms(path: Path) -> Transforms:
     """Read one transforms.json.
 
     Intrinsics may stand in the file or in each frame: `fl_x fl_y` or `camera_angle_x camera_angle_y`, `cx cy` (the
-    middle if absent), `w h` (the picture's own size if absent), `k1 k2 k3 k4 p1 p2`, `camera_model` or `is_fisheye`.
+    middle if absent), `w h` (the picture's own size, or its proportions, if absent), `k1 k2 k3 k4 p1 p2`,
+    `camera_model` or `is_fisheye`.
     `file_path` is relative to the file, with or without extension. nerfstudio's `ply_file_path` and its
-    `train_filenames`, `val_filenames` and `test_filenames` are honoured. Raises InputError that names the file and the
-    key for JSON that does not parse, a key that is missing or of the wrong kind, and listed pictures that are missing.
+    `train_filenames`, `val_filenames` and `test_filenames` are honoured: what is in the last two, or not in the first,
+    is held out. The result's warnings tell of what is ignored and of what contradicts itself. Raises InputError that
+    names the file and the key for JSON that does not parse, a key that is missing or of the wrong kind, and listed
+    pictures that are missing.
     """
     document = load_document(path)
     readers = _readers(path, document)
     files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
     require_images(files, path)
-    result = Transforms(_frames(path, readers, files))
+    frames, heard = _frames(path, readers, files)
+    result = Transforms(frames, warnings=heard)
     if any("mask_path" in keys.frame for keys in readers):
         result.warnings.append(f"{path}: 'mask_path' is ignored, masks are not supported")
     result.box = _ngp_box(Keys(path, None, {}, document))
@@ -97,10 +107,16 @@ def read_poses(path: Path, size: tuple[int, int] | None = None) -> list[Frame]:
     """The cameras of a transforms.json alone, in its order.
 
     Its pictures need not be there where the file says `w h`; else, where a picture is missing, too, it counts as one of
-    `size`, (width, height). Raises InputError as `read_transforms`.
+    `size`, (width, height). Raises InputError as `read_transforms`; warns of what contradicts itself, and of
+    lenses beyond reason.
     """
     readers = _readers(path, load_document(path))
-    return _frames(path, readers, [_find_file(path.parent, keys.text("file_path")) for keys in readers], size)
+    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
+    frames, heard = _frames(path, readers, files, size)
+    for text in (*heard, absurd([(frame.name, frame.lens) for frame in frames])):
+        if text:
+            warnings.warn(plain(text), stacklevel=2)
+    return frames
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
@@ -113,22 +129,74 @@ def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
     return readers
 
 
-def _frames(path: Path, readers: list[Keys], files: list[Path], size: tuple[int, int] | None = None) -> list[Frame]:
-    held_out = _held_out(readers[0].document)
+def _frames(
+    path: Path, readers: list[Keys], files: list[Path], size: tuple[int, int] | None = None
+) -> tuple[list[Frame], list[str]]:
+    """The frames, and warnings of what contradicts itself."""
     frames = []
     for keys, file in zip(readers, files, strict=True):
         listed = keys.text("file_path")
-        split = None if held_out is None else "test" if _plain(listed) in held_out else "train"
         lens = _lens(keys, file, size)
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
         name = _plain(listed) + file.name[len(PurePosixPath(_plain(listed)).name) :]  # with the extension found
-        frames.append(Frame(name, file, lens, rotation, translation, split))
+        frames.append(Frame(name, file, lens, rotation, translation))
     seen: set[str] = set()
     for frame in frames:
         if frame.name in seen:
             raise InputError(f"{path}: lists {frame.name} twice, expected each picture once; remove one of the frames")
         seen.add(frame.name)
-    return frames
+    heard = _contradictions(path, readers, frames)
+    return _split(path, readers, frames, heard), heard
+
+
+def _split(path: Path, readers: list[Keys], frames: list[Frame], heard: list[str]) -> list[Frame]:
+    """The frames with nerfstudio's own split, where the file has one."""
+    known = {frame.name: frame.name for frame in frames}
+    known |= {_plain(keys.text("file_path")): frame.name for keys, frame in zip(readers, frames, strict=True)}
+    listed = []
+    for key in ("train_filenames", "test_filenames", "val_filenames"):
+        names = readers[0].document.get(key) or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{path}: '{key}' is {short(names)}, expected a list of file names; correct or remove it")
+        if lost := [name for name in names if _plain(name) not in known]:
+            heard.append(f"{path}: '{key}' lists {examples(lost)}, and no frame has that as its 'file_path'")
+        listed.append({known[_plain(name)] for name in names if _plain(name) in known})
+    train, held_out = listed[0], listed[1] | listed[2]
+    if not (train or held_out):
+        return frames
+    trained = (train or set(known.values())) - held_out
+    if not trained:
+        raise InputError(
+            f"{path}: 'test_filenames' and 'val_filenames' hold out all {len(frames)} pictures, expected some to train "
+            "on; remove these keys for a split of --test-every"
+        )
+    return [replace(frame, split="train" if frame.name in trained else "test") for frame in frames]
+
+
+def _contradictions(path: Path, readers: list[Keys], frames: list[Frame]) -> list[str]:
+    heard = []
+    for axis in "xy":
+        focal, angle = f"fl_{axis}", f"camera_angle_{axis}"
+        found = []
+        for keys, frame in zip(readers, frames, strict=True):
+            used, other = keys.number(focal), keys.get(angle)
+            # one of the frame goes before one of the file, which is of other frames then
+            alike = (keys.frame.get(focal) is None) == (keys.frame.get(angle) is None)
+            if used and alike and isinstance(other, int | float) and 0 < other < math.pi:
+                size = frame.lens.width if axis == "x" else frame.lens.height
+                meant = 0.5 * size / math.tan(0.5 * other)
+                if abs(used / meant - 1) > AGREE:
+                    found.append(f"{frame.name} ({used:g}, not {meant:.4g})")
+        if found:
+            heard.append(f"{path}: '{focal}' is used, '{angle}' says otherwise of {examples(found)}")
+    if any(_shutter(keys.get("rolling_shutter")) for keys in readers):
+        heard.append(f"{path}: 'rolling_shutter' is ignored, pictures are taken as exposed at once")
+    return heard
+
+
+def _shutter(value: object) -> bool:
+    """Whether a rolling shutter does anything."""
+    return any(value) if isinstance(value, list) else bool(value)
 
 
 def read_blender(folder: Path) -> Transforms:
@@ -233,15 +301,6 @@ def _inside(folder: Path, listed: str, where: str) -> None:
         )
 
 
-def _held_out(document: dict[str, Any]) -> set[str] | None:
-    """nerfstudio's own split: the names of test_filenames, or of val_filenames where there are none to test."""
-    for key in ("test_filenames", "val_filenames"):
-        names = document.get(key)
-        if isinstance(names, list) and names:
-            return {_plain(name) for name in names if isinstance(name, str)}
-    return None
-
-
 def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
     width, height = keys.number("w"), keys.number("h")
     if width is None or height is None:
@@ -251,9 +310,16 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
                     f"{keys.where}: has no 'w' and 'h', nor is its picture there: {file}; give both --width and "
                     "--height"
                 )
-            width, height = size
+            found = size
         else:
-            width, height = image_size(file, orient=False)
+            found = image_size(file, orient=False)
+        if width is not None:  # the other one in the picture's proportions
+            height = width * found[1] / found[0]
+        elif height is not None:
+            width = height * found[0] / found[1]
+        else:
+            width, height = found
+    assert height is not None
     fx = _focal(keys, "fl_x", "camera_angle_x", width)
     fy = _focal(keys, "fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
@@ -325,6 +391,11 @@ def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64,
     matrix = numbers(given)
     if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < MAX_NUMBER).all():
         raise InputError(f"{where}: {what} is {short(given)}, expected 4 x 4 finite numbers")
+    if matrix.shape == (4, 4) and np.abs(matrix[3, :3]).max() > ROUNDING:
+        raise InputError(
+            f"{where}: {what} has {' '.join(f'{value:g}' for value in matrix[3])} as its last row, expected 0 0 0 1; "
+            "the translation belongs into the last column: transpose the matrix"
+        )
     # A scaled camera object leaves its scale in the matrix; a camera has none.
     determinant = float(np.linalg.det(matrix[:3, :3]))
     scale = float(np.cbrt(determinant))

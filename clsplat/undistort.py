@@ -7,6 +7,7 @@ The models and their formulas are COLMAP's, evaluated by pycolmap (`Camera.img_f
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsplat.camera import Camera
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples
 from clsplat.images import associate, downscale, unassociate
 from clsplat.process import undisturbed
 
@@ -29,6 +30,8 @@ REFUSED = {"EQUIRECTANGULAR": "a panorama has no pinhole camera; cut it into per
 
 MAX_SIZE = 1 << 20
 """Pixels a side; larger is a damaged file. Also keeps width times height far from overflow."""
+BENT = 0.5
+"""Half widths or heights of the picture by which a lens may move what is at its edge."""
 
 
 @cache
@@ -131,6 +134,34 @@ def check_lens(lens: Lens, where: str) -> Lens:
     if not all(math.isfinite(value) for value in lens.params) or min(focal) <= 0:
         raise InputError(f"{where}: parameters {list(lens.params)}, expected finite ones, focal lengths above 0")
     return lens
+
+
+def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
+    """A warning of the pictures whose lens bends beyond reason, or nothing. lenses: with the pictures' names."""
+    bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
+    found = [(name, lens) for name, lens in lenses if bend[lens]]
+    if not found:
+        return ""
+    lens = found[0][1]
+    params = " ".join(f"{value:g}" for value in lens.params)
+    return (
+        f"the lens of {examples(name for name, _ in found)} bends the picture beyond reason ({lens.model} {params}): "
+        "check its coefficients, and their order"
+    )
+
+
+def _bends(lens: Lens) -> bool:
+    """Whether the lens moves what a pinhole camera of its focal length has at the picture's edge by a large part of it.
+    Fisheyes and the like are meant to."""
+    if lens.is_pinhole or lens.model in ("FOV", "EUCM") or "FISHEYE" in lens.model:
+        return False
+    pinhole = lens.pinhole(np.eye(3), np.zeros(3))
+    half = np.array([lens.width, lens.height]) / 2
+    edge = half * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    rays = np.concatenate([edge / [pinhole.fx, pinhole.fy], np.ones((len(edge), 1))], axis=1)
+    pixels = lens.img_from_cam(rays)
+    moved = pixels - pixels[len(pixels) // 2] - edge
+    return not bool((np.abs(moved) <= BENT * half).all())
 
 
 def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:

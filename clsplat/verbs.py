@@ -317,6 +317,9 @@ def bench(verb: Bench) -> int:
     progress = StageProgress()
     device = require(Device(select(verb.device), profile=True))
     device.memory.limit = limit
+    most = int(device.cl_device.global_mem_size) // measure.GAUSSIAN_BYTES
+    if verb.source is None and verb.gaussians > most:
+        raise InputError(f"--gaussians {verb.gaussians}: expected at most {most}, which fill {device.name}'s memory")
     if verb.source is None:
         subject = measure.synthetic(verb.gaussians, *(size or (1024, 768)))
     else:

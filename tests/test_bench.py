@@ -424,6 +424,7 @@ def test_plot_without_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (["--size", "100"], "--size 100"),
         (["--size", "0x5"], "--size 0x5"),
         (["--gaussians", "0"], "--gaussians 0"),
+        (["--gaussians", "99999999999"], "--gaussians 99999999999: expected at most "),
         (["--repeat", "0"], "--repeat 0"),
         (["nowhere.ply"], "nowhere.ply"),
         (["--plot", "a.pdf"], "a.pdf"),

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import os
 import random
 import shutil
 from pathlib import Path
@@ -68,6 +69,71 @@ def test_text_without_observations_and_points(tmp_path: Path) -> None:
     np.testing.assert_array_equal(model.images[1].translation, [1, 2, 3])
     np.testing.assert_array_equal(model.images[1].rotation, np.eye(3))  # the quaternion 1.5 0 0 0 is normalised
     assert model.points.shape == model.colors.shape == (0, 3)
+
+
+def test_text_without_the_lines_of_observations(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 8 6 10 4 3\n")
+    pose = "1 0 0 0 0 0 0 1"
+    seen = "1.5 2.5 -1 3.5 4.5 7 5.5 6.5 8 1.5 2.5 -1"  # of 12 words, as the line of a picture whose name has blanks
+    lines = [
+        f"1 {pose} 1.png",
+        f"2 {pose} 2 and 3.png",
+        f"3 {pose} 004",
+        seen,
+        f"4 {pose} 5.png",
+        "",
+        f"5 {pose} 6.png",
+    ]
+    (tmp_path / "images.txt").write_text("\n".join(lines))
+    expected = ["004", "1.png", "2 and 3.png", "5.png", "6.png"]
+    assert [image.name for image in read_model(tmp_path).images] == expected
+    assert list(read_cameras(tmp_path)) == expected
+    (tmp_path / "images.txt").write_text("\n".join([*lines[:4], f"4 {pose}"]))
+    with pytest.raises(InputError, match=r"images\.txt: line 5 does not read as IMAGE_ID QW"):
+        read_model(tmp_path)
+    (tmp_path / "images.txt").write_text("\n".join([*lines[:3], seen[:-4], lines[4]]))
+    with pytest.raises(InputError, match=r"images\.txt: line 4 does not read as X Y POINT3D_ID, again and again, or"):
+        read_model(tmp_path)
+
+
+@pytest.mark.parametrize(("stem", "kept"), [("images", -2), ("points3D", -1)])
+def test_text_that_is_cut_at_the_end_of_a_line_is_told(tmp_path: Path, stem: str, kept: int) -> None:
+    make_model(tmp_path)
+    path = tmp_path / "txt" / f"{stem}.txt"
+    assert read_model(tmp_path / "txt").warnings == []
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("\ufeff" + "".join(lines[:kept]), "utf-8")
+    counts = {"images": (3, 2), "points3D": (5, 4)}[stem]
+    told = f"{path}: its header announces {counts[0]}, and it holds {counts[1]}; is it cut, or edited since?"
+    assert read_model(tmp_path / "txt").warnings == [told]
+    if stem == "images":
+        with pytest.warns(UserWarning, match="its header announces 3, and it holds 2"):
+            read_cameras(tmp_path / "txt")
+
+
+def test_a_track_that_is_cut_is_refused_with_the_line(tmp_path: Path) -> None:
+    make_model(tmp_path)
+    path = tmp_path / "txt" / "points3D.txt"
+    line = "9 1 2 3 255 255 255 0.5 1 2"
+    path.write_text(f"{line}\n{line} 3")
+    with pytest.raises(InputError, match=r"points3D\.txt: line 2 does not read as POINT3D_ID"):
+        read_model(tmp_path / "txt")
+
+
+def test_text_that_was_edited_beside_a_binary_file_is_told(tmp_path: Path) -> None:
+    make_model(tmp_path)
+    folder = tmp_path / "bin"
+    for file in (tmp_path / "txt").iterdir():
+        shutil.copy(file, folder)
+    for file in folder.iterdir():
+        os.utime(file, (1000, 1000))
+    os.utime(folder / "images.txt", (1030, 1030))  # a slow disk
+    assert read_model(folder).warnings == []
+    for stem in ("images", "points3D"):
+        os.utime(folder / f"{stem}.txt", (2000, 2000))
+    read, newer = "images.bin, points3D.bin", "images.txt, points3D.txt"
+    told = f"{folder}: {read} is read and not the newer {newer}; remove what is not meant"
+    assert read_model(folder).warnings == [told]
 
 
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
@@ -178,6 +244,13 @@ def test_read_cameras(tmp_path: Path) -> None:
     (tmp_path / "bin" / "cameras.bin").unlink()
     with pytest.raises(InputError, match=r"has no cameras\.bin or cameras\.txt"):
         read_cameras(tmp_path / "bin")
+
+
+def test_an_absurd_lens_is_told_where_cameras_alone_are_read(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 48 32 40 24 16 5\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n")
+    with pytest.warns(UserWarning, match=r"a\.png bends the picture beyond reason \(SIMPLE_RADIAL 40 24 16 5\)"):
+        read_cameras(tmp_path)
 
 
 def test_rotation_from_quaternion() -> None:

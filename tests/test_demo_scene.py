@@ -5,8 +5,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from clsplat import demo_scene
+from clsplat import demo, demo_scene
 from clsplat.camera import Camera
+from clsplat.errors import InputError
 from clsplat.trajectory import look_at
 
 
@@ -15,6 +16,21 @@ def surfaces():
     objects = demo_scene.still_life()
     demo_scene.bake(objects, seed=0)
     return objects
+
+
+@pytest.mark.parametrize("name", ["photos", "scene", "run", "turntable"])
+def test_a_folder_of_somebody_else_is_no_demos(tmp_path, name):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match=f"holds {name}, which no demo has made .* choose another folder"):
+        demo.run_demo(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_demos_folder_is_known_again(tmp_path):
+    demo.claim(tmp_path)
+    (tmp_path / "run").mkdir()
+    demo.claim(tmp_path)
 
 
 @pytest.mark.slow

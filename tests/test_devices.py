@@ -4,9 +4,13 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import pytest
+from calls import error_line
 
+from clsplat.bench import synthetic
 from clsplat.cli import main
 from clsplat.device.context import list_devices, open_device
 
@@ -55,3 +59,28 @@ def test_an_unknown_one(capsys: Capture) -> None:
     assert captured.out == ""
     assert captured.err.startswith("clsplat: error: --device abacus: no such device; there are 0: ")
     assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "expected"),
+    [
+        ("CLSPLAT_DEVICE", "abacus", "no such device; there are 0: "),
+        ("CLSPLAT_DRIVER_TIMEOUT", "soon", "expected seconds, such as 300"),
+        ("CLSPLAT_SHAPE", "8", "expected LANESxITEMS"),
+        ("CLSPLAT_TRUST_DRIVER", "no", "expected 1, or 0"),
+        ("CLSPLAT_DEBUG", "false", "expected 1, or 0"),
+    ],
+)
+def test_a_variable_that_makes_no_sense(
+    variable: str, value: str, expected: str, model: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    monkeypatch.setenv(variable, value)
+    assert main(["bench", str(model), "--repeat", "1"]) == 2
+    assert re.match(rf"clsplat: error: {variable}={value}: {expected}", error_line(capsys))
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    """A model of a few Gaussians."""
+    synthetic(10, 32, 32).gaussians.save(tmp_path / "model.ply")
+    return tmp_path / "model.ply"

@@ -100,6 +100,19 @@ def test_absurd_distortion_is_told(k1: float, absurd: bool, tmp_path: Path) -> N
         assert f"and 6 more bends the picture beyond reason (SIMPLE_RADIAL 40 24 16 {k1:g}): check its" in found[0]
 
 
+def test_cameras_in_one_place_are_told(tmp_path: Path) -> None:
+    loaded = load_scene(make_colmap(tmp_path))
+    assert not [text for text in doubts.of_scene(loaded, "black") if "one place" in text]
+    here = [-view.camera.rotation @ [1.0, 2.0, 3.0] for view in loaded.views]
+    views = [
+        replace(view, camera=replace(view.camera, translation=place))
+        for view, place in zip(loaded.views, here, strict=True)
+    ]
+    found = [text for text in doubts.of_scene(replace(loaded, views=views), "black") if "one place" in text]
+    assert len(found) == 1
+    assert f"all {len(loaded.train_views)} training cameras stand in one place" in found[0]
+
+
 @pytest.mark.parametrize(
     ("colour", "background", "hint"),
     [

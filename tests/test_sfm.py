@@ -147,6 +147,20 @@ def test_finished_result_is_used_again_and_never_replaced_unasked(scene, photos,
     assert (output / "sparse/0/images.bin").stat().st_mtime_ns == before
 
 
+@pytest.mark.parametrize("change", ["gone", "cut"])
+def test_a_result_that_has_changed_since_is_not_used_again(scene, photos, tmp_path, change):
+    copy = tmp_path / "scene"
+    shutil.copytree(scene[0], copy)
+    assert sfm.reconstruct(photos, copy, camera_model="SIMPLE_PINHOLE") == copy
+    picture = copy / "images/view_03.jpg"
+    if change == "gone":
+        picture.unlink()
+    else:
+        picture.write_bytes(picture.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"scene: images/view_03\.jpg are gone or changed since .* --overwrite"):
+        sfm.reconstruct(photos, copy, camera_model="SIMPLE_PINHOLE")
+
+
 @pytest.mark.slow
 def test_same_seed_same_bytes(scene, photos, tmp_path):
     again = sfm.reconstruct(photos, tmp_path / "again", camera_model="SIMPLE_PINHOLE", threads=3)

@@ -12,7 +12,7 @@ from needs import SCENES
 
 from clsplat.errors import InputError
 from clsplat.images import write_image
-from clsplat.transforms import read_blender, read_point_cloud, read_transforms
+from clsplat.transforms import read_blender, read_point_cloud, read_poses, read_transforms
 
 POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 
@@ -190,6 +190,75 @@ def test_nerfstudios_split_points_and_masks(tmp_path: Path) -> None:
     assert any("'mask_path' is ignored" in warning for warning in result.warnings)
     (tmp_path / "sparse.ply").unlink()
     assert any("sparse.ply" in warning for warning in read_transforms(path).warnings)
+
+
+@pytest.mark.parametrize(
+    ("keys", "split"),
+    [
+        ({"train_filenames": ["images/0.png"]}, "train test test"),
+        ({"val_filenames": ["images/0.png"], "test_filenames": ["images/2.png"]}, "test train test"),
+        ({"train_filenames": ["images/0.png"], "val_filenames": ["./images/1.png"]}, "train test test"),
+        (
+            {"train_filenames": [f"images/{n}.png" for n in range(3)], "val_filenames": ["images/1.png"]},
+            "train test train",
+        ),
+        ({"train_filenames": [], "val_filenames": None}, "None None None"),
+    ],
+)
+def test_what_nerfstudio_does_not_train_on_is_held_out(tmp_path: Path, keys: dict[str, Any], split: str) -> None:
+    result = read_transforms(make(tmp_path, 3, **keys))
+    assert [str(frame.split) for frame in result.frames] == split.split()
+    assert result.warnings == []
+
+
+def test_a_split_that_makes_no_sense(tmp_path: Path) -> None:
+    every = ["images/0.png", "images/1.png"]
+    with pytest.raises(InputError, match="hold out all 2 pictures, expected some to train on; remove these keys"):
+        read_transforms(make(tmp_path, val_filenames=every[:1], test_filenames=every[1:]))
+    with pytest.raises(InputError, match="'val_filenames' is 'images', expected a list of file names"):
+        read_transforms(make(tmp_path, val_filenames="images"))
+    path = make(tmp_path, test_filenames=["images/1.png", "a.png", "b.png", "c.png", "d.png"])
+    told = f"{path}: 'test_filenames' lists a.png, b.png, c.png and 1 more, and no frame has that as its 'file_path'"
+    assert read_transforms(path).warnings == [told]
+
+
+def test_a_transposed_pose_is_refused(tmp_path: Path) -> None:
+    path = make(tmp_path)
+    change_frame(path, transform_matrix=np.transpose(POSE).tolist())
+    with pytest.raises(InputError, match=r"frame 1: 'transform_matrix' has 1 2 3 1 as its last row, .* transpose"):
+        read_transforms(path)
+
+
+@pytest.mark.parametrize(("keys", "size"), [({"w": 24}, (24, 16)), ({"h": 4}, (6, 4))])
+def test_one_side_alone_has_the_other_in_proportion(
+    tmp_path: Path, keys: dict[str, Any], size: tuple[int, int]
+) -> None:
+    lens = read_transforms(make(tmp_path, **keys)).frames[0].lens
+    assert (lens.width, lens.height) == size
+    assert lens.params == (10, 10, size[0] / 2, size[1] / 2)
+
+
+def test_an_angle_that_contradicts_the_focal_length_is_told(tmp_path: Path) -> None:
+    path = make(tmp_path, 5, camera_angle_x=2 * math.atan(6 / 10.1))  # 1 % off, as rounding may be
+    assert read_transforms(path).warnings == []
+    path = make(tmp_path, 5, camera_angle_x=math.pi / 2)
+    change_frame(path, fl_x=20.0)  # of this frame alone, and the angle of the others
+    pictures = ", ".join(f"images/{n}.png (10, not 6)" for n in (0, 2, 3))
+    told = f"{path}: 'fl_x' is used, 'camera_angle_x' says otherwise of {pictures} and 1 more"
+    assert read_transforms(path).warnings == [told]
+    with pytest.warns(UserWarning, match="'camera_angle_x' says otherwise"):
+        read_poses(path)
+
+
+def test_a_rolling_shutter_is_told(tmp_path: Path) -> None:
+    assert read_transforms(make(tmp_path, rolling_shutter=[0, 0, 0, 0])).warnings == []
+    path = make(tmp_path, rolling_shutter=[0, 0, 0.03, 0])
+    assert ["'rolling_shutter' is ignored" in text for text in read_transforms(path).warnings] == [True]
+
+
+def test_an_absurd_lens_is_told_where_cameras_alone_are_read(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match=r"images/0\.png, images/1\.png bends the picture beyond reason \(OPENCV"):
+        read_poses(make(tmp_path, k1=5.0))
 
 
 def test_point_clouds(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_a_shape_that_local_memory_is_too_small_for(monkeypatch: pytest.MonkeyPa
     assert shape_of(gpu(1024, 64)).items == 512
 
 
-@pytest.mark.parametrize("content", ["no JSON", "[]", '{"a": 1}'])
+@pytest.mark.parametrize("content", ["no JSON", "[]", '{"a": 1}', pytest.param("[" * 100_000, id="deep")])
 def test_a_broken_file_is_passed_over(content: str, default_device: Device) -> None:
     saved_path().parent.mkdir(parents=True)
     saved_path().write_text(content)

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import IO, Any
 
-from clsplat.errors import DriverError, InputError
+from clsplat.errors import DriverError, InputError, switched_on
 from clsplat.process import Interrupted, apart, endings
 
 MARK = "clsplat-child "
@@ -52,8 +52,8 @@ def patience() -> float:
 
 
 def regardless() -> bool:
-    """True if CLSPLAT_TRUST_DRIVER=1 leaves out every test and trial of a driver."""
-    return os.environ.get(REGARDLESS, "") not in ("", "0")
+    """True if CLSPLAT_TRUST_DRIVER=1 leaves out every test and trial of a driver. Raises InputError."""
+    return switched_on(REGARDLESS)
 
 
 def tell(**values: object) -> None:

@@ -15,6 +15,7 @@ import pyopencl as cl
 
 from clsplat.device.advice import no_device
 from clsplat.device.buffers import allocate
+from clsplat.device.child import patience
 from clsplat.device.known import tell_once
 from clsplat.device.launch import launch_groups
 from clsplat.device.memory import Memory
@@ -214,9 +215,11 @@ def select(selector: str | None) -> cl.Device:
 
     Without one: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
     """
+    patience()  # what the environment says of drivers is looked at before it is needed
     devices, infos = all_devices(), list_devices()
     if not devices:
         raise no_device()
+    named = f"--device {selector}" if selector else f"CLSPLAT_DEVICE={os.environ.get('CLSPLAT_DEVICE', '')}"
     selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
     if selector is None:
         return next((d for d, i in zip(devices, infos, strict=True) if i.kind == "gpu"), devices[0])
@@ -226,7 +229,7 @@ def select(selector: str | None) -> cl.Device:
         if not selector.isdigit() and _matches(selector, info):
             return device
     names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for info in infos)
-    raise DeviceError(f"--device {selector}: no such device; there are {names}")
+    raise DeviceError(f"{named}: no such device; there are {names}")
 
 
 def find_device(selector: str | None) -> DeviceInfo:

@@ -15,6 +15,7 @@ import pyopencl as cl
 from clsplat.device import known
 from clsplat.device.child import regardless
 from clsplat.errors import DeviceError, reason_of
+from clsplat.files import parse_json
 
 LANES = (1, 4, 8, 16)
 """Pixels that a vector can have."""
@@ -226,7 +227,7 @@ def saved_shapes() -> dict[str, str]:
     """LANESxITEMS by device and driver. A file that is none of ours is passed over with a warning."""
     path = saved_path()
     try:
-        saved = json.loads(path.read_bytes())
+        saved = parse_json(path.read_bytes())
     except (FileNotFoundError, NotADirectoryError):  # a home may be a file, or none
         return {}
     except OSError as error:
