@@ -455,8 +455,21 @@ def _tyro(kind: Any, arguments: Sequence[str], **options: Any) -> Any:
 
 
 def _comma_separated() -> tyro.constructors.ConstructorRegistry:
-    """Lists of steps are written 500,1000,2000; tyro by itself wants spaces."""
+    """Lists of steps are written 500,1000,2000, tyro by itself wants spaces; a path that is empty, as a shell makes it
+    of a variable that is not set, is not the folder one is in."""
     registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.primitive_rule
+    def path(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        if info.type is not Path:
+            return None
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="PATH",
+            instance_from_str=lambda words: _path(words[0]),
+            is_instance=lambda value: isinstance(value, Path),
+            str_from_instance=lambda value: [str(value)],
+        )
 
     @registry.primitive_rule
     def steps(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
@@ -471,6 +484,12 @@ def _comma_separated() -> tyro.constructors.ConstructorRegistry:
         )
 
     return registry
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise ValueError("the path is empty, expected a name")
+    return Path(text)
 
 
 def _steps(text: str) -> tuple[int, ...]:
@@ -534,3 +553,9 @@ def one_line(error: BaseException) -> str:
 def _show_warning(message: Warning | str, *_: Any) -> None:
     """In place of `warnings.showwarning`, which would print the line of code as well."""
     print(f"clsplat: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+if __name__ == "__main__":  # python -m clsplat.cli
+    from clsplat.__main__ import main as whole
+
+    sys.exit(whole())

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from math import inf
-from typing import Literal
+from numbers import Integral, Real
+from typing import Literal, get_args, get_origin, get_type_hints
 
 from clsplat.errors import InputError
 
@@ -26,6 +27,9 @@ HOST, PORT = "127.0.0.1", 8080
 """Where the viewer listens."""
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
 
+MOST = 1 << 62
+"""Below which whole numbers are, so that TOML has room for them."""
+
 _Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
 """Names of settings, whether a value makes sense (which NaN must not), and what is expected."""
 
@@ -37,6 +41,37 @@ def _check(config: object, prefix: str, rules: tuple[_Rule, ...]) -> None:
             value = getattr(config, name)
             if not makes_sense(value):
                 raise InputError(f"{prefix}{name.replace('_', '-')} {value}: expected {expected}")
+
+
+def _check_kinds(config: object, prefix: str) -> None:
+    """Raise InputError naming the flag of the first setting that is of another kind than its field, which Python lets
+    through, or larger than config.toml can hold."""
+    for name, kind in get_type_hints(type(config)).items():
+        value = getattr(config, name)
+        if get_origin(kind) is Literal:
+            fits, expected = isinstance(value, str) and value in get_args(kind), f"one of {', '.join(get_args(kind))}"
+        elif get_origin(kind) is tuple:
+            fits = isinstance(value, tuple | list) and all(_is_whole(step) for step in value)
+            expected = f"whole numbers below {MOST}"
+        elif kind is int:
+            fits, expected = _is_whole(value), f"a whole number below {MOST}"
+        elif kind is float:
+            fits = isinstance(value, Real) and not _is_truth(value) and not 1e300 <= abs(float(value)) < inf
+            expected = "a number below 1e300"
+        else:
+            fits = _is_truth(value) if kind is bool else isinstance(value, kind)
+            expected = "True or False" if kind is bool else f"{kind.__name__}(...)"
+        if not fits:
+            text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+            raise InputError(f"{prefix}{name.replace('_', '-')} {text:.100}: expected {expected}")
+
+
+def _is_truth(value: object) -> bool:
+    return type(value).__name__ in ("bool", "bool_")  # NumPy's has had both names
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, Integral) and not _is_truth(value) and abs(int(value)) < MOST
 
 
 def _check_steps(flag: str, steps: tuple[int, ...]) -> None:
@@ -113,6 +148,7 @@ class RasterizerConfig:
             (("alpha_min",), lambda value: 1e-3 <= value < 0.5, "0.001 to 0.5"),
             (("transmittance_min",), lambda value: 1e-6 <= value < 0.5, "1e-6 to 0.5"),
         )
+        _check_kinds(self, "--rasterizer.")
         _check(self, "--rasterizer.", rules)
 
 
@@ -176,6 +212,7 @@ class OptimiserConfig:
             (("beta1", "beta2"), lambda value: 0 <= value < 1, "at least 0, less than 1"),
             (("epsilon",), lambda value: 0 < value < inf, "a finite number, more than 0"),
         )
+        _check_kinds(self, "--optimiser.")
         _check(self, "--optimiser.", rules)
         if self.means_rate > 0 and self.means_rate_end == 0:  # in between it would be 0 as well, from the first step on
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0, the rate falls log-linearly to it")
@@ -250,6 +287,7 @@ class DensityConfig:
             (("prune_every",), lambda value: value >= 0, "at least 0"),
             (("prune_fraction",), lambda value: 0 <= value < 1, "at least 0, less than 1"),
         )
+        _check_kinds(self, "--density.")
         _check(self, "--density.", rules)
         _check_steps("--density.prune-at", self.prune_at)
         if self.prune_fraction > 0 and not self.prune_at:
@@ -322,6 +360,7 @@ class TrainConfig:
                 "at least 0",
             ),
         )
+        _check_kinds(self, "--")
         _check(self, "--", rules)
         for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):
             _check_steps(f"--{name}", steps)

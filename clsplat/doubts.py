@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.config import Background
 from clsplat.errors import examples
+from clsplat.evaluate import background_colour, composite
 from clsplat.undistort import absurd
 
 if TYPE_CHECKING:
@@ -37,22 +38,32 @@ BORDER = 0.9
 def of_scene(scene: Scene, background: Background) -> list[str]:
     """What is wrong with the scene's points, cameras and photographs, or with the background for them."""
     lenses = absurd([(view.name, view.lens) for view in scene.views])
-    found = (_coincident(scene), _principal_points(scene), lenses, _one_place(scene), _background(scene, background))
+    found = (
+        _coincident(scene),
+        _principal_points(scene),
+        lenses,
+        _one_place(scene),
+        _empty(scene, background),
+        _background(scene, background),
+    )
     return [text for text in found if text]
 
 
-def of_pictures(draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: Sequence[View]) -> str:
-    """What is wrong with the pictures of a training, or nothing. draw: image (H, W, 3) and alpha (H, W) of a camera."""
+def of_pictures(
+    draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: Sequence[View], kind: str = "training"
+) -> str:
+    """What is wrong with a model's pictures of these views, or nothing. draw: image (H, W, 3) and alpha (H, W) of a
+    camera; kind: what the views are called."""
     looked = spread(views, LOOKED_AT)
     drawn = [draw(_small(view.camera)) for view in looked]
     if not any(alpha.any() for _, alpha in drawn):
         return (
-            f"no Gaussian is seen by any of the {len(looked)} training views that were looked at: the points do not "
+            f"no Gaussian is seen by any of the {len(looked)} {kind} views that were looked at: the points do not "
             "lie before the cameras; check that both have the same axes, scale and origin"
         )
     if all(_is_flat(image) for image, _ in drawn) and not all(_is_flat(_pixels(view)) for view in looked):
         return (
-            f"the pictures of all {len(looked)} training views that were looked at are of one colour, and the "
+            f"the pictures of all {len(looked)} {kind} views that were looked at are of one colour, and the "
             "photographs are not: check that cameras and points belong together, and settings other than the defaults"
         )
     return ""
@@ -110,6 +121,17 @@ def _one_place(scene: Scene) -> str:
     return (
         f"all {len(scene.train_views):,} training cameras stand in one place, from where nothing has a depth: check "
         "the translations of the poses; of photographs that were taken so, views from elsewhere cannot be learnt"
+    )
+
+
+def _empty(scene: Scene, background: Background) -> str:
+    views = spread(scene.train_views, LOOKED_AT)
+    colour = background_colour(background)
+    if not all(_is_flat(composite(_pixels(view), colour)) for view in views):
+        return ""
+    return (
+        f"the {len(views)} training photographs that were looked at are of one colour, or transparent, so that there "
+        f"is nothing to learn: check {examples(view.name for view in views)}"
     )
 
 

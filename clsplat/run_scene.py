@@ -6,14 +6,15 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import clsplat
-from clsplat.errors import InputError, plain
-from clsplat.files import atomic_write, parse_json, read_document
+from clsplat.errors import InputError, examples, plain
+from clsplat.files import atomic_write, parse_json, read_document, short_digest
 
 if TYPE_CHECKING:
     from clsplat.runs import Run
@@ -150,6 +151,31 @@ def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
             )
         )
     write(run, scene)
+
+
+def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
+    """Why scores of these views are not those of held-out photographs of the scene that the run has begun with."""
+    try:
+        record = read(run)
+    except InputError:
+        record = None
+    was = record["views"] if record is not None else {}
+    known = [view for view in views if view.name in was]
+    seen = [view.name for view in known if was[view.name]["split"] == "train"]
+    changed = [
+        view.name
+        for view in known
+        if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
+        and was[view.name]["blake2b"] != short_digest(view.path)
+    ]
+    told = []
+    if seen:
+        told.append(f"{len(seen):,} of {len(views):,} views were trained on ({examples(seen)}): they score too well")
+    if changed:
+        told.append(f"{_listed('with another photograph than at the training', changed)}")
+    if was and not known:
+        told.append(f"none of the views is of the scene that {run.path} began with")
+    return told
 
 
 def _close(a: list[float], b: list[float]) -> bool:

@@ -109,6 +109,12 @@ class Run:
             if resume:
                 earlier = cls.open(path)
                 check_resumed(earlier, config)
+                if (was := earlier.config.background) != config.background:
+                    warnings.warn(
+                        plain(f"{path}: the background was {was} so far and is {config.background} from here on: ")
+                        + "Gaussians that stand for the old one have to be learnt anew",
+                        stacklevel=2,
+                    )
                 scene = scene or earlier.scene
             elif overwrite and is_run(path):
                 for file in owned_files(path):
@@ -128,6 +134,12 @@ class Run:
             raise InputError(f"{path}: not a run (no config.toml of clsplat in it)")
         config, scene = read_config(path / "config.toml")
         return cls(path, config, scene)
+
+    def keep_config(self, config: TrainConfig) -> None:
+        """Write config.toml where the settings are others than those there."""
+        if config != self.config:
+            atomic_write(self.config_path, config_text(config, self.scene).encode())
+            self.config = config
 
     def save_model(self, gaussians: Gaussians, space: str = "sRGB") -> None:
         """Write model.ply; space: the colour space that it was trained in (`colour.photos_space`)."""
@@ -224,15 +236,23 @@ class Run:
         """
         found = self.checkpoints()
         checkpoint: Checkpoint | None = None
-        for _, path in reversed(found):
+        for step, path in reversed(found):
             try:
                 checkpoint = _read_checkpoint(path)
+                if checkpoint.step != step:
+                    found_step, checkpoint = checkpoint.step, None
+                    raise ValueError(f"it is of step {found_step}")
                 break
             except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly anything for a flipped bit
                 why = str(error) or type(error).__name__
                 warnings.warn(plain(f"{path}: checkpoint is damaged and was passed over ({why})"), stacklevel=2)
         if found and checkpoint is None:
             raise InputError(f"{self.checkpoints_path}: no checkpoint there is whole, use --overwrite to start again")
+        if checkpoint is None and (lost := max((each.get("step", 0) for each in self.read_metrics()), default=0)):
+            warnings.warn(
+                plain(f"{self.path}: has no checkpoint: training begins again, the {lost} steps before are lost"),
+                stacklevel=2,
+            )
         if self.resuming:
             for left in self.path.rglob(".*" + TEMPORARY_SUFFIX):
                 remove(left)
@@ -375,8 +395,17 @@ def config_text(config: TrainConfig, scene: Path | None) -> str:
     document: dict[str, Any] = {"clsplat": clsplat.__version__}
     if scene is not None:
         document["scene"] = str(scene)
-    document["train"] = asdict(config)
+    document["train"] = _of_python(asdict(config))
     return tomli_w.dumps(document)
+
+
+def _of_python(value: Any) -> Any:
+    """Settings without NumPy's numbers, which TOML does not know."""
+    if isinstance(value, dict):
+        return {key: _of_python(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_of_python(each) for each in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
@@ -396,12 +425,14 @@ def parse_config(text: str, path: Path, *, tell: bool = True) -> tuple[TrainConf
                 f"{path}: has {key!r}, which is no setting; expected clsplat, scene and the tables of train"
             )
     scene = document.get("scene")
+    if scene is not None and not (isinstance(scene, str) and scene):
+        raise InputError(f"{path}: scene is {scene!r}, expected the scene's path as text")
     config = _from_table(TrainConfig, document.get("train", {}), path, "train", tell=tell)
     try:
         config.check()
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return config, Path(scene) if isinstance(scene, str) else None
+    return config, Path(scene) if scene is not None else None
 
 
 def _from_table(cls: type[T], table: Any, path: Path, where: str, *, tell: bool) -> T:

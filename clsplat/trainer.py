@@ -478,27 +478,49 @@ class Trainer:
         """Go on from a checkpoint."""
         loaded = [self._loaded(checkpoint, kind) for kind in ("parameters", "first", "second")]
         self.step = checkpoint.step
-        self.rng.bit_generator.state = checkpoint.state["rng"]
-        queue = list(checkpoint.state["queue"])
+        try:
+            self.rng.bit_generator.state = checkpoint.state["rng"]
+            queue = list(checkpoint.state["queue"])
+            if not all(type(index) is int and index >= 0 for index in queue):
+                raise ValueError(f"a queue of {queue[:3]}")
+            patience = Patience(**checkpoint.state.get("patience", {}))
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            why = f"{type(error).__name__}: {error}"
+            raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
         self.queue = queue if max(queue, default=0) < len(self.views) else []  # of a scene that had more of them
         self.controlled, self._mark = bool(checkpoint.state.get("controlled", False)), None
-        self.watch.patience = Patience(**checkpoint.state.get("patience", {}))
+        self.watch.patience = patience
         self.watch.forget()
         del self.parameters, self.first, self.second, self.gradients, self.statistics
         self._make_plan(loaded[0].count)
         self._set_parameters(*(self._placed(model) for model in loaded))
         prefix = "statistics/"
         found = {name[len(prefix) :]: each for name, each in checkpoint.arrays.items() if name.startswith(prefix)}
+        for name, array in self.statistics.named().items():
+            if name in found and (found[name].shape, found[name].dtype) != (array.shape, array.dtype):
+                raise unusable(checkpoint, f"{prefix}{name} has shape {found[name].shape}")
         self.statistics.load(found)  # what the settings did not ask for before the checkpoint is not known
 
     def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
         for group in GROUPS:
             if f"{kind}/{group}" not in checkpoint.arrays:
-                raise InputError(f"checkpoint of step {checkpoint.step}: has no {kind}/{group}")
+                raise unusable(checkpoint, f"has no {kind}/{group}")
         host = {group: checkpoint.arrays[f"{kind}/{group}"] for group in GROUPS}
         count, coefficients = len(host["means"]), host["sh_rest"].shape[1] + 1
         for group, shape in group_shapes(count, coefficients).items():
-            if host[group].shape != shape:
-                raise InputError(f"checkpoint of step {checkpoint.step}: {kind}/{group} has shape {host[group].shape}")
+            if host[group].shape != shape or host[group].dtype != np.float32 or count == 0:
+                raise unusable(checkpoint, f"{kind}/{group} has shape {host[group].shape} of {host[group].dtype}")
+        most = (self.config.sh_degree + 1) ** 2
+        if coefficients > most:
+            raise unusable(
+                checkpoint,
+                f"has {coefficients} SH coefficients, more than the {most} of --sh-degree {self.config.sh_degree}",
+            )
         arrays = {group: HostArray(values) for group, values in host.items()}
         return HostGaussians(count, coefficients, arrays, count)
+
+
+def unusable(checkpoint: Checkpoint, why: str) -> InputError:
+    """The error of a checkpoint that is whole, and not one to go on with."""
+    advice = "is it of another run or version?"
+    return InputError(f"checkpoint of step {checkpoint.step}: {why}; {advice}")

@@ -24,7 +24,7 @@ from clsplat.config import TrainConfig
 from clsplat.device import cl
 from clsplat.device.child import TrialInterrupted
 from clsplat.device.context import Device, open_device
-from clsplat.errors import CapacityError, ClsplatError, DriverError
+from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluate import background_colour, evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.locks import locked
@@ -35,9 +35,9 @@ from clsplat.quarantine import RETURNS, WINDOW
 from clsplat.rendering import Renderer
 from clsplat.replay import write_bundle
 from clsplat.report import measure, write_last
-from clsplat.runs import Run
+from clsplat.runs import Run, check_resumed
 from clsplat.stages.loss import Loss
-from clsplat.trainer import Trainer
+from clsplat.trainer import Trainer, unusable
 
 if TYPE_CHECKING:
     from clsplat.scene import Scene, View
@@ -108,7 +108,10 @@ class _Session:
         """Go on from the latest checkpoint, if there is one."""
         if self.run is not None and (checkpoint := self.run.load_latest_checkpoint()) is not None:
             self.trainer.restore(checkpoint)
-            self.seconds = float(checkpoint.state["seconds"])
+            seconds = checkpoint.state.get("seconds")
+            if not isinstance(seconds, float | int):
+                raise unusable(checkpoint, f"its state is not as this version writes it (seconds: {seconds!r})")
+            self.seconds = float(seconds)
             self.saved = checkpoint.step
 
     def save(self) -> None:
@@ -323,9 +326,10 @@ def train(
 ) -> Gaussians:
     """Train on a scene; the model.
 
-    device: open, or as `clsplat devices` names it, then with at most `max_device_mem` of its memory, such as "256MiB";
-    run: a folder for metrics, checkpoints, held-out renders and
-    the model, or None for none of them; resume: go on from the run's latest checkpoint; on_step: called every
+    config: the run's, or the defaults, where it is not given; a run is told of another one. device: open, or as
+    `clsplat devices` names it; max_device_mem: at most so much of its memory, such as "256MiB". run: a folder for
+    metrics, checkpoints, held-out renders and the model, or None for none of them; resume: go on from the run's latest
+    checkpoint, without which a run that has been trained is refused; on_step: called every
     REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes;
     between: called before each step; it may render what the trainer has, and take its time, which is not counted.
     Raises InputError for a scene without views, one that is not the resumed run's, and a run that another process
@@ -333,17 +337,62 @@ def train(
     tells of what could be mended), and Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP after a
     checkpoint has been written.
     """
-    config = config or TrainConfig()
-    config.check()
-    scene.require_training_views()
-    opened = device if isinstance(device, Device) else open_device(device, parse_bytes(max_device_mem))
+    config = _checked(scene, config, run, resume=resume)
+    limit = parse_bytes(max_device_mem)
+    opened = device if isinstance(device, Device) else open_device(device, limit)
+    if isinstance(device, Device) and limit is not None:
+        opened = device.with_memory_limit(limit)
     if run is None:
         return _train(scene, config, opened, None, on_step=on_step, on_plan=on_plan, between=between)
     with locked(run.path, "train"):
+        if not resume and (run.checkpoints() or run.read_metrics()):
+            raise InputError(
+                f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
+                "starts again"
+            )
+        run.keep_config(config)
         if resume:
             run_scene.check(run, scene, run.scene or Path(scene.name), config.resolution)
         run_scene.keep(run, scene, resuming=resume)
         return _train(scene, config, opened, run, resume=resume, on_step=on_step, on_plan=on_plan, between=between)
+
+
+def _checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
+    """The settings. Raises InputError where the arguments of `train` make no sense."""
+    from clsplat.scene import Scene
+
+    for name, value, kind in (
+        ("scene", scene, Scene),
+        ("config", config, TrainConfig | None),
+        ("run", run, Run | None),
+    ):
+        if not isinstance(value, kind):
+            meant = {"scene": "clsplat.load_scene(...)", "config": "TrainConfig(...)", "run": "Run.create(...)"}[name]
+            raise InputError(f"{name} is {value!r:.100}, expected {meant}")
+    if resume and run is None:
+        raise InputError("resume=True: expected run=..., the run to go on with")
+    if config is None:
+        config = run.config if run is not None else TrainConfig()
+    config.check()
+    if resume and run is not None:
+        check_resumed(run, config)
+        if (done := max((step for step, _ in run.checkpoints()), default=0)) > config.iterations:
+            raise InputError(f"iterations {config.iterations}: {run.path} is at step {done} already, expected more")
+    scene.require_training_views()
+    return config
+
+
+def _tell_idle_settings(trainer: Trainer) -> None:
+    """A warning for each setting that comes to nothing with this scene."""
+    config, count = trainer.config, trainer.parameters.count
+    if config.eval_at and not trainer.scene.test_views:
+        steps = ",".join(map(str, config.eval_at))
+        warnings.warn(f"--eval-at {steps}: no view is held out, so that nothing is evaluated; see --test-every")
+    if trainer.step == 0 and config.density.every and count > config.density.max_gaussians:
+        warnings.warn(
+            f"training begins with {count:,} Gaussians, more than --density.max-gaussians "
+            f"{config.density.max_gaussians:,}, which stops new ones only: give the scene fewer points"
+        )
 
 
 def _train(
@@ -369,6 +418,7 @@ def _train(
     if resume:
         session.resume()
     session.first_step = trainer.step
+    _tell_idle_settings(trainer)
     session.tell_plan()
     with _rescued(session), _Interruption() as interrupted:
         while True:

@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat.cli import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb
 from clsplat.cli_models import Compare, Convert, Info, Report, View
-from clsplat.errors import InputError
+from clsplat.errors import CapacityError, InputError, plain
 from clsplat.memory import Plan, parse_bytes
 from clsplat.process import status_of
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from clsplat.camera import Camera
     from clsplat.device.context import Device
     from clsplat.gaussians import Gaussians
     from clsplat.runs import Run
@@ -232,7 +235,7 @@ def _train_verb(scene: Scene, run: Run, device: Device, between: Between | None 
 
 def evaluate(verb: Eval, *, held: bool = False) -> int:
     """Model and scene to numbers. held: a run's folder is locked."""
-    from clsplat import report
+    from clsplat import doubts, report, run_scene
     from clsplat.colour import recorded_space
     from clsplat.config import TrainConfig
     from clsplat.device.context import open_device
@@ -269,6 +272,16 @@ def evaluate(verb: Eval, *, held: bool = False) -> int:
     renderer = Renderer(device, config=config.rasterizer)
 
     background = background_colour(verb.background or config.background)
+    told = run_scene.of_evaluation(trained, views) if trained else []
+    with suppress(CapacityError):
+
+        def draw(camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+            drawn = renderer.render(gaussians, camera, background)
+            return drawn.image, drawn.alpha
+
+        told.append(doubts.of_pictures(draw, views, "held-out"))
+    for text in filter(None, told):
+        print(f"clsplat: warning: {plain(text)}", file=sys.stderr)
     trained_for = given_run.model_record() if given_run else {}
     result = measure(
         lambda view: renderer.render(gaussians, view.camera, background).image,

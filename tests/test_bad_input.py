@@ -233,7 +233,7 @@ def test_an_unknown_device(verb: str, scene: Path, trained: Path, tmp_path: Path
     }[verb]
     assert main([verb, *arguments, "--device", "abacus"]) == 2
     line = one_error(capfd)
-    assert "--device abacus: no such device; there are 0: " in line
+    assert "--device abacus: no such device, expected cpu, gpu, a part of a name, or an index of these: 0: " in line
     assert not list(tmp_path.iterdir())
 
 

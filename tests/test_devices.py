@@ -57,7 +57,7 @@ def test_an_unknown_one(capsys: Capture) -> None:
     assert main(["devices", "--device", "abacus"]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err.startswith("clsplat: error: --device abacus: no such device; there are 0: ")
+    assert captured.err.startswith("clsplat: error: --device abacus: no such device, expected ")
     assert captured.err.count("\n") == 1
 
 

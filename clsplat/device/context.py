@@ -229,7 +229,7 @@ def select(selector: str | None) -> cl.Device:
         if not selector.isdigit() and _matches(selector, info):
             return device
     names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for info in infos)
-    raise DeviceError(f"{named}: no such device; there are {names}")
+    raise DeviceError(f"{named}: no such device, expected cpu, gpu, a part of a name, or an index of these: {names}")
 
 
 def find_device(selector: str | None) -> DeviceInfo:

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs, checkpoints and evaluations that went wrong without a word."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calls import Capture, error_line
+from calls import train as command_train
+from tiny import short, write_scene
+
+import clsplat
+from clsplat import doubts
+from clsplat.cli import main
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.images import read_image, write_image
+from clsplat.runs import Run
+from clsplat.scene import load_scene
+from clsplat.training import train
+
+FEW = short(iterations=3, sh_degree_every=1, report=False, density={"every": 0})
+
+
+@pytest.fixture(scope="module")
+def begun(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three steps; not to be changed."""
+    run = tmp_path_factory.mktemp("begun") / "run"
+    assert command_train(scene, run, FEW) == 0
+    return run
+
+
+@pytest.fixture
+def run(begun: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(begun, tmp_path / "run"))
+
+
+def test_the_module_of_the_command_line_is_one() -> None:
+    line = [sys.executable, "-m", "clsplat.cli", "--version"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert done.stdout == f"clsplat {clsplat.__version__}\n"
+
+
+@pytest.mark.parametrize("value", ['""', "5", "[]"])
+def test_a_scene_that_is_no_path_is_named(value: str, run: Path, capsys: Capture) -> None:
+    text = (run / "config.toml").read_text()
+    lines = [f"scene = {value}" if line.startswith("scene = ") else line for line in text.splitlines()]
+    (run / "config.toml").write_text("\n".join(lines))
+    assert main(["train", "-o", str(run), "--resume"]) == 2
+    assert "expected the scene's path as text" in error_line(capsys)
+
+
+@pytest.mark.parametrize("line", ["train  -o run", "train scene -o ", "eval ", "info "])
+def test_an_empty_path_is_not_the_working_directory(line: str, capsys: Capture) -> None:
+    """As a shell makes it of a variable that is not set."""
+    assert main(line.split(" ")) == 2
+    assert "the path is empty" in error_line(capsys)
+
+
+def without_digests(change: Callable[[dict[str, Any], dict[str, Any]], object]) -> Callable[[Path], None]:
+    """A change of a checkpoint's state and arrays, as another version might have written them."""
+
+    def spoil(path: Path) -> None:
+        with np.load(path) as archive:
+            arrays = dict(archive)
+        record = json.loads(arrays["state.json"].tobytes())
+        del record["sha256"]
+        change(record["state"], arrays)
+        arrays["state.json"] = np.frombuffer(json.dumps(record).encode(), np.uint8)
+        np.savez(path, **arrays)
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda state, _: state.pop("rng"), "its state is not as this version writes it (KeyError: 'rng')"),
+        (lambda state, _: state.update(queue=["a"]), "its state is not as this version writes it"),
+        (lambda state, _: state.update(queue=[-1]), "its state is not as this version writes it"),
+        (lambda state, _: state.update(patience={"x": 1}), "its state is not as this version writes it"),
+        (lambda state, _: state.pop("seconds"), "its state is not as this version writes it"),
+        (
+            lambda _, arrays: arrays.update({"first/means": arrays["first/means"].astype(float)}),
+            "first/means has shape (40, 3) of float64",
+        ),
+        (
+            lambda _, arrays: arrays.update({name: arrays[name][:0] for name in arrays if name.startswith("param")}),
+            "parameters/means has shape (0, 3)",
+        ),
+        (
+            lambda _, arrays: arrays.update({"statistics/seen": arrays["statistics/seen"][:3]}),
+            "statistics/seen has shape (3,)",
+        ),
+    ],
+)
+def test_a_checkpoint_of_another_form_is_named(
+    change: Callable[[dict[str, Any], dict[str, Any]], object], message: str, run: Path, capfd: Capture
+) -> None:
+    without_digests(change)(run / "checkpoints" / "step-0000003.npz")
+    assert main(["train", "-o", str(run), "--resume", "--iterations", "5"]) == 2
+    line = capfd.readouterr().err.splitlines()[-1]
+    assert line.startswith("clsplat: error: checkpoint of step 3: ")
+    assert message in line
+
+
+def test_a_checkpoint_of_more_coefficients_is_named(scene: Path, run: Path, default_device: Device) -> None:
+    text = (run / "config.toml").read_text()
+    (run / "config.toml").write_text(text.replace("sh_degree = 2", "sh_degree = 1"))
+    with pytest.raises(InputError, match="has 9 SH coefficients, more than the 4 of --sh-degree 1"):
+        train(load_scene(scene), device=default_device, run=Run.open(run), resume=True)
+
+
+def test_a_checkpoint_under_another_name_is_passed_over(run: Path) -> None:
+    latest = run / "checkpoints" / "step-0000003.npz"
+    latest.rename(latest.with_name("step-0000900.npz"))
+    with pytest.warns(UserWarning, match="it is of step 3"), pytest.raises(InputError, match="no checkpoint there"):
+        Run.open(run).load_latest_checkpoint()
+
+
+def test_beginning_again_for_want_of_a_checkpoint_is_told(run: Path) -> None:
+    shutil.rmtree(run / "checkpoints")
+    with pytest.warns(UserWarning, match="has no checkpoint: training begins again, the 3 steps before are lost"):
+        assert Run.open(run).load_latest_checkpoint() is None
+
+
+def test_another_background_on_the_way_is_told(run: Path) -> None:
+    earlier = Run.open(run)
+    with pytest.warns(UserWarning, match="the background was black so far and is white from here on"):
+        Run.create(run, replace(earlier.config, background="white"), resume=True)
+
+
+def test_photographs_of_one_colour_are_told(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "scene", alpha=True)
+    for path in (folder / "images").iterdir():
+        pixels = read_image(path)
+        pixels[:, :, 3] = 0
+        write_image(path, pixels)
+    found = doubts.of_scene(load_scene(folder), "black")
+    assert any("are of one colour, or transparent" in text for text in found)
+
+
+def test_settings_that_come_to_nothing_are_told(scene: Path, default_device: Device) -> None:
+    loaded = load_scene(scene, test_every=0)
+    config = replace(FEW, iterations=2, eval_at=(1,), density=replace(FEW.density, every=5, max_gaussians=3))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        train(loaded, config, device=default_device)
+    told = [str(each.message) for each in caught]
+    assert any("--eval-at 1: no view is held out" in text for text in told)
+    assert any("training begins with 40 Gaussians, more than --density.max-gaussians 3" in text for text in told)
+
+
+def test_an_evaluation_of_what_was_trained_on_says_so(scene: Path, run: Path, tmp_path: Path, capfd: Capture) -> None:
+    assert main(["eval", str(run)]) == 0
+    assert "warning" not in capfd.readouterr().err
+    assert main(["eval", str(run), "--test-every", "3"]) == 0
+    assert "warning: 3 of 4 views were trained on (03.png, 06.png, 09.png): they score" in capfd.readouterr().err
+    own = Path(shutil.copytree(scene, tmp_path / "own"))
+    shutil.copy(own / "images" / "05.png", own / "images" / "00.png")
+    assert main(["eval", str(run), "--scene", str(own)]) == 0
+    assert "1 view with another photograph than at the training (00.png)" in capfd.readouterr().err
+
+
+def test_an_evaluation_of_a_model_that_is_not_seen_says_so(run: Path, capfd: Capture) -> None:
+    model = clsplat.Gaussians.load(run / "model.ply")
+    model.means += 1e4
+    model.save(run / "model.ply")
+    assert main(["eval", str(run)]) == 0
+    assert "no Gaussian is seen by any of the 2 held-out views" in capfd.readouterr().err
