@@ -39,8 +39,6 @@ LAST_ROW = 1e-6
 MAX_NUMBER = 1e30
 """Larger ones are damage; their squares are still finite."""
 PERSPECTIVE = ("", "PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-ROUNDING = 1e-6
-"""What a pose may have in its last row for 0."""
 FISHEYE = ("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 RGB = ("red", "green", "blue")
 AGREE = 0.02
@@ -391,11 +389,6 @@ def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64,
     matrix = numbers(given)
     if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < MAX_NUMBER).all():
         raise InputError(f"{where}: {what} is {short(given)}, expected 4 x 4 finite numbers")
-    if matrix.shape == (4, 4) and np.abs(matrix[3, :3]).max() > ROUNDING:
-        raise InputError(
-            f"{where}: {what} has {' '.join(f'{value:g}' for value in matrix[3])} as its last row, expected 0 0 0 1; "
-            "the translation belongs into the last column: transpose the matrix"
-        )
     # A scaled camera object leaves its scale in the matrix; a camera has none.
     determinant = float(np.linalg.det(matrix[:3, :3]))
     scale = float(np.cbrt(determinant))

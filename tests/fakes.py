@@ -30,8 +30,8 @@ class FakeView:
     split: str
     camera: Camera = field(default_factory=camera)
 
-    def load(self) -> np.ndarray:
-        return np.full((self.camera.height, self.camera.width, 3), 0.5, np.float32)
+    def load(self, width: int | None = None, height: int | None = None) -> np.ndarray:
+        return np.full((height or self.camera.height, width or self.camera.width, 3), 0.5, np.float32)
 
 
 @dataclass

@@ -110,5 +110,5 @@ def test_a_run_that_is_there_is_not_trained_into_and_knows_its_settings(
 def test_arrays_of_different_lengths_are_not_rendered(loaded: Scene, default_device: Device) -> None:
     model = hidden_model()
     model.quaternions = model.quaternions[:5]
-    with pytest.raises(InputError, match=r"40 means, 5 quaternions, .*expected as many of each"):
+    with pytest.raises(ValueError, match=r"quaternions is float32 \(5, 4\), expected float32 \(40, 4\)"):
         Renderer(default_device).render(model, loaded.views[0].camera)

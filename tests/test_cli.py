@@ -239,7 +239,8 @@ def test_eval_of_a_run(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: 
     assert list(pipeline.written) == [str(run / "test" / "0.png")]
 
     assert main(["eval", str(run / "model.ply"), "--background", "black", "--resolution", "99"]) == 0
-    assert pipeline.calls[-2:] == [("load_scene", folder, 99, 8), ("render", 4, 32, 24, (0, 0, 0))]
+    looked = ("render", 4, 8, 6, (0, 0, 0))  # small, to warn of views that do not see the model
+    assert pipeline.calls[-3:] == [("load_scene", folder, 99, 8), looked, ("render", 4, 32, 24, (0, 0, 0))]
     assert "1 held-out views  PSNR 12.04 dB" in capsys.readouterr().out
 
 

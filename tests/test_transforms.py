@@ -225,7 +225,7 @@ def test_a_split_that_makes_no_sense(tmp_path: Path) -> None:
 def test_a_transposed_pose_is_refused(tmp_path: Path) -> None:
     path = make(tmp_path)
     change_frame(path, transform_matrix=np.transpose(POSE).tolist())
-    with pytest.raises(InputError, match=r"frame 1: 'transform_matrix' has 1 2 3 1 as its last row, .* transpose"):
+    with pytest.raises(InputError, match=r"frame 1: 'transform_matrix' has the last row .*, so transpose it"):
         read_transforms(path)
 
 

@@ -157,10 +157,6 @@ def _grouped(gaussians: Gaussians, sh: ShStorage) -> dict[str, NDArray[Any]]:
         "sh_dc": gaussians.sh[:, 0],
         "sh_rest": gaussians.sh[:, 1 : sh.coefficients],
     }
-    lengths = {name: len(values) for name, values in host.items()}
-    if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{length} {name}" for name, length in lengths.items())
-        raise InputError(f"Gaussians with {told}: expected as many of each")
     kinds = {"sh_rest": np.float16 if sh.half else np.float32}
     arrays = {name: np.ascontiguousarray(values, kinds.get(name, np.float32)) for name, values in host.items()}
     return arrays if sh.degrees is None else {**arrays, "sh_degrees": sh.degrees}
