@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from typing import Any
 
     from clsplat.camera import Camera as Camera
-    from clsplat.config import TrainConfig as TrainConfig
+    from clsplat.config.training import TrainConfig as TrainConfig
     from clsplat.gaussians import Gaussians as Gaussians
-    from clsplat.rendering import render as render
-    from clsplat.scene import load_scene as load_scene
-    from clsplat.training import train as train
+    from clsplat.rendering.rasterizer import render as render
+    from clsplat.scenes.scene import load_scene as load_scene
+    from clsplat.training.loop import train as train
 
     __version__: str
 
@@ -31,10 +31,10 @@ __all__ = ["Camera", "Gaussians", "TrainConfig", "__version__", "load_scene", "r
 _MODULES = {
     "Camera": "clsplat.camera",
     "Gaussians": "clsplat.gaussians",
-    "TrainConfig": "clsplat.config",
-    "load_scene": "clsplat.scene",
-    "render": "clsplat.rendering",
-    "train": "clsplat.training",
+    "TrainConfig": "clsplat.config.training",
+    "load_scene": "clsplat.scenes.scene",
+    "render": "clsplat.rendering.rasterizer",
+    "train": "clsplat.training.loop",
 }
 
 

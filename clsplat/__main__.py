@@ -18,7 +18,7 @@ def main() -> int:
             output.reconfigure(errors="backslashreplace")  # a path may have letters that the stream's encoding lacks
 
         with terminable():
-            from clsplat.cli import main as run
+            from clsplat.cli.main import main as run
 
             return run()
     except KeyboardInterrupt as error:  # before the command line could catch it

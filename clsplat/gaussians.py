@@ -76,17 +76,18 @@ class Gaussians:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Gaussians:
-        """Read a model file of any format, see `clsplat.formats`. Raises InputError naming the file and the trouble."""
-        from clsplat.formats import load
+        """Read a model file of any format, see `clsplat.models.formats`. Raises InputError naming the file and the
+        trouble."""
+        from clsplat.models.formats import load
 
         return load(path)
 
     def save(self, path: str | os.PathLike[str], *, sh_degree: int | None = None, comments: Sequence[str] = ()) -> None:
-        """Write a model file in the format of its ending, atomically, see `clsplat.formats`.
+        """Write a model file in the format of its ending, atomically, see `clsplat.models.formats`.
 
         Of formats that have room for it: sh_degree, pad with zero coefficients up to this degree; the model's own where
         it is not given. comments: lines of the header, such as `colour.comment`.
         """
-        from clsplat.formats import save
+        from clsplat.models.formats import save
 
         save(path, self, sh_degree=sh_degree, comments=comments)

@@ -18,7 +18,7 @@ SMOOTHING = 0.1
 
 
 class StepReport(Protocol):
-    """What is shown of a training step, `clsplat.training.StepReport` for one; seconds of training so far."""
+    """What is shown of a training step, `clsplat.training.loop.StepReport` for one; seconds of training so far."""
 
     @property
     def step(self) -> int: ...
@@ -129,7 +129,7 @@ class StageProgress:
 
 
 class FrameRecord(Protocol):
-    """What is shown of a frame, `clsplat.render_job.Record` for one; seconds that it took."""
+    """What is shown of a frame, `clsplat.sequence.workers.Record` for one; seconds that it took."""
 
     @property
     def name(self) -> str: ...

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.cli import main
-from clsplat.config import TrainConfig
+from clsplat.cli.main import main
+from clsplat.config.training import TrainConfig
 from clsplat.files import temporary_name
 
 Capture = pytest.CaptureFixture[str]

@@ -19,7 +19,7 @@ import pytest
 from clsplat.device.context import DeviceInfo, all_devices, list_devices
 from clsplat.device.shapes import Shape, default_shape
 from clsplat.files import atomic_write
-from clsplat.trust import examine
+from clsplat.selftest.trust import examine
 
 NARROW = "CLSPLAT_TEST_DRIVERS"
 SESSION = "CLSPLAT_TEST_SESSION"

@@ -12,8 +12,8 @@ from calls import Capture
 from drivers import KEPT
 from tiny import short
 
-from clsplat.cli import main
-from clsplat.config import OptimiserConfig
+from clsplat.cli.main import main
+from clsplat.config.training import OptimiserConfig
 from clsplat.device import context, known, rehearsal
 from clsplat.device.child import REGARDLESS
 

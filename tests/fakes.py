@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from models import random_gaussians
 
-from clsplat import colmap, layers, pictures, trust, verb_render  # noqa: F401  # imported before fakes take their modules' places
 from clsplat.camera import Camera
-from clsplat.config import RasterizerConfig, TrainConfig
+from clsplat.cli import render as verb_render  # noqa: F401  # imported before fakes take their modules' places
+from clsplat.config.training import RasterizerConfig, TrainConfig
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
-from clsplat.runs import Run
+from clsplat.images import channels as layers
+from clsplat.runs.run import Run
+from clsplat.scenes import colmap
 
 
 def camera(width: int = 32, height: int = 24) -> Camera:
@@ -148,12 +150,12 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
     monkeypatch.setattr(colmap, "read_cameras", lambda _: pipe.cameras)
     monkeypatch.setattr(layers, "write_layers", pipe.write_layers)
     fakes: dict[str, dict[str, Any]] = {
-        "scene": {"load_scene": load_scene},
-        "training": {"train": train},
-        "rendering": {"Renderer": Renderer},
+        "scenes.scene": {"load_scene": load_scene},
+        "training.loop": {"train": train},
+        "rendering.rasterizer": {"Renderer": Renderer},
         "device.context": {"open_device": open_device},
-        "trust": {"require": lambda device, *_: device},
-        "images": {"write_image": write_image},
+        "selftest.trust": {"require": lambda device, *_: device},
+        "images.reading": {"write_image": write_image},
     }
     for name, members in fakes.items():
         module = ModuleType(f"clsplat.{name}")

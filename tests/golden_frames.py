@@ -16,10 +16,10 @@ from tiny import short, write_scene
 
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
-from clsplat.rendering import Renderer
-from clsplat.scene import load_scene
-from clsplat.shading import FrameShader, RenderOptions, Task
-from clsplat.training import train
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.scenes.scene import load_scene
+from clsplat.sequence.frame_renderer import FrameShader, RenderOptions, Task
+from clsplat.training.loop import train
 
 Array = NDArray[np.float32]
 
@@ -59,7 +59,7 @@ def _of(run: Pipeline) -> dict[str, list[Array]]:
 
 
 CHANNELS = ("rgb", "alpha", "depth", "median", "first", "normals", "position", "motion", "count", "id", "deep")
-"""All that a picture can be written with (`clsplat.layers`), and its slices by depth."""
+"""All that a picture can be written with (`clsplat.images.channels`), and its slices by depth."""
 BOUNDS = np.array([2.0, 3.5, 6.0], np.float32)
 
 

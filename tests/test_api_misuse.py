@@ -12,13 +12,13 @@ import pytest
 from tiny import hidden_model, short
 
 import clsplat
-from clsplat.config import DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
+from clsplat.config.training import DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
-from clsplat.rendering import Renderer
-from clsplat.runs import Run
-from clsplat.scene import Scene, load_scene
-from clsplat.training import train
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.loop import train
 
 FEW = short(iterations=2, report=False, density={"every": 0})
 

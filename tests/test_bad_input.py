@@ -14,7 +14,7 @@ import pytest
 from calls import Capture, command, error_line, one_error, train
 from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, write_scene
 
-from clsplat.cli import main
+from clsplat.cli.main import main
 
 
 @pytest.mark.smoke

@@ -18,16 +18,17 @@ from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
 from tiny import write_scene
 
-from clsplat import bench as measure
-from clsplat import plots, tradeoff
-from clsplat.cli import main
-from clsplat.config import PRESETS, RasterizerConfig
+from clsplat.bench import plots
+from clsplat.bench import settings as tradeoff
+from clsplat.bench import stages as measure
+from clsplat.cli.main import main
+from clsplat.config.training import PRESETS, RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT, TILE
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.reference import render as reference
-from clsplat.rendering import Rasterizer
+from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.limit import Limits, measure_limits
 

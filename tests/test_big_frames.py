@@ -12,15 +12,15 @@ import pytest
 import scenes
 from compare import assert_same_bits
 
-from clsplat.big_frames import in_strips, strip_rows, strips, write_in_strips
 from clsplat.camera import Camera, Window
+from clsplat.config.pictures import FramingConfig, SamplingConfig
 from clsplat.device.context import open_device
 from clsplat.errors import InputError
-from clsplat.framing import crop, drawn_by, framed, supersampled
-from clsplat.layers import LAYERS, Encoding, Header, write_layers
-from clsplat.picture_config import FramingConfig, SamplingConfig
-from clsplat.rendering import Renderer
-from clsplat.sampling import sample_cameras, sampled
+from clsplat.frame.shutter_and_lens import sample_cameras, sampled
+from clsplat.frame.strips import in_strips, strip_rows, strips, write_in_strips
+from clsplat.frame.window import crop, drawn_by, framed, supersampled
+from clsplat.images.channels import LAYERS, Encoding, Header, write_layers
+from clsplat.rendering.rasterizer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(3000, 8, 150, 200)
 EVERYTHING = tuple(LAYERS)

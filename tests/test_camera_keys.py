@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
-from clsplat.paths.keys import Key, interpolate, tangents
-from clsplat.paths.shot import Shot, numbered
+from clsplat.shots.keys import Key, interpolate, tangents
+from clsplat.shots.shot import Shot, numbered
 
 # Rotations and positions of a few units go through some ten products in float64.
 EXACT = 1e-12

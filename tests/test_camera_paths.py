@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
-from clsplat.paths.generated import PATHS, parabola_weights, spiral, through
-from clsplat.trajectory import look_at
+from clsplat.shots.generated import PATHS, parabola_weights, spiral, through
+from clsplat.shots.viewpoints import look_at
 
 FOCUS = np.array([5.0, -2.0, 7.0])
 WORLD = Rotation.from_euler("xyz", [0.4, -1.3, 2.2]).as_matrix()

@@ -11,8 +11,8 @@ import pytest
 from needs import require
 
 from clsplat.errors import InputError
-from clsplat.paths import choose_shot, read_shot
 from clsplat.reference.cameras import pixel_from_world
+from clsplat.shots import choose_shot, read_shot
 
 STAGE = """#usda 1.0
 (

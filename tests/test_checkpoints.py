@@ -16,10 +16,10 @@ from calls import Capture, train
 from tiny import CONFIG, short
 
 from clsplat import files
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.errors import InputError
 from clsplat.files import TEMPORARY_SUFFIX
-from clsplat.runs import STATE_KEY, Checkpoint, Run
+from clsplat.runs.run import STATE_KEY, Checkpoint, Run
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 

@@ -14,11 +14,11 @@ import pytest
 from calls import Capture, command, error_line
 from fakes import Pipeline
 
-from clsplat import verbs
-from clsplat.cli import Eval, Train, main, parse
-from clsplat.config import DEMO_ITERATIONS, TrainConfig
+from clsplat.cli import verbs
+from clsplat.cli.main import Eval, Train, main, parse
+from clsplat.config.training import DEMO_ITERATIONS, TrainConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.runs import Run
+from clsplat.runs.run import Run
 
 
 @pytest.mark.smoke
@@ -42,7 +42,7 @@ def test_every_training_flag_has_help(capsys: Capture) -> None:
 
 
 def test_help_loads_nothing_heavy() -> None:
-    code = "import sys, clsplat, clsplat.cli; clsplat.cli.main(['train', '--help']); "
+    code = "import sys, clsplat, clsplat.cli.main; clsplat.cli.main.main(['train', '--help']); "
     code += "heavy = {'pyopencl', 'pycolmap', 'scipy', 'skimage', 'OpenImageIO'} & set(sys.modules); "
     code += "sys.exit(str(heavy) if heavy else 0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
@@ -71,7 +71,7 @@ def test_the_demo_takes_the_steps_it_is_given(tmp_path: Path, monkeypatch: pytes
         given.append((output, iterations))
         return {}
 
-    monkeypatch.setattr("clsplat.demo.run_demo", run_demo)
+    monkeypatch.setattr("clsplat.demo.run.run_demo", run_demo)
     assert main(["demo", "-o", str(tmp_path), "--iterations", "30"]) == 0
     assert main(["demo", "-o", str(tmp_path)]) == 0
     assert given == [(tmp_path, 30), (tmp_path, DEMO_ITERATIONS)]
@@ -148,9 +148,9 @@ def test_sfm(folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
         (output / "sfm.json").write_text('{"photos": 3}')
         return output
 
-    fake = ModuleType("clsplat.sfm")
+    fake = ModuleType("clsplat.scenes.sfm")
     vars(fake).update(reconstruct=reconstruct, RECORD="sfm.json")
-    monkeypatch.setitem(sys.modules, "clsplat.sfm", fake)
+    monkeypatch.setitem(sys.modules, "clsplat.scenes.sfm", fake)
     assert main(["sfm", folder, "-o", str(tmp_path / "out"), "--matching", "sequential", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out) == {"photos": 3}

@@ -11,10 +11,10 @@ import pytest
 from calls import Capture, error_line
 from fakes import Pipeline, camera
 
-from clsplat.cli import Render, main, parse
-from clsplat.config import PRESETS, RasterizerConfig, TrainConfig
-from clsplat.render_request import resizer
-from clsplat.runs import Run
+from clsplat.cli.main import Render, main, parse
+from clsplat.cli.render_request import resizer
+from clsplat.config.training import PRESETS, RasterizerConfig, TrainConfig
+from clsplat.runs.run import Run
 
 
 def test_render(model: str, folder: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:

@@ -11,8 +11,8 @@ import pycolmap
 import pytest
 from needs import SCENES
 
-from clsplat.colmap import find_model, read_cameras, read_model, rotation_from_quaternion
 from clsplat.errors import InputError
+from clsplat.scenes.colmap import find_model, read_cameras, read_model, rotation_from_quaternion
 
 
 def make_model(folder: Path, names: list[str] | None = None, model: str = "PINHOLE") -> pycolmap.Reconstruction:

@@ -10,11 +10,20 @@ import OpenImageIO as oiio
 import pytest
 from scenes import one
 
-from clsplat.colour import LINEAR, SRGB, Colours, comment, linear_to_srgb, photos_space, recorded_space, srgb_to_linear
+from clsplat.config.pictures import ColourConfig
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.layers import Encoding, write_layers
-from clsplat.picture_config import ColourConfig
+from clsplat.images.channels import Encoding, write_layers
+from clsplat.images.colour import (
+    LINEAR,
+    SRGB,
+    Colours,
+    comment,
+    linear_to_srgb,
+    photos_space,
+    recorded_space,
+    srgb_to_linear,
+)
 
 HALF = 2.0**-11
 """What rounding to a half loses, relative."""

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from tiny import write_scene
 
-from clsplat.cli import main
-from clsplat.config import PRESETS, DensityConfig, OptimiserConfig, TrainConfig, bundled, scheduled
-from clsplat.runs import Run
+from clsplat.cli.main import main
+from clsplat.config.training import PRESETS, DensityConfig, OptimiserConfig, TrainConfig, bundled, scheduled
+from clsplat.runs.run import Run
 
 Capture = pytest.CaptureFixture[str]
 
@@ -135,10 +135,10 @@ def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> 
 def test_a_setting_that_two_places_have_has_one_default() -> None:
     import inspect
 
-    from clsplat.cli import Render, Train
-    from clsplat.cli_models import Convert, View
-    from clsplat.layers import Encoding
-    from clsplat.scene import load_scene
+    from clsplat.cli.main import Render, Train
+    from clsplat.cli.options import Convert, View
+    from clsplat.images.channels import Encoding
+    from clsplat.scenes.scene import load_scene
     from clsplat.viewer.server import Address
 
     def default(owner: type, name: str) -> object:

@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 from systems import can_link
 from tiny import cameras, hidden_model
 
-from clsplat import colour, edit, formats
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.images import colour
+from clsplat.models import edit, formats
 
 
 @pytest.fixture
@@ -288,7 +289,7 @@ def test_info_of_every_format(suffix: str, model: Path, capsys: Capture) -> None
 
 
 def test_info_counts_what_a_reader_refuses(model: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    monkeypatch.setattr("clsplat.formats.packing.require_finite", lambda *_, **__: None)
+    monkeypatch.setattr("clsplat.models.codec.values.require_finite", lambda *_, **__: None)
     gaussians = Gaussians.load(model)
     gaussians.means[3, 1] = np.nan
     gaussians.opacity_logits[[3, 7]] = np.inf

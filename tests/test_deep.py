@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from pipeline import EVERY_SHAPE, shaped, shapes_of
 
 from clsplat.camera import Camera, Window
-from clsplat.colour import LINEAR, Colours
-from clsplat.deep import bin_bounds, depths_in_view, flattened, render_deep, write_deep
+from clsplat.config.pictures import ColourConfig, DeepConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
-from clsplat.framing import crop
+from clsplat.frame.deep_exr import bin_bounds, depths_in_view, flattened, render_deep, write_deep
+from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
-from clsplat.layers import Encoding, Header, camera_matrices
-from clsplat.picture_config import ColourConfig, DeepConfig
+from clsplat.images.channels import Encoding, Header, camera_matrices
+from clsplat.images.colour import LINEAR, Colours
 from clsplat.reference import deep as twin
 from clsplat.reference import render as reference
-from clsplat.rendering import Renderer
+from clsplat.rendering.rasterizer import Renderer
 
 SCENES = {
     "overlap": scenes.NAMED["overlap"],
@@ -183,7 +183,7 @@ def test_halves_and_a_window(tmp_path: Path) -> None:
 def test_strips_make_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, *_ = made(tmp_path)
     whole = path.read_bytes()
-    monkeypatch.setattr("clsplat.deep.DEEP_STRIP_FLOATS", 71 * 6 * 6 * 16)
+    monkeypatch.setattr("clsplat.frame.deep_exr.DEEP_STRIP_FLOATS", 71 * 6 * 6 * 16)
     made(tmp_path)
     assert path.read_bytes() == whole
 

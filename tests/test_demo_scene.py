@@ -5,16 +5,17 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from clsplat import demo, demo_scene
 from clsplat.camera import Camera
+from clsplat.demo import ray_caster
+from clsplat.demo import run as demo
 from clsplat.errors import InputError
-from clsplat.trajectory import look_at
+from clsplat.shots.viewpoints import look_at
 
 
 @pytest.fixture(scope="module")
 def surfaces():
-    objects = demo_scene.still_life()
-    demo_scene.bake(objects, seed=0)
+    objects = ray_caster.still_life()
+    ray_caster.bake(objects, seed=0)
     return objects
 
 
@@ -37,7 +38,7 @@ def test_a_demos_folder_is_known_again(tmp_path):
 def test_photos_are_whole_repeatable_and_hold_no_pose(tmp_path):
     heard = []
     for folder in ("one", "two"):
-        demo_scene.write_photos(
+        ray_caster.write_photos(
             tmp_path / folder, count=2, width=64, height=48, progress=lambda text, part: heard.append((text, part))
         )
     names = sorted(path.name for path in (tmp_path / "one").iterdir())
@@ -72,7 +73,7 @@ def test_rays_meet_the_surface_where_its_texture_says(surfaces, index):
     np.testing.assert_allclose(distance, 0.05, atol=2e-3)
     row, column = surface.texture_coordinates(points)
     again, _ = surface.point(np.clip(row, 0, 1), np.clip(column, 0, 0.99999))
-    if not isinstance(surface, demo_scene.Ball):  # around a pole the columns of a ball meet
+    if not isinstance(surface, ray_caster.Ball):  # around a pole the columns of a ball meet
         np.testing.assert_allclose(again, points, atol=2e-2)
 
 
@@ -80,17 +81,17 @@ def test_camera_sees_what_lies_on_its_axis(surfaces):
     marble = surfaces[2]
     rotation, translation = look_at(np.array([2.0, 0.5, 1.0]), np.array(marble.centre), np.array([0.0, 0.0, 1.0]))
     camera = Camera(32, 24, 200.0, 200.0, 16.0, 12.0, rotation, translation)
-    alone = demo_scene.render([marble], camera, samples=1)
-    together = demo_scene.render(surfaces, camera, samples=1)
+    alone = ray_caster.render([marble], camera, samples=1)
+    together = ray_caster.render(surfaces, camera, samples=1)
     np.testing.assert_array_equal(alone[12, 16], together[12, 16])
     assert together.min() >= 0 and together.max() <= 1
 
 
 def test_cameras_stand_inside_the_wall_and_look_at_the_middle():
-    views = demo_scene.cameras(40, 320, 240, seed=0)
+    views = ray_caster.cameras(40, 320, 240, seed=0)
     assert len(views) == 40
     for view in views:
-        assert np.hypot(*view.position[:2]) < demo_scene.WALL_RADIUS - 0.5
-        x, y, z = view.rotation @ demo_scene.CENTRE + view.translation
+        assert np.hypot(*view.position[:2]) < ray_caster.WALL_RADIUS - 0.5
+        x, y, z = view.rotation @ ray_caster.CENTRE + view.translation
         assert z > 0
         assert abs(view.fx * x / z) < 40 and abs(view.fy * y / z) < 40

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from clsplat.config import DensityConfig
-from clsplat.density import Plan, is_due, is_reset_due, plan, reset_opacities, split_halves
+from clsplat.config.training import DensityConfig
+from clsplat.training.density.adaptive import Plan, is_due, is_reset_due, plan, reset_opacities, split_halves
 
 CONFIG = DensityConfig()
 EXTENT = 10.0

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from clsplat.config import DensityConfig
-from clsplat.density import (
+from clsplat.config.training import DensityConfig
+from clsplat.training.density.adaptive import (
     Contributions,
     Plan,
     budget,

@@ -15,16 +15,16 @@ from quick import quick
 from test_trainer import host, model_bytes
 from tiny import short, write_scene
 
-from clsplat import density
-from clsplat.config import TrainConfig
-from clsplat.density import Plan
+from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.reference.render import render_grad
-from clsplat.runs import Run
-from clsplat.scene import Scene, load_scene
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.project import GROUPS, HostGaussians
-from clsplat.trainer import Trainer
-from clsplat.training import train
+from clsplat.training.density import adaptive
+from clsplat.training.density.adaptive import Plan
+from clsplat.training.loop import train
+from clsplat.training.trainer import Trainer
 
 EVERYTHING = short(
     iterations=48,
@@ -57,7 +57,7 @@ def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: p
     known: list[int] = []
 
     def noted(name: str) -> Any:
-        real = getattr(density, name)
+        real = getattr(adaptive, name)
 
         def call(config: Any, step: int, *rest: Any, **values: Any) -> Plan:
             result: Plan = real(config, step, *rest, **values)
@@ -67,8 +67,8 @@ def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: p
 
         return call
 
-    monkeypatch.setattr(density, "plan", noted("plan"))
-    monkeypatch.setattr(density, "plan_pruning", noted("plan_pruning"))
+    monkeypatch.setattr(adaptive, "plan", noted("plan"))
+    monkeypatch.setattr(adaptive, "plan_pruning", noted("plan_pruning"))
     trainer = Trainer(scene, EVERYTHING, default_device)
     for _ in range(EVERYTHING.iterations):
         trainer.train_step()

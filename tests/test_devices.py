@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from calls import error_line
 
-from clsplat.bench import synthetic
-from clsplat.cli import main
+from clsplat.bench.stages import synthetic
+from clsplat.cli.main import main
 from clsplat.device.context import list_devices, open_device
 
 Capture = pytest.CaptureFixture[str]

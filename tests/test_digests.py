@@ -16,7 +16,7 @@ from pipeline import shaped
 from quick import quick
 
 from clsplat.device.context import Device
-from clsplat.layers import LAYERS
+from clsplat.images.channels import LAYERS
 
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))

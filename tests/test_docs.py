@@ -12,7 +12,7 @@ from typing import get_args
 import pytest
 from calls import Capture
 
-from clsplat.cli import Verb, main, parse
+from clsplat.cli.main import Verb, main, parse
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from test_scene import make_colmap
 from tiny import short, write_scene
 
-from clsplat import doubts
 from clsplat.camera import Camera
 from clsplat.device.context import Device
-from clsplat.images import read_image, write_image
-from clsplat.initialise import LEAST_COLOUR, SH_C0, from_points
-from clsplat.point_colours import is_colourless, photographed, pixels_of
+from clsplat.images.reading import read_image, write_image
 from clsplat.reference.cameras import pixel_from_world
-from clsplat.scene import Scene, load_scene
-from clsplat.training import train
+from clsplat.scenes import doubts
+from clsplat.scenes.initialise import LEAST_COLOUR, SH_C0, from_points
+from clsplat.scenes.point_colours import is_colourless, photographed, pixels_of
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.loop import train
 
 
 def told(scene: Scene, device: Device, **changes: object) -> list[str]:

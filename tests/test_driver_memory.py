@@ -19,16 +19,16 @@ from calls import Capture
 from drivers import KEPT
 from dying import ALWAYS, Standing
 
-from clsplat import trust
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.device import child, context, known, launch, rehearsal, shapes
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
 from clsplat.device.program import Kernels, Variant, build
 from clsplat.errors import DeviceError, DriverError
 from clsplat.files import locked
-from clsplat.selftest_result import STAGES
-from clsplat.trust import Report
+from clsplat.selftest import trust
+from clsplat.selftest.result import STAGES
+from clsplat.selftest.trust import Report
 
 POSIX = pytest.mark.skipif(os.name == "nt", reason="signals are sent as POSIX has it")
 

@@ -18,8 +18,8 @@ from drivers import KEPT
 from dying import ALWAYS, LATE, VERBS, Standing, call, error_of, forget, number_of
 from tiny import CONFIG
 
-from clsplat.cli import main
-from clsplat.config import TrainConfig
+from clsplat.cli.main import main
+from clsplat.config.training import TrainConfig
 from clsplat.device import context, known, rehearsal
 from clsplat.device.child import TIMEOUT, Child
 from clsplat.device.context import Device

@@ -11,15 +11,15 @@ import scenes
 from models import assert_equal, random_gaussians
 from scipy.spatial.transform import Rotation
 
-from clsplat import edit
 from clsplat.camera import Camera
-from clsplat.contributions import largest_contributions
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.models import edit
 from clsplat.reference.render import render as reference
 from clsplat.reference.sh import sh_basis
-from clsplat.rendering import Renderer
+from clsplat.rendering.contributions import largest_contributions
+from clsplat.rendering.rasterizer import Renderer
 
 TURN = Rotation.from_euler("xyz", (0.7, -1.9, 2.6)).as_matrix()
 MIRROR = TURN @ np.diag([1.0, -1.0, 1.0])

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat import metrics
 from clsplat.errors import ClsplatError, InputError
-from clsplat.evaluate import background_colour, composite, evaluate, picture_names
+from clsplat.evaluation import metrics
+from clsplat.evaluation.held_out import background_colour, composite, evaluate, picture_names
 
 
 @dataclass(frozen=True)

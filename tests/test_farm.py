@@ -22,14 +22,14 @@ from needs import openjd_path, require
 from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
-from clsplat import farm
-from clsplat.cli import main
-from clsplat.config import RasterizerConfig
+from clsplat.cli.main import main
+from clsplat.config.training import RasterizerConfig
 from clsplat.errors import InputError
 from clsplat.files import digest
-from clsplat.paths.shot import Shot, numbered
-from clsplat.render_job import make_tasks, stamp
-from clsplat.shading import RenderOptions
+from clsplat.sequence import farm
+from clsplat.sequence.frame_renderer import RenderOptions
+from clsplat.sequence.workers import make_tasks, stamp
+from clsplat.shots.shot import Shot, numbered
 
 ROOT = Path(__file__).resolve().parents[1]
 TEMPLATE = ROOT / "docs" / "farm" / "clsplat-render.openjd.yaml"
@@ -286,7 +286,7 @@ def test_the_open_job_description_runs(openjd: str, shot: list[str], whole: dict
 
 
 def test_the_opencue_example_calls_render_as_it_is() -> None:
-    from clsplat.cli import Render, parse
+    from clsplat.cli.main import Render, parse
 
     tree = ast.parse((ROOT / "docs" / "farm" / "opencue_render.py").read_text())
     values = [

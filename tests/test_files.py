@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from systems import posix
 
-from clsplat.cli import one_line
+from clsplat.cli.main import one_line
 from clsplat.errors import WriteError
 from clsplat.files import atomic_write, atomic_writer
 

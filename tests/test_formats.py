@@ -17,13 +17,13 @@ from models import assert_equal, random_gaussians
 from needs import SCENES, require
 from scipy.spatial.transform import Rotation
 
-from clsplat import edit, fidelity, formats
 from clsplat.camera import Camera
 from clsplat.device.context import Device
 from clsplat.errors import InputError
+from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
-from clsplat.metrics import psnr
-from clsplat.rendering import Renderer
+from clsplat.models import difference, edit, formats
+from clsplat.rendering.rasterizer import Renderer
 
 FORMATS = formats.formats()
 WRITTEN = {name: module for name, module in FORMATS.items() if hasattr(module, "write")}
@@ -177,7 +177,7 @@ def test_the_loss_is_small_in_every_attribute(name: str, tmp_path: Path) -> None
     whole = as_far_as_it_goes(module, asymmetric())
     formats.save(path, whole)
     written = edit.take(whole, module.order(whole)) if hasattr(module, "order") else whole
-    found = fidelity.errors(written, formats.load(path))
+    found = difference.errors(written, formats.load(path))
     exact = getattr(module, "FLOAT", False)
     # Floats: logs and logits of what is stored, and unit quaternions, are rounded once more. Else: positions to 10
     # bits, scales and opacities to 7 or 8, rotations to 8, colour to 8. SH of which every one is different are the
@@ -199,10 +199,10 @@ def test_scales_count_as_a_part_of_the_gaussians_largest(tmp_path: Path) -> None
     disc = edit.take(asymmetric(), np.arange(3))
     disc.log_scales[:] = ((-3, -4, -30), (-30, -3, -3), (-3, -3, -3))  # SPZ ends at -10
     formats.save(tmp_path / "a.spz", disc)
-    found = fidelity.errors(disc, formats.load(tmp_path / "a.spz"))["scale"]["largest"]
+    found = difference.errors(disc, formats.load(tmp_path / "a.spz"))["scale"]["largest"]
     assert found == pytest.approx(np.exp(-7), rel=0.01)  # exp(-10) of exp(-3); that of whole sixteenths is 0
     wider = replace(disc, log_scales=disc.log_scales + np.float32([[0, 0, 0], [0, 0, 0.5], [0, 0, 0]]))
-    assert fidelity.errors(disc, wider)["scale"]["largest"] == pytest.approx(np.expm1(0.5), rel=1e-5)
+    assert difference.errors(disc, wider)["scale"]["largest"] == pytest.approx(np.expm1(0.5), rel=1e-5)
 
 
 @pytest.mark.parametrize("name", WRITTEN)

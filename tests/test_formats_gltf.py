@@ -18,8 +18,8 @@ from splats import assert_refused_or_sound, assert_within, colours, covariances,
 from systems import can_link
 
 from clsplat.errors import InputError
-from clsplat.formats import gltf, spz
 from clsplat.gaussians import Gaussians
+from clsplat.models.formats import gltf, spz
 
 EXACT = {"means": 0, "rotations": 1e-6, "log_scales": 5e-7, "opacities": 2e-7, "sh0": 0, "sh": 0}
 """The rest is float32's rounding of unit quaternions, of exp and of the sigmoid."""

@@ -15,10 +15,11 @@ from splats import lopsided
 
 from clsplat.camera import Camera
 from clsplat.device.context import Device
-from clsplat.formats import conventions, gltf, sog, spz, usd
+from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
-from clsplat.metrics import psnr
-from clsplat.rendering import Renderer
+from clsplat.models.codec import axes
+from clsplat.models.formats import gltf, sog, spz, usd
+from clsplat.rendering.rasterizer import Renderer
 
 FILES = {
     "model.glb": (gltf, 60.0),
@@ -72,18 +73,18 @@ def test_a_lopsided_model(default_device: Device, tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.parametrize("signs", [(-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, 1), (1, -1, -1)])
-def test_a_mirrored_axis_would_be_seen(default_device: Device, signs: conventions.Signs) -> None:
+def test_a_mirrored_axis_would_be_seen(default_device: Device, signs: axes.Signs) -> None:
     model = lopsided(2000)
     model.log_scales += np.float32(0.5)
     mirrored = replace(model, **{name: getattr(model, name).copy() for name in ("means", "quaternions", "sh")})
-    conventions.flip(mirrored, signs)
+    axes.flip(mirrored, signs)
     assert compare(default_device, model, mirrored, cameras()) < 25
 
 
 def test_a_flip_of_the_harmonics_alone_would_be_seen(default_device: Device) -> None:
     model = lopsided(2000)
     model.log_scales += np.float32(0.5)
-    flipped = replace(model, sh=model.sh * conventions.sh_signs((1, -1, -1))[:, None])
+    flipped = replace(model, sh=model.sh * axes.sh_signs((1, -1, -1))[:, None])
     assert compare(default_device, model, flipped, cameras()) < 35
 
 

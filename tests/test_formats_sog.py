@@ -18,10 +18,11 @@ from splats import assert_refused_or_sound, assert_within, damaged, lopsided, lo
 from systems import links
 
 from clsplat.errors import InputError
-from clsplat.formats import packing, sog
-from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.gaussians import Gaussians
-from clsplat.model_info import size
+from clsplat.models.codec import values as packing
+from clsplat.models.codec.palette import codebook, nearest, palette
+from clsplat.models.formats import sog
+from clsplat.models.info import size
 
 SAME = {"means": 2e-6, "rotations": 2e-6, "log_scales": 0, "sh0": 0, "sh": 0, "opacities": 0.0011}
 """float32's rounding; opacities of 0 and 255 count as a quarter of a step from the end here, as the end there."""

@@ -16,8 +16,8 @@ from node import splat_transform
 from splats import assert_refused_or_sound, assert_within, damaged, lopsided, losses, read_plainly, with_origin
 
 from clsplat.errors import InputError
-from clsplat.formats import spz
 from clsplat.gaussians import Gaussians
+from clsplat.models.formats import spz
 
 BOUNDS = {
     "means": 0.5 / 4096 * 1.001,  # half a step, and float32's rounding
@@ -70,7 +70,7 @@ def test_a_file_without_gzip_is_read_too() -> None:
 
 
 def test_biker_is_the_compressed_ply_of_the_same_model() -> None:
-    from clsplat import formats
+    from clsplat.models import formats
 
     if not hasattr(formats, "load"):
         pytest.skip("no reader of compressed PLY")

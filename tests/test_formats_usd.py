@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from splats import assert_refused_or_sound, assert_within, colours, covariances, damaged, lopsided, with_origin
 
 from clsplat.errors import InputError
-from clsplat.formats import usd
-from clsplat.paths import read_shot
+from clsplat.models.formats import usd
+from clsplat.shots import read_shot
 
 require("pxr")
 from pxr import Gf, Sdf, Usd, UsdGeom  # noqa: E402
@@ -219,7 +219,7 @@ def test_a_stage_without_gaussians(tmp_path: Path) -> None:
 def test_without_usd_core_there_is_one_line(tmp_path: Path) -> None:
     code = (
         "import sys; sys.modules['pxr'] = None\n"
-        "from pathlib import Path\nfrom clsplat.formats import usd\n"
+        "from pathlib import Path\nfrom clsplat.models.formats import usd\n"
         f"usd.read(Path({str(tmp_path / 'model.usda')!r}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

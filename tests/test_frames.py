@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clsplat.errors import InputError
-from clsplat.frames import Pattern, output_paths, parse_frames, ranges
+from clsplat.shots.frame_numbers import Pattern, output_paths, parse_frames, ranges
 
 
 @pytest.mark.parametrize(

@@ -12,14 +12,14 @@ import scenes
 from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera, Projection, Window
+from clsplat.config.pictures import FramingConfig, parse_overscan
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.framing import Draw, Layers, crop, drawn_by, filter_taps, framed, reframed, supersampled
-from clsplat.layers import LAYERS
-from clsplat.picture_config import FramingConfig, parse_overscan
+from clsplat.frame.window import Draw, Layers, crop, drawn_by, filter_taps, framed, reframed, supersampled
+from clsplat.images.channels import LAYERS
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
-from clsplat.rendering import Renderer
+from clsplat.rendering.rasterizer import Renderer
 
 WIDTH, HEIGHT = 150, 100
 EVERYTHING = tuple(LAYERS)

@@ -13,9 +13,9 @@ import pytest
 from models import random_gaussians
 from needs import missing
 
-from clsplat import formats
 from clsplat.errors import WriteError
 from clsplat.files import require_room
+from clsplat.models import formats
 
 MOUNT = 'mkdir -p "$1" && mount -t tmpfs -o size="$2" none "$1" && shift 2 && exec "$@"'
 SUFFIXES = [each for each in formats.suffixes(writable=True) if each.startswith(".")]
@@ -47,7 +47,7 @@ def on_disk(folder: Path, size: str, code: str, *words: str, **variables: str) -
 CONVERT = """
 import sys
 from pathlib import Path
-from clsplat.formats import load, save
+from clsplat.models.formats import load, save
 model, folder = load(sys.argv[1]), Path(sys.argv[2])
 for suffix in sys.argv[3:]:
     try:
@@ -88,7 +88,7 @@ PICTURES = """
 import sys
 from pathlib import Path
 import numpy as np
-from clsplat.layers import Encoding, is_whole, write_layers
+from clsplat.images.channels import Encoding, is_whole, write_layers
 folder, name = Path(sys.argv[1]), sys.argv[2]
 rng = np.random.default_rng(0)
 for size in range(*map(int, sys.argv[3:])):
@@ -120,7 +120,7 @@ VIDEO = """
 import sys
 from pathlib import Path
 import numpy as np
-from clsplat.video import write_video
+from clsplat.images.video import write_video
 rng = np.random.default_rng(0)
 try:
     write_video(Path(sys.argv[1]), [(rng.random((200, 200, 3)) * 255).astype(np.uint8) for _ in range(10)])

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from quick import quick
 
 from clsplat.camera import Camera
-from clsplat.config import RasterizerConfig
+from clsplat.config.training import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.rendering import Renderer, held_sh
-from clsplat.sh import needed_degrees
+from clsplat.rendering.rasterizer import Renderer, held_sh
+from clsplat.rendering.sh_storage import needed_degrees
 from clsplat.stages.project import DeviceGaussians, HostGaussians, upload_gaussians
 
 Float32 = NDArray[np.float32]

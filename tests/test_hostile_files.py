@@ -37,12 +37,14 @@ from spoilers import SPOILERS
 from stress_files import stress, verdict
 from systems import links, posix
 
-from clsplat import colmap, images, runs, sfm, transforms
-from clsplat.config import TrainConfig
+from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
-from clsplat.formats import ply
-from clsplat.images import find_images, image_size, read_image
-from clsplat.scene import load_scene
+from clsplat.images import reading
+from clsplat.images.reading import find_images, image_size, read_image
+from clsplat.models.formats import ply
+from clsplat.runs import run as runs
+from clsplat.scenes import colmap, sfm, transforms
+from clsplat.scenes.scene import load_scene
 
 
 def refusal(read: Callable[[], object]) -> str:
@@ -451,11 +453,11 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 def test_a_png_of_100_000_by_100_000_pixels(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0))
-    path.write_bytes(images.PNG_SIGNATURE + head + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b""))
+    path.write_bytes(reading.PNG_SIGNATURE + head + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b""))
     for read in (image_size, read_image):
         assert "does not decode" in refusal(lambda read=read: read(path))  # OpenImageIO's own limit
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0))
-    path.write_bytes(images.PNG_SIGNATURE + head + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b""))
+    path.write_bytes(reading.PNG_SIGNATURE + head + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b""))
     for read in (image_size, read_image):
         assert "30000 x 30000" in refusal(lambda read=read: read(path))
 
@@ -479,7 +481,7 @@ def test_an_exr_shown_as_100_000_by_100_000_pixels(tmp_path: Path) -> None:
 def test_large_flat_pictures_are_pictures(tmp_path: Path) -> None:
     """What compresses best of what there is."""
     path = tmp_path / "a.png"
-    images.write_image(path, np.zeros((3000, 4000), np.uint8))
+    reading.write_image(path, np.zeros((3000, 4000), np.uint8))
     assert path.stat().st_size < 40_000
     assert read_image(path).shape == (3000, 4000, 3)
 
@@ -489,16 +491,16 @@ def test_a_decoder_that_says_what_is_no_text() -> None:
         def geterror(self) -> str:
             return b"\xff".decode()
 
-    assert images.error_of(Decoder()) == "in words that are no text"
+    assert reading.error_of(Decoder()) == "in words that are no text"
 
 
 def test_a_png_of_empty_chunks_takes_no_long_look(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     with open(path, "wb") as file:
-        file.write(images.PNG_SIGNATURE)
+        file.write(reading.PNG_SIGNATURE)
         file.truncate(1 << 29)
     with pytest.raises(InputError):
-        images._check_png_is_whole(path)
+        reading._check_png_is_whole(path)
 
 
 def test_names_that_no_scene_can_list(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from clsplat.errors import InputError
-from clsplat.initialise import MIN_SQUARED_DISTANCE, SH_C0, from_points, mean_squared_distance, random_points
+from clsplat.scenes.initialise import MIN_SQUARED_DISTANCE, SH_C0, from_points, mean_squared_distance, random_points
 
 
 def brute_force(points: np.ndarray) -> np.ndarray:

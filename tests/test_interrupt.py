@@ -27,7 +27,9 @@ STARTS = {
 
 
 @pytest.mark.parametrize("start", STARTS)
-@pytest.mark.parametrize("module", ["clsplat.cli", "tyro", "clsplat.config", "clsplat.verbs", "pyopencl"])
+@pytest.mark.parametrize(
+    "module", ["clsplat.cli.main", "tyro", "clsplat.config.training", "clsplat.cli.verbs", "pyopencl"]
+)
 def test_ctrl_c_during_an_import(start: str, module: str) -> None:
     code = INTERRUPTED.format(module=module, start=STARTS[start])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

@@ -17,15 +17,16 @@ import pytest
 from calls import Capture, error_line
 from tiny import short, write_scene
 
-from clsplat import locks, process
-from clsplat.cli import main
-from clsplat.config import TrainConfig
+from clsplat import process
+from clsplat.cli.main import main
+from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.runs import Run
-from clsplat.scene import Scene, load_scene
-from clsplat.trainer import Trainer
-from clsplat.training import train
+from clsplat.runs import locks
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.loop import train
+from clsplat.training.trainer import Trainer
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 posix = pytest.mark.skipif(os.name != "posix", reason="sends signals as POSIX has them")
@@ -33,7 +34,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="sends signals as POSIX ha
 HOLDER = """
 import sys, time
 from pathlib import Path
-from clsplat.locks import locked
+from clsplat.runs.locks import locked
 with locked(Path(sys.argv[1]), "train"):
     print("held", flush=True)
     time.sleep(60)
@@ -111,7 +112,7 @@ def test_what_is_ignored_stays_so() -> None:
 
 @posix
 def test_every_verb_ends_with_the_signals_number(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    from clsplat import verbs
+    from clsplat.cli import verbs
 
     monkeypatch.setattr(verbs, "run", lambda _verb: signal.raise_signal(signal.SIGTERM))
     assert main(["devices"]) == 143
@@ -170,10 +171,10 @@ def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
         "sys.argv = ['clsplat', 'train', '.', '-o', 'nowhere']\n"
         "from clsplat.__main__ import main\n"
         "from clsplat.process import terminable\n"
-        "from clsplat import cli\n"
-        "from clsplat import verbs\n"
+        "from clsplat.cli import main as cli\n"
+        "from clsplat.cli import verbs\n"
         "def work(verb):\n"
-        "    import clsplat.undistort\n"
+        "    import clsplat.scenes.lens\n"
         "verbs.run = work\n"
         "sys.exit(main())\n"
     )

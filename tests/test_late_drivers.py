@@ -11,16 +11,16 @@ import pytest
 from calls import Capture, train
 from dying import ALWAYS, LATE, Standing, call, error_of, forget, number_of
 
-from clsplat import training
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.device import known, launch
 from clsplat.device.child import TIMEOUT, TrialInterrupted
 from clsplat.device.context import Device
 from clsplat.errors import DriverError
 from clsplat.gaussians import Gaussians
-from clsplat.runs import Run
-from clsplat.scene import load_scene
-from clsplat.training import train as train_on
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import load_scene
+from clsplat.training import loop as training
+from clsplat.training.loop import train as train_on
 
 WITHOUT = replace(LATE, checkpoint_every=0, optimiser=replace(LATE.optimiser, sparse=True), report=False)
 """Adam has a kernel for each number of floats in a row: that of SH is built in step 12, behind the others."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scenes import tilted_camera
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.layers import (
+from clsplat.images.channels import (
     LAYERS,
     Encoding,
     Header,

@@ -14,17 +14,17 @@ from scenes import random_cloud
 from tiny import CONFIG, short, write_scene
 
 import clsplat
-from clsplat.cli import main
-from clsplat.config import RasterizerConfig, TrainConfig
+from clsplat.cli.main import main
+from clsplat.config.training import RasterizerConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
-from clsplat.memory import Need, plan
-from clsplat.rendering import Renderer
-from clsplat.runs import Run
-from clsplat.scene import Scene, load_scene
+from clsplat.rendering.memory_plan import Need, plan
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.project import HostGaussians
-from clsplat.trainer import Trainer
-from clsplat.training import train
+from clsplat.training.loop import train
+from clsplat.training.trainer import Trainer
 
 KIB = 1024
 

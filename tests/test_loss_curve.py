@@ -12,7 +12,7 @@ from compare import assert_close
 from tiny import loss_curve, write_scene
 
 from clsplat.device.context import Device
-from clsplat.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene, load_scene
 
 GOLDEN = Path(__file__).parent / "golden" / "loss_curve.json"
 

@@ -16,7 +16,7 @@ from quick import quick
 
 from clsplat.device.context import list_devices
 from clsplat.device.shapes import Shape
-from clsplat.trust import Report
+from clsplat.selftest.trust import Report
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.device.buffers import Workspace, allocate
 from clsplat.device.context import Device, open_device
 from clsplat.errors import CapacityError, InputError
-from clsplat.memory import parse_bytes
+from clsplat.rendering.memory_plan import parse_bytes
 
 
 @pytest.mark.parametrize(

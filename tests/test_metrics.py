@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate1d
 
-from clsplat import metrics
 from clsplat.errors import InputError
+from clsplat.evaluation import metrics
 
 
 def images(height: int = 20, width: int = 31) -> tuple[np.ndarray, np.ndarray]:

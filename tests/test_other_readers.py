@@ -11,8 +11,8 @@ from models import random_gaussians
 from node import splat_transform
 from test_packed_formats import ksplat
 
-from clsplat import formats
 from clsplat.gaussians import Gaussians
+from clsplat.models import formats
 
 
 def as_they_read_it(path: Path) -> Gaussians:

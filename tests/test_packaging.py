@@ -43,7 +43,7 @@ def test_wheel_has_every_kernel_and_module_and_nothing_else(wheel):
     assert kernels
     assert {f"clsplat/{name}" for name in kernels} <= names
     templates = {f"clsplat/report/templates/{name}" for name in TEMPLATES}
-    files = {"clsplat/py.typed", "clsplat/selftest.json"} | templates
+    files = {"clsplat/py.typed", "clsplat/selftest/digests.json"} | templates
     assert names == {f"clsplat/{name}" for name in kernels} | modules | files
 
 

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from models import random_gaussians, real_file
 
-from clsplat import edit, formats
 from clsplat.errors import InputError
-from clsplat.formats import compressed_ply, packing, ply
 from clsplat.gaussians import Gaussians
+from clsplat.models import edit, formats
+from clsplat.models.codec import values as packing
+from clsplat.models.formats import compressed_ply, ply
 from clsplat.reference.sh import C0
 
 CHUNK = [

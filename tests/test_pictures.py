@@ -13,12 +13,12 @@ import scenes
 from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera
-from clsplat.colour import LINEAR, linear_to_srgb, srgb_to_linear
+from clsplat.config.pictures import ColourConfig, FramingConfig, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
-from clsplat.layers import Encoding
-from clsplat.picture_config import ColourConfig, FramingConfig, PictureConfig, SamplingConfig
-from clsplat.pictures import Pictures
-from clsplat.rendering import Renderer
+from clsplat.frame.pipeline import Pictures
+from clsplat.images.channels import Encoding
+from clsplat.images.colour import LINEAR, linear_to_srgb, srgb_to_linear
+from clsplat.rendering.rasterizer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(1500, 8, 100, 70)
 
@@ -92,7 +92,7 @@ def test_all_of_it_to_a_file_in_strips(tmp_path: Path, monkeypatch: pytest.Monke
     pictures = Pictures(Renderer(), CLOUD, config)
     after = sliding(1.0)
     pictures.write(tmp_path / "whole.exr", sliding, names, Encoding(depth="float"), after=after)
-    monkeypatch.setattr("clsplat.pictures.strip_rows", lambda *_: 16)
+    monkeypatch.setattr("clsplat.frame.pipeline.strip_rows", lambda *_: 16)
     pictures.write(tmp_path / "strips.exr", sliding, names, Encoding(depth="float"), after=after)
     assert (tmp_path / "strips.exr").read_bytes() == (tmp_path / "whole.exr").read_bytes()
     spec = oiio.ImageBuf(str(tmp_path / "whole.exr")).spec()

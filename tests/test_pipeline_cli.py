@@ -25,11 +25,11 @@ from systems import posix
 from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, short, write_scene
 
 import clsplat
-from clsplat.cli import main
-from clsplat.colour import srgb_to_linear
-from clsplat.images import read_image, write_image
-from clsplat.report.pictures import data_uri
-from clsplat.runs import Run
+from clsplat.cli.main import main
+from clsplat.images.colour import srgb_to_linear
+from clsplat.images.reading import read_image, write_image
+from clsplat.report.thumbnails import data_uri
+from clsplat.runs.run import Run
 
 # From photographs to pictures
 
@@ -239,7 +239,7 @@ def test_kill_and_resume_give_the_same_model(scene: Path, tmp_path: Path, long_m
 def test_ctrl_c_before_the_first_step(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture
 ) -> None:
-    from clsplat import trainer
+    from clsplat.training import trainer
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt

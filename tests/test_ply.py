@@ -12,8 +12,8 @@ import pytest
 from models import assert_equal, random_gaussians, real_file
 
 from clsplat.errors import InputError
-from clsplat.formats import ply
 from clsplat.gaussians import Gaussians
+from clsplat.models.formats import ply
 
 NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3))]
 NAMES += [f"rot_{i}" for i in range(4)]

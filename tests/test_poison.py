@@ -14,15 +14,15 @@ from pipeline import shaped
 from quick import quick
 from tiny import short, write_scene
 
-from clsplat import trainer as trainer_module
-from clsplat.config import TrainConfig
+from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
 from clsplat.errors import InputError
-from clsplat.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.project import GROUPS, DeviceGaussians
-from clsplat.trainer import Trainer
+from clsplat.training import trainer as trainer_module
+from clsplat.training.trainer import Trainer
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

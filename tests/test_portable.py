@@ -18,14 +18,16 @@ import pytest
 from models import random_gaussians
 from packaging.requirements import Requirement
 
-from clsplat import files, frames, process, sfm_photos, transforms
-from clsplat.cli import _unboxed
+from clsplat import files, process
+from clsplat.cli.main import _unboxed
 from clsplat.device import packaged
 from clsplat.device.advice import driver_advice
 from clsplat.errors import InputError
-from clsplat.evaluate import picture_names
+from clsplat.evaluation.held_out import picture_names
 from clsplat.files import identity, name_trouble
-from clsplat.images import read_image, write_image
+from clsplat.images.reading import read_image, write_image
+from clsplat.scenes import sfm_photos, transforms
+from clsplat.shots import frame_numbers
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -66,20 +68,20 @@ def test_names_that_windows_alone_refuses(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "why"), [("..\\..\\x.jpg", "leads out"), ("nul.jpg", "device"), ("a?.jpg", "has")])
 def test_a_frame_is_not_written_where_windows_would_not(name: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frames, "name_trouble", partial(name_trouble, windows=True))
+    monkeypatch.setattr(frame_numbers, "name_trouble", partial(name_trouble, windows=True))
     with pytest.raises(InputError, match=why):
-        frames.output_paths("out/{name}.png", [(1, name)])
+        frame_numbers.output_paths("out/{name}.png", [(1, name)])
 
 
 def test_frames_that_differ_in_case_or_spelling_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs = [("A.jpg", "a.jpg"), ("\u00fc.jpg", "u\u0308.jpg")]  # the second: as macOS used to spell it
     for pair in pairs:
         cameras = list(enumerate(pair))
-        monkeypatch.setattr(frames, "identity", partial(identity, ignores_case=False))
-        assert len(frames.output_paths("{name}.png", cameras)) == 2
-        monkeypatch.setattr(frames, "identity", partial(identity, ignores_case=True))
+        monkeypatch.setattr(frame_numbers, "identity", partial(identity, ignores_case=False))
+        assert len(frame_numbers.output_paths("{name}.png", cameras)) == 2
+        monkeypatch.setattr(frame_numbers, "identity", partial(identity, ignores_case=True))
         with pytest.raises(InputError, match="would be both"):
-            frames.output_paths("{name}.png", cameras)
+            frame_numbers.output_paths("{name}.png", cameras)
 
 
 def test_held_out_renders_that_would_be_one_file_where_case_is_ignored() -> None:
@@ -130,7 +132,7 @@ def test_what_is_flushed_may_be_written_to(tmp_path: Path, monkeypatch: pytest.M
     """Windows flushes no file that was opened for reading."""
     fcntl = pytest.importorskip("fcntl", reason="tells how a file was opened, on POSIX")
     pytest.importorskip("av", reason="the extra `video` brings it")
-    from clsplat.video import write_video
+    from clsplat.images.video import write_video
 
     real, asked = os.fsync, []
 
@@ -272,7 +274,7 @@ def load():
     return names
 
 def use():
-    from clsplat.cli import main
+    from clsplat.cli.main import main
 
     for arguments in (["--help"], ["train", "--help"], ["info", sys.argv[1]], ["convert", sys.argv[1], sys.argv[2]]):
         assert main(arguments) == 0, arguments
@@ -307,7 +309,7 @@ def test_no_module_wants_what_only_posix_has(tmp_path: Path) -> None:
     assert (tmp_path / "b.splat").stat().st_size == 4 * 32
 
 
-ASCII_FILES = {"clsplat/device/shapes.py", "clsplat/selftest.py"}
+ASCII_FILES = {"clsplat/device/shapes.py", "clsplat/selftest/child.py"}
 """These read what json.dumps wrote, which is ASCII."""
 
 
@@ -368,7 +370,8 @@ def test_paths_of_any_letters_in_any_locale(locale: str, tmp_path: Path) -> None
 def test_a_picture_in_a_folder_of_any_letters_where_the_locale_is_ascii(tmp_path: Path) -> None:
     folder = tmp_path / LETTERS
     folder.mkdir()
-    code = "import sys, numpy as np; from pathlib import Path; from clsplat.images import read_image, write_image; "
+    code = "import sys, numpy as np; from pathlib import Path; from clsplat.images.reading import read_image, "
+    code += "write_image; "
     code += "write_image(Path(sys.argv[1]), np.ones((2, 3, 3), np.float32)); assert read_image(Path(sys.argv[1])).all()"
     environment = {**os.environ, **ASCII, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", code, "日ü.png"]

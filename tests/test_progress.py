@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from clsplat.progress import FrameProgress, StageProgress, TrainProgress, duration
-from clsplat.render_job import Record
+from clsplat.sequence.workers import Record
 
 
 @dataclass

@@ -20,27 +20,18 @@ from compare import assert_same_bits
 from quick import quick
 from tiny import CONFIG, short, write_scene
 
-from clsplat import replay
-from clsplat.config import OptimiserConfig, TrainConfig
+from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.source import kernel_source
 from clsplat.errors import ClsplatError, InputError
-from clsplat.quarantine import (
-    PATIENCE,
-    RETURNS,
-    SH_LIMIT,
-    SMALLER,
-    WINDOW,
-    Patience,
-    examine,
-    finite_or_zero,
-)
 from clsplat.reference.sh import sh_basis
-from clsplat.runs import Run
-from clsplat.scene import Scene, load_scene
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.project import GROUPS, group_shapes
-from clsplat.trainer import Trainer
-from clsplat.training import train
+from clsplat.training import repro
+from clsplat.training.health import PATIENCE, RETURNS, SH_LIMIT, SMALLER, WINDOW, Patience, examine, finite_or_zero
+from clsplat.training.loop import train
+from clsplat.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
@@ -261,13 +252,13 @@ def test_what_cannot_be_helped_stops_with_a_bundle(scene: Scene, default_device:
     )
     assert message is not None
     assert len([line for line in lines if "back to" in line]) == RETURNS
-    bundle = replay.read_bundle(Path(message[3]))
+    bundle = repro.read_bundle(Path(message[3]))
     assert bundle.record["reproduced"]
     assert bundle.config == config
     assert bundle.record["device"]["name"] == default_device.name
     assert bundle.record["versions"].keys() == {"clsplat", "numpy", "pyopencl", "python", "system"}
-    counts = replay.replay(bundle, default_device)
-    assert replay.first_trouble(counts) == "adam"
+    counts = repro.replay(bundle, default_device)
+    assert repro.first_trouble(counts) == "adam"
     assert sum(counts.values()) == counts["adam"] > 0
     # and the run can be put right
     Run.create(run.path, CONFIG, overwrite=True)
@@ -282,17 +273,17 @@ def test_a_bundle_has_no_more_than_it_needs(
     with heard(), pytest.raises(ClsplatError), spoilt(lambda trainer: trainer.step > 5, "log_scales", value=np.inf):
         train(scene, config, device=default_device, run=run)
     (path,) = run.path.glob("trouble-step-*.npz")
-    bundle = replay.read_bundle(path)
+    bundle = repro.read_bundle(path)
     kept, of = bundle.record["of"]
     assert kept == 1 < of
     assert {len(values) for groups in bundle.models.values() for values in groups.values()} == {1}
     assert bundle.photograph.shape[:2] == (bundle.camera.height, bundle.camera.width)
     assert path.stat().st_size < 50_000
-    assert replay.main([str(path)]) == 0
+    assert repro.main([str(path)]) == 0
     out = capsys.readouterr().out
     assert "first in parameters" in out
     assert f"1 of {of} Gaussians" in out
-    assert replay.main([str(path), "--json"]) == 0
+    assert repro.main([str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["stage"] == "parameters"
 
 
@@ -306,10 +297,10 @@ def test_a_bundle_of_a_sound_step_says_so(
     trainer.watch.loss_failed()
     trainer.mend()
     assert trainer.watch.latest is not None
-    path = replay.write_bundle(tmp_path, trainer, trainer.watch.latest)
-    assert replay.read_bundle(path).record["of"] == [40, 40]
-    assert not replay.read_bundle(path).record["reproduced"]
-    assert replay.main([str(path)]) == 1
+    path = repro.write_bundle(tmp_path, trainer, trainer.watch.latest)
+    assert repro.read_bundle(path).record["of"] == [40, 40]
+    assert not repro.read_bundle(path).record["reproduced"]
+    assert repro.main([str(path)]) == 1
     assert "all is well on this device" in capsys.readouterr().out
 
 
@@ -321,27 +312,27 @@ def test_a_bundle_with_a_setting_of_an_earlier_version_loads(
     trainer.watch.loss_failed()
     trainer.mend()
     assert trainer.watch.latest is not None
-    path = replay.write_bundle(tmp_path, trainer, trainer.watch.latest)
+    path = repro.write_bundle(tmp_path, trainer, trainer.watch.latest)
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
-    record = json.loads(arrays[replay.RECORD].tobytes())
+    record = json.loads(arrays[repro.RECORD].tobytes())
     record["settings"] = record["settings"].replace("[train.rasterizer]", "[train.rasterizer]\nsh_angle = 1.5")
-    arrays[replay.RECORD] = np.frombuffer(json.dumps(record).encode(), np.uint8)
+    arrays[repro.RECORD] = np.frombuffer(json.dumps(record).encode(), np.uint8)
     np.savez(path, allow_pickle=False, **arrays)
-    assert replay.read_bundle(path).config == CONFIG
+    assert repro.read_bundle(path).config == CONFIG
     assert not recwarn.list
 
 
 def test_what_is_no_bundle_is_named(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "some.npz"
-    assert replay.main([str(path)]) == 2
+    assert repro.main([str(path)]) == 2
     assert f"{path}: no such file" in capsys.readouterr().err
     np.savez(path, a=np.zeros(3))
     with pytest.raises(InputError, match="not a bundle"):
-        replay.read_bundle(path)
+        repro.read_bundle(path)
     path.write_bytes(b"PK")
     with pytest.raises(InputError, match="not a bundle"):
-        replay.read_bundle(path)
+        repro.read_bundle(path)
 
 
 def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device: Device) -> None:

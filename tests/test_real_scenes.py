@@ -13,14 +13,14 @@ from compare import assert_close_images
 from models import real_file
 
 from clsplat.camera import Camera
-from clsplat.config import TrainConfig
+from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.reference.render import render as reference
-from clsplat.rendering import Renderer
-from clsplat.runs import Run
-from clsplat.scene import Scene, load_scene
-from clsplat.training import train
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.loop import train
 
 BACKGROUND = (0.1, 0.2, 0.3)
 CAMERAS = {

@@ -18,17 +18,17 @@ import pytest
 from calls import left_behind
 from scenes import tilted_camera
 
-from clsplat import render_job
 from clsplat.camera import Camera
+from clsplat.config.pictures import ColourConfig, PictureConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import temporary_name
-from clsplat.framing import Layers
-from clsplat.layers import LAYERS, Encoding
-from clsplat.paths.shot import Frame, Shot, numbered
-from clsplat.picture_config import ColourConfig, PictureConfig
-from clsplat.render_job import Record, is_complete, make_tasks, run_tasks, write_frame
-from clsplat.shading import FrameShader, RenderOptions, Shaded, Task, settings_digest
-from clsplat.shutter import camera_after, stretches
+from clsplat.frame.window import Layers
+from clsplat.images.channels import LAYERS, Encoding
+from clsplat.sequence import workers
+from clsplat.sequence.frame_renderer import FrameShader, RenderOptions, Shaded, Task, settings_digest
+from clsplat.sequence.workers import Record, is_complete, make_tasks, run_tasks, write_frame
+from clsplat.shots.motion import camera_after, stretches
+from clsplat.shots.shot import Frame, Shot, numbered
 
 EVERYTHING = tuple(LAYERS)
 OPTIONS = RenderOptions(("rgb", "alpha", "depth"), attributes={"clsplat:model": "abc", "Software": "clsplat"})
@@ -211,7 +211,7 @@ def test_the_loop_writes_every_frame_once(tmp_path: Path) -> None:
 
 def test_frames_that_wait_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tasks = tasks_in(tmp_path, 40)
-    writers, held = render_job.frames_ahead(tasks, OPTIONS, 1)
+    writers, held = workers.frames_ahead(tasks, OPTIONS, 1)
     assert held <= writers + 2
     waiting, most, lock = 0, 0, threading.Lock()
 
@@ -230,11 +230,11 @@ def test_frames_that_wait_are_bounded(tmp_path: Path, monkeypatch: pytest.Monkey
             waiting -= 1
         return record
 
-    monkeypatch.setattr(render_job, "write_frame", slow)
+    monkeypatch.setattr(workers, "write_frame", slow)
     run_tasks(tasks, [counting], OPTIONS, lambda record: None)
     assert 1 < most <= held
     huge = [replace(task, camera=replace(task.camera, width=40_000, height=20_000)) for task in tasks]
-    assert render_job.frames_ahead(huge, OPTIONS, 1) == (2, 3)
+    assert workers.frames_ahead(huge, OPTIONS, 1) == (2, 3)
 
 
 @pytest.mark.parametrize("where", ["render", "write", "report"])
@@ -257,7 +257,7 @@ def test_trouble_ends_the_job(where: str, tmp_path: Path, monkeypatch: pytest.Mo
         if where == "report":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(render_job, "write_frame", broken)
+    monkeypatch.setattr(workers, "write_frame", broken)
     before = threading.active_count()
     with pytest.raises(KeyboardInterrupt if where == "report" else ClsplatError):
         run_tasks(tasks, [failing], OPTIONS, on_done)
@@ -311,26 +311,26 @@ def test_stale_temporaries_of_the_shot_alone_go(tmp_path: Path) -> None:
     left_behind(tmp_path / "a.0002.exr")
     left_behind(tmp_path / "a.0003.exr")
     others.append(left_behind(tmp_path / "a.0004.exr"))
-    render_job.remove_temporaries(tasks)
+    workers.remove_temporaries(tasks)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
-    render_job.remove_temporaries(tasks_in(tmp_path / "none", 3))
+    workers.remove_temporaries(tasks_in(tmp_path / "none", 3))
 
 
 def test_folders_are_looked_at_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"")
     (tmp_path / "a.0002.exr").mkdir()
     with pytest.raises(InputError, match=r"file: is a file, expected a folder"):
-        render_job.check_folders(tasks_in(tmp_path / "file" / "shot"))
+        workers.check_folders(tasks_in(tmp_path / "file" / "shot"))
     with pytest.raises(InputError, match=r"a\.0002\.exr: is a folder, expected the name of a file"):
-        render_job.check_folders(tasks_in(tmp_path))
-    render_job.check_folders(tasks_in(tmp_path / "new" / "shot"))
+        workers.check_folders(tasks_in(tmp_path))
+    workers.check_folders(tasks_in(tmp_path / "new" / "shot"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
     with pytest.raises(InputError, match="is not writable"):
-        render_job.check_folders(tasks_in(tmp_path / "new" / "shot"))
+        workers.check_folders(tasks_in(tmp_path / "new" / "shot"))
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system")))
     with pytest.raises(InputError, match="cannot be made: the disk is read-only"):
-        render_job.make_folders(tasks_in(tmp_path / "new" / "shot"))
+        workers.make_folders(tasks_in(tmp_path / "new" / "shot"))
 
 
 def test_the_digest_goes_by_what_a_colour_configuration_says(tmp_path: Path) -> None:

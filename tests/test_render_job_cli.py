@@ -20,12 +20,12 @@ from quick import quick
 from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.device.context import list_devices
 from clsplat.gaussians import Gaussians
-from clsplat.paths import choose_shot
-from clsplat.rendering import Renderer
-from clsplat.shutter import camera_after
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.shots import choose_shot
+from clsplat.shots.motion import camera_after
 
 COUNT = 6
 ALL = "rgb,alpha,depth,normals,position,motion,median,first,count,id"
@@ -261,13 +261,13 @@ def test_a_reader_that_has_gone(shot: list[str], tmp_path: Path) -> None:
 
 
 def test_a_full_disk_ends_the_job(shot: list[str], tmp_path: Path, capsys: Capture, monkeypatch: Any) -> None:
-    from clsplat import images
+    from clsplat.images import reading
 
     def full(path: Path, *_: Any) -> None:
         if "0003" in str(path):
-            raise images.ClsplatError(f"{path}: cannot be written: No space left on device")
+            raise reading.ClsplatError(f"{path}: cannot be written: No space left on device")
 
-    monkeypatch.setattr("clsplat.layers.write_spec", full)
+    monkeypatch.setattr("clsplat.images.channels.write_spec", full)
     assert render(shot, tmp_path, "--progress", "none") == 1
     assert "a.0003.exr: cannot be written: No space left on device" in error_line(capsys)
 

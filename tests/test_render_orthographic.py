@@ -20,11 +20,11 @@ from scenes import make_gaussians
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.gaussians import Gaussians
 from clsplat.reference import every_pixel
 from clsplat.reference.cameras import pixel_from_world
-from clsplat.trajectory import look_at
+from clsplat.shots.viewpoints import look_at
 
 WIDTH, HEIGHT, PIXEL = 160, 128, 0.03125
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)

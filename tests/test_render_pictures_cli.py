@@ -17,10 +17,10 @@ from headers import exr_attributes, png_chunks
 from systems import can_link
 from tiny import HEIGHT, WIDTH, hidden_model
 
-from clsplat.cli import main
-from clsplat.colour import LINEAR, Colours, comment, linear_to_srgb, srgb_to_linear
-from clsplat.picture_config import ColourConfig
-from clsplat.video import video_missing
+from clsplat.cli.main import main
+from clsplat.config.pictures import ColourConfig
+from clsplat.images.colour import LINEAR, Colours, comment, linear_to_srgb, srgb_to_linear
+from clsplat.images.video import video_missing
 
 COUNT = 4
 HALF = 2.0**-11

@@ -17,16 +17,17 @@ from pages import charts_of, figures_of, outside_of, parse, rows_of
 from systems import links
 from tiny import CONFIG, short
 
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.errors import ClsplatError
 from clsplat.gaussians import Gaussians
-from clsplat.images import write_image
+from clsplat.images.reading import write_image
 from clsplat.reference.render import render_grad
-from clsplat.report import measure, page, pictures
-from clsplat.runs import Run
-from clsplat.scene import load_scene
-from clsplat.trainer import Trainer
+from clsplat.report import page, thumbnails
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import load_scene
+from clsplat.training import telemetry
+from clsplat.training.trainer import Trainer
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -146,10 +147,10 @@ def test_pictures_are_the_photograph_and_the_render(reported: Path, scene: Path)
     first = root.all("figure", class_="view")[0]
     photo, render, error = (image.attributes["src"] for image in first.all("img"))
     view = load_scene(scene).test_views[0]
-    assert photo == pictures.data_uri(view.load())
-    assert render == pictures.data_uri(pictures.read_image(reported / "test" / "00.png"))
-    difference = np.abs(view.load() - pictures.read_image(reported / "test" / "00.png")).mean(axis=2)
-    assert error == pictures.data_uri(pictures.error_colors(difference))
+    assert photo == thumbnails.data_uri(view.load())
+    assert render == thumbnails.data_uri(thumbnails.read_image(reported / "test" / "00.png"))
+    difference = np.abs(view.load() - thumbnails.read_image(reported / "test" / "00.png")).mean(axis=2)
+    assert error == thumbnails.data_uri(thumbnails.error_colors(difference))
 
 
 # That it needs nothing else
@@ -232,10 +233,12 @@ def test_views_beyond_the_limit_are_counted(copied: Path) -> None:
 
 def test_the_worst_and_the_best_views_are_shown() -> None:
     scores = [30.0, 20.0, None, 35.0, 25.0, 28.0]
-    assert pictures.chosen(scores, 2) == [1, 2], "no score is the last"
-    assert pictures.chosen([30.0, 20.0, 35.0, 25.0, 28.0, 29.0], 3) == [1, 2, 4], "of six the lowest, third and highest"
-    assert pictures.chosen([5.0, 1.0, 9.0, 3.0, 7.0], 3) == [0, 1, 2]
-    assert pictures.chosen(scores, 6) == list(range(6))
+    assert thumbnails.chosen(scores, 2) == [1, 2], "no score is the last"
+    assert thumbnails.chosen([30.0, 20.0, 35.0, 25.0, 28.0, 29.0], 3) == [1, 2, 4], (
+        "of six the lowest, third and highest"
+    )
+    assert thumbnails.chosen([5.0, 1.0, 9.0, 3.0, 7.0], 3) == [0, 1, 2]
+    assert thumbnails.chosen(scores, 6) == list(range(6))
 
 
 def test_an_unfinished_run_has_a_report(scene: Path, tmp_path: Path, copied: Path, capfd: Capture) -> None:
@@ -364,7 +367,7 @@ def test_contributions_are_the_references(scene: Path, device: Device) -> None:
     trainer = Trainer(load_scene(scene), short(stages_every=0), device)
     for _ in range(12):
         trainer.train_step()
-    found, looked = measure.largest_contributions(trainer, 1e9)
+    found, looked = telemetry.largest_contributions(trainer, 1e9)
     assert looked == len(trainer.views) == 8
     model = trainer.gaussians()
     expected = np.zeros(len(model))
@@ -374,12 +377,12 @@ def test_contributions_are_the_references(scene: Path, device: Device) -> None:
         expected = np.maximum(expected, gradients.contributions)
     # sums of up to 1920 weights in float32, and alphas near the threshold of 1/255 that fall to either side of it
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=0.01)
-    counted = measure.contributions(trainer, 1e9)
+    counted = telemetry.contributions(trainer, 1e9)
     assert counted is not None
     assert sum(counted["counts"]) + counted["none"] == len(model)
 
 
 def test_views_are_looked_at_far_apart_first() -> None:
-    assert measure._spread(8) == [0, 4, 2, 6, 1, 5, 3, 7]
-    assert measure._spread(1) == [0]
-    assert sorted(measure._spread(11)) == list(range(11))
+    assert telemetry._spread(8) == [0, 4, 2, 6, 1, 5, 3, 7]
+    assert telemetry._spread(1) == [0]
+    assert sorted(telemetry._spread(11)) == list(range(11))

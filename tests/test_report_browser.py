@@ -13,7 +13,7 @@ import pytest
 from browser import kept, watched_page
 from test_report import SCRIPT
 
-from clsplat.cli import main
+from clsplat.cli.main import main
 
 WIDE, PHONE = {"width": 1280, "height": 900}, {"width": 390, "height": 800}
 

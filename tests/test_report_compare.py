@@ -13,9 +13,9 @@ from calls import Capture, train
 from pages import charts_of, figures_of, parse, rows_of
 from tiny import short
 
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.report.compare import _labels
-from clsplat.runs import Run
+from clsplat.runs.run import Run
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clsplat.resolution import FACTORS, Sizes, by_doubling, by_spectra, sizes_of, some_of, spectrum_shares
+from clsplat.training.resolution import FACTORS, Sizes, by_doubling, by_spectra, sizes_of, some_of, spectrum_shares
 
 
 def test_doubling() -> None:

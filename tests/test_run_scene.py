@@ -15,13 +15,13 @@ from calls import train as command_train
 from quick import quick
 from tiny import short, write_scene
 
-from clsplat import run_scene
-from clsplat.cli import Train, main, parse
-from clsplat.config import TrainConfig
+from clsplat.cli.main import Train, main, parse
+from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
-from clsplat.images import read_image, write_image
-from clsplat.runs import Run
-from clsplat.scene import Scene, load_scene
+from clsplat.images.reading import read_image, write_image
+from clsplat.runs import scene_record
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
 
 FEW = short(iterations=3, report=False, density={"every": 0})
 
@@ -71,9 +71,9 @@ def refusal(run: Path, scene: Path, capsys: Capture) -> str:
 
 
 def test_the_same_scene_goes_on_from_anywhere(run: Path, own: Path) -> None:
-    known = (run / run_scene.NAME).read_bytes()
+    known = (run / scene_record.NAME).read_bytes()
     assert resume(run, own) == 0
-    assert (run / run_scene.NAME).read_bytes() == known
+    assert (run / scene_record.NAME).read_bytes() == known
 
 
 def test_a_changed_photograph_is_refused(run: Path, own: Path, capsys: Capture) -> None:
@@ -124,29 +124,29 @@ def test_another_resolution_is_not_another_scene(run: Path, own: Path) -> None:
 
 
 def test_a_run_of_an_earlier_version_resumes_with_one_line(run: Path, own: Path, capsys: Capture) -> None:
-    (run / run_scene.NAME).unlink()
+    (run / scene_record.NAME).unlink()
     capsys.readouterr()
     assert resume(run, own) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if run_scene.NAME in line]
+    told = [line for line in capsys.readouterr().err.splitlines() if scene_record.NAME in line]
     assert len(told) == 1
     assert told[0].startswith(f"clsplat: warning: {run}: has no scene.json, as runs of earlier versions")
-    assert (run / run_scene.NAME).exists()
+    assert (run / scene_record.NAME).exists()
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"views": {"a": {}}}', '{"views": 3, "points": {}}'])
 def test_a_damaged_record_is_named(text: str, run: Path, own: Path, capsys: Capture) -> None:
-    (run / run_scene.NAME).write_text(text)
-    assert f"{run / run_scene.NAME}: is damaged" in refusal(run, own, capsys)
+    (run / scene_record.NAME).write_text(text)
+    assert f"{run / scene_record.NAME}: is damaged" in refusal(run, own, capsys)
 
 
 def test_the_digest_is_of_the_photograph(scene: Path, own: Path) -> None:
     def record(folder: Path) -> dict[str, object]:
-        return run_scene.record_of(load_scene(folder), 0)
+        return scene_record.record_of(load_scene(folder), 0)
 
     assert json.loads(json.dumps(record(scene))) == record(own)
     with open(own / "images" / "05.png", "ab") as file:
         file.write(b"x")
-    assert run_scene.differences(record(scene), record(own)) == ["1 view another photograph (05.png)"]
+    assert scene_record.differences(record(scene), record(own)) == ["1 view another photograph (05.png)"]
 
 
 def test_a_scene_of_any_size_is_compared(scene: Path) -> None:
@@ -161,19 +161,19 @@ def test_a_scene_of_any_size_is_compared(scene: Path) -> None:
         return replace(whole, views=moved)
 
     for factor in (1e-7, 1.0, 1e7):
-        records = [run_scene.record_of(scaled(factor, shift), 0) for shift in (0.0, 0.0, 1e-3)]
-        assert run_scene.differences(records[0], records[1]) == []
-        assert run_scene.differences(records[0], records[2]) != []
+        records = [scene_record.record_of(scaled(factor, shift), 0) for shift in (0.0, 0.0, 1e-3)]
+        assert scene_record.differences(records[0], records[1]) == []
+        assert scene_record.differences(records[0], records[2]) != []
 
 
 def test_a_scene_elsewhere_cannot_be_accepted(scene: Path, tmp_path: Path) -> None:
     known = load_scene(scene)
     run = Run.create(tmp_path / "run", TrainConfig())
-    run_scene.write(run, known)
+    scene_record.write(run, known)
     far = load_scene(write_scene(tmp_path / "far"))
     far.origin = np.array([1024.0, 0, 0])
     with pytest.raises(InputError, match="lies elsewhere in the world"):
-        run_scene.check(run, far, tmp_path, 0, accept=True)
+        scene_record.check(run, far, tmp_path, 0, accept=True)
 
 
 DISPLAY = (

@@ -11,11 +11,11 @@ import pytest
 from models import random_gaussians
 
 import clsplat
-from clsplat.cli import Train, main, parse
-from clsplat.config import DensityConfig, OptimiserConfig, TrainConfig
+from clsplat.cli.main import Train, main, parse
+from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import TEMPORARY_SUFFIX
-from clsplat.runs import Run, is_run, parse_config, read_config
+from clsplat.runs.run import Run, is_run, parse_config, read_config
 
 CONFIG = TrainConfig(
     iterations=7,

@@ -11,13 +11,13 @@ import scenes
 from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera
+from clsplat.config.pictures import FramingConfig, SamplingConfig
 from clsplat.errors import InputError
-from clsplat.framing import crop, drawn_by, framed
-from clsplat.paths.shot import Shot, numbered
-from clsplat.picture_config import FramingConfig, SamplingConfig
+from clsplat.frame.shutter_and_lens import lens_points, lens_radius, sample_cameras, sample_times, sampled, through_lens
+from clsplat.frame.window import crop, drawn_by, framed
 from clsplat.reference import render as reference
-from clsplat.rendering import Renderer
-from clsplat.sampling import lens_points, lens_radius, sample_cameras, sample_times, sampled, through_lens
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.shots.shot import Shot, numbered
 
 CLOUD, CAMERA = scenes.random_cloud(1000, 8, 100, 70)
 

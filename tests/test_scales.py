@@ -12,14 +12,14 @@ import pytest
 from models import random_gaussians
 from tiny import cameras, short
 
-from clsplat import edit
 from clsplat.camera import NEAR, Camera
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
-from clsplat.initialise import MIN_SQUARED_DISTANCE, squared_floor
+from clsplat.models import edit
 from clsplat.reference import render as reference
-from clsplat.rendering import Renderer
-from clsplat.scene import Scene, load_scene
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.scenes.initialise import MIN_SQUARED_DISTANCE, squared_floor
+from clsplat.scenes.scene import Scene, load_scene
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
 

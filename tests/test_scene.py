@@ -20,8 +20,8 @@ from systems import links
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.images import companions, read_image, write_image
-from clsplat.scene import camera_bounds, detect, load_scene
+from clsplat.images.reading import companions, read_image, write_image
+from clsplat.scenes.scene import camera_bounds, detect, load_scene
 
 RNG = np.random.default_rng(2)
 WIDTH, HEIGHT = 48, 32
@@ -357,7 +357,7 @@ def test_photos_go_through_sfm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         warnings.warn("b.png could not be placed", stacklevel=1)
         return make_colmap(output)
 
-    monkeypatch.setitem(__import__("sys").modules, "clsplat.sfm", SimpleNamespace(reconstruct=reconstruct))
+    monkeypatch.setitem(__import__("sys").modules, "clsplat.scenes.sfm", SimpleNamespace(reconstruct=reconstruct))
     scene = load_scene(photos)
     assert calls == [(photos, tmp_path / "photos_colmap", None)]
     assert len(scene.views) == 9

@@ -15,19 +15,19 @@ from drivers import KEPT
 from pipeline import shaped
 from quick import quick
 
-from clsplat import trust
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.device import known
 from clsplat.device.child import MARK, REGARDLESS, TIMEOUT
 from clsplat.device.context import Device, all_devices, list_devices
 from clsplat.device.program import BREAK
 from clsplat.device.shapes import shape_of
 from clsplat.errors import DeviceError, InputError
-from clsplat.selftest import run
-from clsplat.selftest_bench import error_of
-from clsplat.selftest_result import BACKWARD, BOUNDS, CHANNELS, DEEP, FORWARD, RAYS, STAGES, TRAINING, Result
-from clsplat.selftest_scenes import keys, scenes
-from clsplat.trust import Report, examine
+from clsplat.selftest import trust
+from clsplat.selftest.child import run
+from clsplat.selftest.harness import error_of
+from clsplat.selftest.result import BACKWARD, BOUNDS, CHANNELS, DEEP, FORWARD, RAYS, STAGES, TRAINING, Result
+from clsplat.selftest.scenes import keys, scenes
+from clsplat.selftest.trust import Report, examine
 
 Capture = pytest.CaptureFixture[str]
 

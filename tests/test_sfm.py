@@ -14,8 +14,9 @@ import pytest
 from PIL import Image as Pillow
 from systems import can_link
 
-from clsplat import demo_scene, sfm, sfm_photos
+from clsplat.demo import ray_caster
 from clsplat.errors import ClsplatError, InputError
+from clsplat.scenes import sfm, sfm_photos
 
 WIDTH, HEIGHT, COUNT = 240, 180, 12
 # EXIF orientation: what a viewer does to stored pixels to show the photo; here its inverse, shown to stored
@@ -62,10 +63,10 @@ def read_image(path):
 @pytest.fixture(scope="module")
 def pictures():
     """A dozen neighbouring views of the demo's ring, (height, width, 3) uint8, and their true cameras."""
-    surfaces = demo_scene.still_life()
-    demo_scene.bake(surfaces, seed=0)
-    cameras = demo_scene.cameras(40, WIDTH, HEIGHT, seed=0)[:COUNT]
-    return [np.rint(demo_scene.render(surfaces, camera) * 255).astype(np.uint8) for camera in cameras], cameras
+    surfaces = ray_caster.still_life()
+    ray_caster.bake(surfaces, seed=0)
+    cameras = ray_caster.cameras(40, WIDTH, HEIGHT, seed=0)[:COUNT]
+    return [np.rint(ray_caster.render(surfaces, camera) * 255).astype(np.uint8) for camera in cameras], cameras
 
 
 @pytest.fixture(scope="module")
@@ -372,7 +373,7 @@ def test_camera_groups():
 
 @pytest.mark.slow
 def test_the_whole_demo_registers(tmp_path):
-    demo_scene.write_photos(tmp_path / "photos")
+    ray_caster.write_photos(tmp_path / "photos")
     output = sfm.reconstruct(tmp_path / "photos", tmp_path / "scene", camera_model="SIMPLE_PINHOLE")
     record = json.loads((output / sfm.RECORD).read_text())
     assert record["unregistered"] == []

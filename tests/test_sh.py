@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import InputError
 from clsplat.reference.sh import sh_basis
-from clsplat.sh import change_bounds, check_half, coefficients_in_use, needed_degrees
+from clsplat.rendering.sh_storage import change_bounds, check_half, coefficients_in_use, needed_degrees
 
 Float64 = NDArray[np.float64]
 

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from tiny import CONFIG, HEIGHT, WIDTH, short, write_scene
 
-from clsplat.config import OptimiserConfig
+from clsplat.config.training import OptimiserConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
-from clsplat.initialise import from_points
-from clsplat.runs import Run
-from clsplat.scene import Scene, load_scene
+from clsplat.runs.run import Run
+from clsplat.scenes.initialise import from_points
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.project import download_gaussians
-from clsplat.trainer import Trainer
-from clsplat.training import train
+from clsplat.training.loop import train
+from clsplat.training.trainer import Trainer
 
 ALL = replace(short(frequency_steps=20), optimiser=replace(CONFIG.optimiser, sparse=True, sh_rest_every=3))
 

@@ -20,14 +20,14 @@ from calls import train as command_train
 from tiny import short, write_scene
 
 import clsplat
-from clsplat import doubts
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.images import read_image, write_image
-from clsplat.runs import Run
-from clsplat.scene import load_scene
-from clsplat.training import train
+from clsplat.images.reading import read_image, write_image
+from clsplat.runs.run import Run
+from clsplat.scenes import doubts
+from clsplat.scenes.scene import load_scene
+from clsplat.training.loop import train
 
 FEW = short(iterations=3, sh_degree_every=1, report=False, density={"every": 0})
 

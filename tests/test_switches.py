@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
 
-from clsplat.config import PRESETS, RasterizerConfig
+from clsplat.config.training import PRESETS, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT, TILE
 from clsplat.device.source import kernel_root, kernel_source
-from clsplat.device.switches import kernel_defines
 from clsplat.errors import InputError
-from clsplat.rendering import Rasterizer
+from clsplat.rendering.build_flags import kernel_defines
+from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.project import upload_gaussians
 
 EXACT_OFF = {

@@ -13,17 +13,17 @@ import pytest
 from compare import assert_close, assert_same_bits
 from tiny import CONFIG, EVENTS, HEIGHT, WIDTH, hidden_model, short, write_scene
 
-from clsplat import density
-from clsplat.config import DensityConfig, OptimiserConfig, TrainConfig
-from clsplat.density import Plan
+from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import ClsplatError, InputError
-from clsplat.runs import Run
-from clsplat.scene import Scene, load_scene
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.loss import Loss
 from clsplat.stages.project import GROUPS, DeviceGaussians, upload_gaussians
-from clsplat.trainer import Trainer
-from clsplat.training import StepReport, train
+from clsplat.training.density import adaptive
+from clsplat.training.density.adaptive import Plan
+from clsplat.training.loop import StepReport, train
+from clsplat.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -134,17 +134,17 @@ def test_the_test_run_has_everything_in_it(
 ) -> None:
     """What the tests below stop and repeat: without this, they would show less than they seem to."""
     plans: dict[int, Plan] = {}
-    resets, counts, real = [], [], density.plan
+    resets, counts, real = [], [], adaptive.plan
 
     def plan(config: DensityConfig, step: int, extent: float, **values: Any) -> Plan:
         counts.append(len(values["seen"]))
         plans[step] = real(config, step, extent, **values)
         return plans[step]
 
-    monkeypatch.setattr(density, "plan", plan)
-    real_reset = density.reset_opacities
+    monkeypatch.setattr(adaptive, "plan", plan)
+    real_reset = adaptive.reset_opacities
     monkeypatch.setattr(
-        density, "reset_opacities", lambda config, logits: resets.append(trainer.step) or real_reset(config, logits)
+        adaptive, "reset_opacities", lambda config, logits: resets.append(trainer.step) or real_reset(config, logits)
     )
     trainer = Trainer(scene, CONFIG, default_device)
     coefficients = []
@@ -359,8 +359,8 @@ def trained_to(scene: Scene, device: Device, step: int, config: TrainConfig = CO
 
 def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """After step 25 some are cloned, some split, some kept: what a row was is what it is, what is fresh has none."""
-    plans, real = [], density.plan
-    monkeypatch.setattr(density, "plan", lambda *args, **values: plans.append(real(*args, **values)) or plans[-1])
+    plans, real = [], adaptive.plan
+    monkeypatch.setattr(adaptive, "plan", lambda *args, **values: plans.append(real(*args, **values)) or plans[-1])
     trainer = trained_to(scene, default_device, 25)
     plans.clear()
     before = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}

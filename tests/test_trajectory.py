@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from clsplat.camera import Camera
-from clsplat.trajectory import covered_arc, focus_point, look_at, turntable, up_axis
+from clsplat.shots.viewpoints import covered_arc, focus_point, look_at, turntable, up_axis
 
 
 def rotated_world(seed):

@@ -14,8 +14,8 @@ import pyopencl as cl
 import pytest
 from pipeline import shaped
 
-from clsplat import tune
-from clsplat.cli import main
+from clsplat.bench import shapes as tune
+from clsplat.cli.main import main
 from clsplat.device.context import Device, list_devices
 from clsplat.device.shapes import (
     Shape,

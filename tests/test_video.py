@@ -12,9 +12,9 @@ import pytest
 from needs import require
 from numpy.typing import NDArray
 
+from clsplat.config.pictures import VideoConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.picture_config import VideoConfig
-from clsplat.video import VideoWriter, check_video, write_video, yuv420
+from clsplat.images.video import VideoWriter, check_video, write_video, yuv420
 
 require("av")
 import av  # noqa: E402

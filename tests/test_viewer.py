@@ -20,8 +20,8 @@ from systems import posix
 from tiny import CONFIG
 from viewer_browser import clsplat
 
-from clsplat.cli import Train, main, parse
-from clsplat.runs import Run
+from clsplat.cli.main import Train, main, parse
+from clsplat.runs.run import Run
 from clsplat.viewer.server import Address, refused
 
 require("viser")

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from tiny import CONFIG, cameras, hidden_model, write_scene
 
-from clsplat.config import RasterizerConfig
+from clsplat.config.training import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
 from clsplat.gaussians import Gaussians
-from clsplat.rendering import Renderer
-from clsplat.scene import Scene, load_scene
-from clsplat.trainer import Trainer
-from clsplat.training import train
-from clsplat.viewer.look import Look, alpha_picture, colour_picture, count_picture, depth_picture, edited
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.loop import train
+from clsplat.training.trainer import Trainer
+from clsplat.viewer.appearance import Look, alpha_picture, colour_picture, count_picture, depth_picture, edited
 from clsplat.viewer.models import HeldModel, LiveModel, draft
-from clsplat.viewer.session import Level, Pose, Share
-from clsplat.viewer.viewing import Viewing
+from clsplat.viewer.refinement import Level, Pose, Share
+from clsplat.viewer.scheduler import Viewing
 
 BLACK = (0.0, 0.0, 0.0)
 CAMERA = cameras()[3]

@@ -17,12 +17,12 @@ from systems import posix
 from tiny import CONFIG
 from viewer_browser import SLOW, choose, clsplat
 
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.device.context import open_device
 from clsplat.gaussians import Gaussians
-from clsplat.images import read_image
-from clsplat.paths import choose_shot
-from clsplat.rendering import Renderer
+from clsplat.images.reading import read_image
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.shots import choose_shot
 
 PAGE = {"width": 900, "height": 600}
 CLEAR = (slice(250, 580), slice(20, 560))

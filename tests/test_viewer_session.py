@@ -16,9 +16,9 @@ from systems import links
 from tiny import cameras
 
 from clsplat.errors import InputError
-from clsplat.images import steps_of
-from clsplat.paths import choose_shot
-from clsplat.viewer.look import (
+from clsplat.images.reading import steps_of
+from clsplat.shots import choose_shot
+from clsplat.viewer.appearance import (
     LARGEST_OPACITY,
     SCALE,
     Look,
@@ -29,8 +29,8 @@ from clsplat.viewer.look import (
     edited,
     read_look,
 )
-from clsplat.viewer.recorder import MOST_KEYS, Recorder, save_path
-from clsplat.viewer.session import (
+from clsplat.viewer.path_recorder import MOST_KEYS, Recorder, save_path
+from clsplat.viewer.refinement import (
     PATIENCE,
     SETTLE,
     SMALLEST,
@@ -48,7 +48,7 @@ from clsplat.viewer.session import (
     read_pose,
     start_of,
 )
-from clsplat.viewer.viewing import Viewing
+from clsplat.viewer.scheduler import Viewing
 
 ZERO = np.zeros(3)
 TURN = np.array([0.5, -0.5, 0.5, 0.5])

@@ -19,8 +19,8 @@ from calls import Capture
 from calls import train as command_train
 from tiny import short
 
-from clsplat import evaluate, metrics, weights
 from clsplat.errors import ClsplatError, InputError
+from clsplat.evaluation import held_out, lpips_weights, metrics
 
 BODY = b"the weights" * 1000
 NAME = f"vgg16-{hashlib.sha256(BODY).hexdigest()[:8]}.pth"
@@ -47,7 +47,7 @@ class Answer(BaseHTTPRequestHandler):
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    monkeypatch.delenv(weights.VARIABLE, raising=False)
+    monkeypatch.delenv(lpips_weights.VARIABLE, raising=False)
     metrics.prepare_lpips.cache_clear()
     metrics._lpips_model.cache_clear()
     found = ThreadingHTTPServer(("127.0.0.1", 0), Answer)
@@ -80,46 +80,46 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_they_are_fetched_once(server: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    monkeypatch.setattr(weights, "URL", f"{server}/whole/{NAME}")
-    weights.fetch()
-    assert weights.place().read_bytes() == BODY
+    monkeypatch.setattr(lpips_weights, "URL", f"{server}/whole/{NAME}")
+    lpips_weights.fetch()
+    assert lpips_weights.place().read_bytes() == BODY
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "fetching VGG-16's weights for LPIPS, for 300 s at most (CLSPLAT_LPIPS_TIMEOUT)" in captured.err
-    monkeypatch.setattr(weights, "URL", f"http://127.0.0.1:9/{NAME}")
-    weights.fetch()
+    monkeypatch.setattr(lpips_weights, "URL", f"http://127.0.0.1:9/{NAME}")
+    lpips_weights.fetch()
     assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("seconds", ["0.3", "0"])
 def test_a_silent_server_has_a_limit(seconds: str, server: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(weights, "URL", f"{server}/silent/{NAME}")
-    monkeypatch.setenv(weights.VARIABLE, seconds)
+    monkeypatch.setattr(lpips_weights, "URL", f"{server}/silent/{NAME}")
+    monkeypatch.setenv(lpips_weights.VARIABLE, seconds)
     start = time.monotonic()
     with pytest.raises(ClsplatError) as caught:
-        weights.fetch()
+        lpips_weights.fetch()
     assert time.monotonic() - start < 2
-    assert f"curl --create-dirs -o {weights.place()} {server}/silent/{NAME}" in str(caught.value)
+    assert f"curl --create-dirs -o {lpips_weights.place()} {server}/silent/{NAME}" in str(caught.value)
     assert ("did not come within 0.3 s" in str(caught.value)) == (seconds != "0")
 
 
 def test_a_page_in_their_place_is_not_kept(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(weights, "URL", f"{server}/other/{NAME}")
+    monkeypatch.setattr(lpips_weights, "URL", f"{server}/other/{NAME}")
     with pytest.raises(ClsplatError, match=r"could not be fetched \(what came has another digest"):
-        weights.fetch()
-    assert not list(weights.place().parent.iterdir())
+        lpips_weights.fetch()
+    assert not list(lpips_weights.place().parent.iterdir())
 
 
 def test_a_limit_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     for text in ("soon", "-1", "nan", "inf"):
-        monkeypatch.setenv(weights.VARIABLE, text)
-        with pytest.raises(InputError, match=f"{weights.VARIABLE} is '{text}', expected seconds"):
-            weights.limit()
+        monkeypatch.setenv(lpips_weights.VARIABLE, text)
+        with pytest.raises(InputError, match=f"{lpips_weights.VARIABLE} is '{text}', expected seconds"):
+            lpips_weights.limit()
 
 
 @pytest.mark.usefixtures("installed")
 def test_nothing_is_on_standard_output(server: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    monkeypatch.setattr(weights, "URL", f"{server}/whole/{NAME}")
+    monkeypatch.setattr(lpips_weights, "URL", f"{server}/whole/{NAME}")
     assert metrics.lpips_missing() is None
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -130,8 +130,8 @@ def test_nothing_is_on_standard_output(server: str, monkeypatch: pytest.MonkeyPa
 def test_train_says_once_what_is_missing(
     server: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    monkeypatch.setattr(weights, "URL", f"{server}/silent/{NAME}")
-    monkeypatch.setenv(weights.VARIABLE, "0.2")
+    monkeypatch.setattr(lpips_weights, "URL", f"{server}/silent/{NAME}")
+    monkeypatch.setenv(lpips_weights.VARIABLE, "0.2")
     config = short(iterations=2, eval_at=(1,), report=False, density={"every": 0})
     assert command_train(scene, tmp_path / "run", config, "--json") == 0
     captured = capsys.readouterr()
@@ -146,7 +146,7 @@ def test_train_says_once_what_is_missing(
 
 def test_without_the_extra_the_file_says_so(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(metrics, "find_spec", lambda _name: None)
-    monkeypatch.setattr(weights, "URL", f"{server}/whole/{NAME}")
+    monkeypatch.setattr(lpips_weights, "URL", f"{server}/whole/{NAME}")
 
     class View:
         name = "a.png"
@@ -154,6 +154,6 @@ def test_without_the_extra_the_file_says_so(server: str, monkeypatch: pytest.Mon
         def load(self) -> np.ndarray:
             return np.zeros((16, 16, 3), np.float32)
 
-    result = evaluate.evaluate(View.load, [View()], (0, 0, 0), step=1, gaussians=1, seconds=0.0)
+    result = held_out.evaluate(View.load, [View()], (0, 0, 0), step=1, gaussians=1, seconds=0.0)
     assert result["lpips_missing"] == "the optional extra is not installed (no lpips): pip install 'clsplat[lpips]'"
-    assert not weights.place().exists(), "nothing is fetched that nobody could use"
+    assert not lpips_weights.place().exists(), "nothing is fetched that nobody could use"

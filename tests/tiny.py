@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from scenes import make_gaussians
 
 from clsplat.camera import Camera
-from clsplat.config import DensityConfig, OptimiserConfig, TrainConfig
+from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
-from clsplat.images import write_image
+from clsplat.images.reading import write_image
 from clsplat.reference.render import render
-from clsplat.scene import Scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.project import upload_gaussians
-from clsplat.trainer import Trainer
+from clsplat.training.trainer import Trainer
 
 WIDTH, HEIGHT, FOCAL = 48, 40, 50.0
 VIEWS = 10

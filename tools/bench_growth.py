@@ -22,11 +22,11 @@ from collections.abc import Sequence
 import numpy as np
 from measuring import Result, machine, number, options_parser, reporting, require, show, sizes
 
-from clsplat.bench import columns, synthetic, wall_ms
+from clsplat.bench.plots import Panel, check_plot, plot_growth
+from clsplat.bench.stages import columns, synthetic, wall_ms
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
-from clsplat.plots import Panel, check_plot, plot_growth
-from clsplat.rendering import Frame, Rasterizer
+from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.stages.project import upload_gaussians
 
 GAUSSIANS, WIDTH, HEIGHT = 200_000, 1024, 768

@@ -22,10 +22,10 @@ from pathlib import Path
 
 from measuring import Result, machine, reporting, require, show
 
-from clsplat.bench import load_subject, synthetic, trainer_of
-from clsplat.config import RasterizerConfig
+from clsplat.bench.stages import load_subject, synthetic, trainer_of
+from clsplat.config.training import RasterizerConfig
 from clsplat.device.context import Device, open_device
-from clsplat.trainer import Trainer
+from clsplat.training.trainer import Trainer
 
 WARM_UP = 3
 

@@ -26,11 +26,11 @@ import numpy as np
 from measuring import Result, machine, number, options_parser, reporting, require, show, sizes
 from numpy.typing import NDArray
 
-from clsplat.bench import columns, wall_ms
+from clsplat.bench.plots import Panel, check_plot, plot_growth
+from clsplat.bench.stages import columns, wall_ms
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device, open_device
 from clsplat.errors import ClsplatError
-from clsplat.plots import Panel, check_plot, plot_growth
 from clsplat.stages.sort import sort
 
 SMALLEST, LINEAR_FROM = 10_000, 100_000

@@ -27,7 +27,7 @@ import numpy as np
 from clsplat.device.context import open_device
 from clsplat.errors import ClsplatError
 from clsplat.gaussians import Gaussians
-from clsplat.runs import model_file
+from clsplat.runs.run import model_file
 
 WINDOW = {"width": 1280, "height": 720}
 TURN = 3.0

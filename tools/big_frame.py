@@ -15,12 +15,12 @@ import sys
 import time
 from pathlib import Path
 
-from clsplat.bench import synthetic
-from clsplat.big_frames import strip_rows
+from clsplat.bench.stages import synthetic
 from clsplat.device.context import open_device
-from clsplat.memory import parse_bytes
-from clsplat.pictures import Pictures
-from clsplat.rendering import Renderer
+from clsplat.frame.pipeline import Pictures
+from clsplat.frame.strips import strip_rows
+from clsplat.rendering.memory_plan import parse_bytes
+from clsplat.rendering.rasterizer import Renderer
 
 
 def main(arguments: list[str]) -> int:

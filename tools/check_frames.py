@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.colmap import read_cameras
 from clsplat.gaussians import Gaussians
-from clsplat.images import read_image
+from clsplat.images.reading import read_image
 from clsplat.reference.render import render
+from clsplat.scenes.colmap import read_cameras
 
 TOLERANCE, FLIPS = 2e-5, 1e-4
 

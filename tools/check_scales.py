@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat import load_scene
-from clsplat.config import TrainConfig
+from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
-from clsplat.evaluate import background_colour, evaluate
+from clsplat.evaluation.held_out import background_colour, evaluate
 from clsplat.gaussians import Gaussians
-from clsplat.rendering import Renderer
-from clsplat.scene import Scene
-from clsplat.training import train
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.scenes.scene import Scene
+from clsplat.training.loop import train
 
 FACTORS = (1.0, 1e-7, 1e-4, 1e4, 1e7)
 OFFSET = 1e6

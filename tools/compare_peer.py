@@ -31,13 +31,13 @@ from pathlib import Path
 
 from measuring import Result, machine, reporting, require, show
 
-from clsplat.bench import columns, wall_ms
-from clsplat.config import TrainConfig
+from clsplat.bench.stages import columns, wall_ms
+from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
-from clsplat.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.limit import measure_limits
-from clsplat.trainer import Trainer
+from clsplat.training.trainer import Trainer
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,18 @@ from typing import Any
 import numpy as np
 from spoilers import MOST_BYTES, SPOILERS, spoil_place
 
-from clsplat import colmap, formats, replay, runs, sfm, sfm_photos, transforms
-from clsplat.config import TrainConfig
-from clsplat.formats import ply
+from clsplat.config.training import TrainConfig
 from clsplat.gaussians import Gaussians
-from clsplat.images import image_size, read_image, write_image
-from clsplat.model_info import model_info
-from clsplat.paths.read import choose_shot
-from clsplat.scene import load_scene
+from clsplat.images.reading import image_size, read_image, write_image
+from clsplat.models import formats
+from clsplat.models.formats import ply
+from clsplat.models.info import model_info
+from clsplat.runs import run as runs
+from clsplat.scenes import colmap, sfm, sfm_photos, transforms
+from clsplat.scenes.scene import load_scene
+from clsplat.shots.read import choose_shot
 from clsplat.stages.project import group_shapes
+from clsplat.training import repro
 
 
 @dataclass(frozen=True)
@@ -231,7 +234,7 @@ FORMATS = ("png", "jpg", "exr", "tif", "bmp", "hdr", "tga", "ppm", "webp")
 
 def make_image(folder: Path, extension: str) -> None:
     """One picture, with an EXIF orientation where the format has it."""
-    import OpenImageIO as oiio  # as clsplat.images writes PNG and EXR alone
+    import OpenImageIO as oiio  # as clsplat.images.reading writes PNG and EXR alone
 
     pixels = np.random.default_rng(2).random((19, 23, 3)).astype(np.float32)
     spec = oiio.ImageSpec(23, 19, 3, oiio.FLOAT if extension in ("exr", "hdr") else oiio.UINT8)
@@ -270,7 +273,7 @@ def make_bundle(folder: Path) -> None:
     np.savez(
         folder / "trouble-step-0000007.npz",
         allow_pickle=False,
-        **{replay.RECORD: np.frombuffer(json.dumps(record).encode(), np.uint8)},
+        **{repro.RECORD: np.frombuffer(json.dumps(record).encode(), np.uint8)},
         photograph=np.zeros((9, 12, 3), np.uint8),
         background=np.zeros(3, np.float32),
         rotation=np.eye(3),
@@ -459,7 +462,7 @@ _ALL = (
     Reader(
         "bundle",
         make_bundle,
-        lambda f: replay.read_bundle(f / "trouble-step-0000007.npz"),
+        lambda f: repro.read_bundle(f / "trouble-step-0000007.npz"),
         ("trouble-step-0000007.npz",),
         (*BYTES, "archive", *PLACES),
         2,

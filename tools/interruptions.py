@@ -62,10 +62,10 @@ VERBS = (
     Verb("view", "view {model} --port 0", "!socket.bind", writes=False),
     Verb("report", "report {out}/run", "clsplat.report.page"),
     Verb("compare", "compare {run} {other} -o {out}/a.html", "clsplat.report.compare"),
-    Verb("convert", "convert {model} {out}/a.sog", "clsplat.fidelity"),
-    Verb("info", "info {model}", "clsplat.model_info", writes=False),
-    Verb("bench", "bench --gaussians 5000 --size 320x240 --repeat 3", "clsplat.tradeoff", writes=False),
-    Verb("tune", "tune", "clsplat.tune", writes=False),
+    Verb("convert", "convert {model} {out}/a.sog", "clsplat.models.difference"),
+    Verb("info", "info {model}", "clsplat.models.info", writes=False),
+    Verb("bench", "bench --gaussians 5000 --size 320x240 --repeat 3", "clsplat.bench.settings", writes=False),
+    Verb("tune", "tune", "clsplat.bench.shapes", writes=False),
     Verb("selftest", "selftest", "!subprocess.Popen", writes=False),
 )
 WATCHED = """
@@ -124,7 +124,7 @@ class Bench:
         self.names.update(model=str(folder / "run" / "model.ply"), cache=str(folder / "cache"))
         write_scene(folder / "scene")
         if any(verb.name == "sfm" for verb in verbs):
-            from clsplat.demo_scene import ignore_progress, write_photos
+            from clsplat.demo.ray_caster import ignore_progress, write_photos
 
             write_photos(folder / "photos", count=12, width=320, height=240, progress=ignore_progress)
         for name in ("run", "other"):

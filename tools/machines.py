@@ -53,11 +53,11 @@ TAIL = 25
 
 SHORT = """
 import sys
-from clsplat.cli import main
+from clsplat.cli.main import main
 from clsplat.device.context import list_devices, open_device
 from clsplat.device.known import memory_path
 from clsplat.errors import ClsplatError
-from clsplat.trust import require
+from clsplat.selftest.trust import require
 if memory_path().exists():
     sys.exit(f"{memory_path()}: exists, expected a home in which no driver is known")
 if not list_devices():
@@ -473,7 +473,7 @@ def _stranger() -> tuple[str, ...]:
     nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
     reading = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
     # a child too: setpriv itself may still follow paths that its command may not
-    code = "import clsplat.cli, pyopencl, subprocess, sys; subprocess.check_call([sys.executable, '-V'])"
+    code = "import clsplat.cli.main, pyopencl, subprocess, sys; subprocess.check_call([sys.executable, '-V'])"
     for command in (nobody, (*nobody, *reading)):
         if _is_root() and _works((*command, PYTHON, "-c", code)):
             return command

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """Write what tests/golden/ holds and the tests repeat: the losses of 20 steps of the tests' tiny training, and
-checksums of frames and gradients; and clsplat/selftest.json, the digests that `clsplat selftest` compares with.
+checksums of frames and gradients; and clsplat/selftest/digests.json, the digests that `clsplat selftest` compares with.
 
     .venv/bin/python tools/make_golden.py [loss_curve] [frames] [selftest]
 
@@ -30,7 +30,7 @@ GOLDEN = ROOT / "tests" / "golden"
 def main(names: list[str]) -> int:
     """Write the files on the default device."""
     makers = {"loss_curve": write_loss_curve, "frames": write_frames, "selftest": write_selftest}
-    paths = {"selftest": ROOT / "clsplat" / "selftest.json"}
+    paths = {"selftest": ROOT / "clsplat" / "selftest" / "digests.json"}
     for name in names or list(makers):
         if name not in makers:
             print(__doc__, file=sys.stderr)
@@ -44,7 +44,7 @@ def write_loss_curve(path: Path) -> None:
     from tiny import loss_curve, write_scene
 
     from clsplat.device.context import open_device
-    from clsplat.scene import load_scene
+    from clsplat.scenes.scene import load_scene
 
     device = open_device()
     with tempfile.TemporaryDirectory() as folder:
@@ -73,7 +73,7 @@ SHAPES = ((1, 1), *((1, items) for items in (16, 32, 64, 128, 256)), (4, 1), (8,
 def write_selftest(path: Path) -> None:
     """Run the self-test in every shape and write the digests: one of all shapes, of blending's gradient one each."""
     from clsplat.device.context import open_device
-    from clsplat.selftest import run, shape_label
+    from clsplat.selftest.child import run, shape_label
 
     device = open_device()
     by_shape: dict[str, dict[str, str]] = {}

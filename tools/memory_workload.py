@@ -20,23 +20,23 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsplat.bench import _Picture
+from clsplat.bench.stages import _Picture
 from clsplat.camera import Camera
-from clsplat.config import DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
+from clsplat.config.training import DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
 from clsplat.device import buffers, launch, program
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device, all_devices
 from clsplat.device.layout import WIDEST_SLOTS
 from clsplat.device.shapes import Shape
 from clsplat.gaussians import Gaussians
-from clsplat.rendering import Rasterizer, Renderer
-from clsplat.scene import Scene
+from clsplat.rendering.rasterizer import Rasterizer, Renderer
+from clsplat.scenes.lens import Lens
+from clsplat.scenes.scene import Scene
 from clsplat.stages.blend import count_pairs, tile_items
 from clsplat.stages.limit import _splats
 from clsplat.stages.project import GROUPS, allocate_gaussians, upload_gaussians
 from clsplat.stages.sort import bitonic_sort, radix_sort
-from clsplat.trainer import Trainer
-from clsplat.undistort import Lens
+from clsplat.training.trainer import Trainer
 
 STAND_INS = (
     "arrays are filled by a copy from the host, as what clEnqueueFillBuffer writes counts as uninitialised there",

@@ -16,9 +16,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from clsplat.bench.plots import check_plot, plot_training
 from clsplat.errors import InputError
-from clsplat.plots import check_plot, plot_training
-from clsplat.runs import Run
+from clsplat.runs.run import Run
 
 
 def curve(path: Path) -> list[tuple[float, float]]:

@@ -20,7 +20,7 @@ from clsplat.reference import render as reference
 from clsplat.reference.blend import blend
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
-from clsplat.rendering import Frame, Rasterizer
+from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.stages.project import allocate_gaussians, download_gaussians, upload_gaussians
 
 Array = NDArray[Any]

@@ -26,8 +26,8 @@ from stress_frames import compare as compare_frame
 from stress_projection import ERRORS, compare
 from stress_stages import BOUNDS, stages
 
+from clsplat.bench.plots import Panel, check_plot, plot_grid
 from clsplat.device.context import Device, open_device
-from clsplat.plots import Panel, check_plot, plot_grid
 
 Array = NDArray[Any]
 BATCH = 5000

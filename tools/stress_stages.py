@@ -10,7 +10,7 @@ import numpy as np
 from measuring import Result
 from numpy.typing import NDArray
 
-from clsplat.config import OptimiserConfig
+from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from clsplat import load_scene
-from clsplat.config import TrainConfig
+from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
-from clsplat.evaluate import background_colour, evaluate
-from clsplat.initialise import SH_C0
-from clsplat.rendering import Renderer
-from clsplat.scene import Scene
-from clsplat.training import train
+from clsplat.evaluation.held_out import background_colour, evaluate
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.scenes.initialise import SH_C0
+from clsplat.scenes.scene import Scene
+from clsplat.training.loop import train
 
 BOUND, FEW_BOUND, FEW = 0.1, 0.3, 4
 

@@ -13,25 +13,17 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from clsplat.device.account import Memory
 from clsplat.device.advice import no_device
 from clsplat.device.buffers import allocate
 from clsplat.device.child import patience
 from clsplat.device.known import tell_once
 from clsplat.device.launch import launch_groups
-from clsplat.device.memory import Memory
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build, variant_of
 from clsplat.device.rehearsal import Rehearsal
-from clsplat.device.shapes import (
-    Shape,
-    asked_shape,
-    compiles_by_size,
-    kind_of,
-    shape_of,
-    shape_text,
-    why_another,
-)
+from clsplat.device.shapes import Shape, asked_shape, compiles_by_size, kind_of, shape_of, shape_text, why_another
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError
 

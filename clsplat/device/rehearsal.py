@@ -111,9 +111,9 @@ def _process(index: int) -> _Process:
 class Rehearsal:
     """Kernels that a driver has shown that it can build and launch, in one shape of the kernels, LANESxITEMS.
 
-    In a process that is a trial itself, such as that of `clsplat.trust`, done has the names of what was built and
-    launched, with the salt of `Variant.anew` that its text needed, and say, if given, is told each kernel that comes
-    next.
+    In a process that is a trial itself, such as that of `clsplat.selftest.trust`, done has the names of what was built
+    and launched, with the salt of `Variant.anew` that its text needed, and say, if given, is told each kernel that
+    comes next.
     """
 
     def __init__(self, device: cl.Device, index: int, shape: str) -> None:

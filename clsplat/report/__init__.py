@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
-    from clsplat.runs import Run
-    from clsplat.scene import Scene
+    from clsplat.runs.run import Run
+    from clsplat.scenes.scene import Scene
 
 NAME = "report.html"
 """In a run's folder."""

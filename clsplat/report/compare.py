@@ -15,7 +15,7 @@ from clsplat.files import atomic_write
 from clsplat.report.figures import SCORES, Figures, read_figures, settings_of, smooth
 from clsplat.report.page import TITLES, duration, render_page, score, setting_text
 from clsplat.report.svg import COLORS, Series, chart
-from clsplat.runs import Run
+from clsplat.runs.run import Run
 
 MAX_RUNS = 24
 MAX_ROWS = 100

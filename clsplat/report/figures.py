@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config import TrainConfig
+from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
 from clsplat.files import digest, parse_json, read_document
 from clsplat.gaussians import Gaussians
-from clsplat.runs import Run
+from clsplat.runs.run import Run
 
 Record = dict[str, Any]
 

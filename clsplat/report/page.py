@@ -14,10 +14,10 @@ from markupsafe import Markup
 
 import clsplat
 from clsplat.errors import amount
-from clsplat.evaluate import background_colour
+from clsplat.evaluation.held_out import background_colour
 from clsplat.files import atomic_write
 from clsplat.gaussians import Gaussians
-from clsplat.report import NAME, pictures
+from clsplat.report import NAME, thumbnails
 from clsplat.report.figures import (
     CURVES,
     MAX_STAGES,
@@ -29,8 +29,8 @@ from clsplat.report.figures import (
     smooth,
 )
 from clsplat.report.svg import Series, chart, short
-from clsplat.runs import Run
-from clsplat.scene import Scene
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene
 
 MAX_VIEWS = 8
 """Held-out views with pictures, unless asked for others."""
@@ -66,16 +66,16 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
     """The page's HTML."""
     evaluation = figures.evaluation
     listed = evaluation["views"] if evaluation else []
-    shown: list[pictures.Shown] = []
+    shown: list[thumbnails.Shown] = []
     notes = list(figures.notes)
     if listed and views > 0:
-        scene = scene if scene is not None else pictures.scene_of(figures.run)
+        scene = scene if scene is not None else thumbnails.scene_of(figures.run)
         if isinstance(scene, str):
             notes.append(f"There are renders without photographs: {scene}.")
         names = [view["name"] for view in listed]
-        wanted = pictures.chosen([view.get("psnr") for view in listed], views)
+        wanted = thumbnails.chosen([view.get("psnr") for view in listed], views)
         background = background_colour(figures.run.config.background)
-        shown = pictures.show(figures.run, names, wanted, None if isinstance(scene, str) else scene, background)
+        shown = thumbnails.show(figures.run, names, wanted, None if isinstance(scene, str) else scene, background)
         if len(shown) < len(wanted):
             notes.append(f"{len(wanted) - len(shown)} renders of held-out views are not in test/, or cannot be read.")
     scores = {view["name"]: view for view in listed}
@@ -91,7 +91,7 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         shown=[(place, each, scores[each.name]) for place, each in enumerate(shown, 1)],
         places=places,
         left_out=len(listed) - len(shown),
-        white_error=pictures.WHITE_ERROR,
+        white_error=thumbnails.WHITE_ERROR,
         columns=[(name, TITLES[name]) for name in SCORES if any(name in view for view in listed)],
         views=listed[:MAX_ROWS],
         views_left_out=max(len(listed) - MAX_ROWS, 0),

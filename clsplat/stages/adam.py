@@ -7,13 +7,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from clsplat.config import OptimiserConfig
+from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.quarantine import limit_of
 from clsplat.stages.project import GROUPS, DeviceGaussians
+from clsplat.training.health import limit_of
 
 REFUSED = ("parameters", "gradients", "moments", "steps")
 """Why the steps of elements were refused: what adam.cl counts."""

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is looked at: a model that does not change, or one in training. Pictures of them, by `clsplat.rendering`.
+"""What is looked at: a model that does not change, or one in training. Pictures of them, by
+`clsplat.rendering.rasterizer`.
 
 Only the thread that made them may ask for pictures: a device has one queue.
 """
@@ -11,16 +12,16 @@ from dataclasses import replace
 from typing import Protocol
 
 from clsplat.camera import Camera
-from clsplat.config import PRESETS, RasterizerConfig
+from clsplat.config.training import PRESETS, RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
 from clsplat.gaussians import Gaussians
-from clsplat.needs import frame_pixels
-from clsplat.rendering import Rasterizer, Renderer
+from clsplat.rendering.memory_needs import frame_pixels
+from clsplat.rendering.rasterizer import Rasterizer, Renderer
 from clsplat.stages.project import AnyGaussians
-from clsplat.trainer import Trainer
-from clsplat.viewer.look import Image, Look, alpha_picture, colour_picture, count_picture, depth_picture, edited
-from clsplat.viewer.session import MOST_PIXELS
+from clsplat.training.trainer import Trainer
+from clsplat.viewer.appearance import Image, Look, alpha_picture, colour_picture, count_picture, depth_picture, edited
+from clsplat.viewer.refinement import MOST_PIXELS
 
 HELD = 2
 """Models on the device: the one of the file, and one that is looked at in another way."""

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clsplat.errors import ClsplatError, InputError, plain
-from clsplat.viewer.look import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
-from clsplat.viewer.recorder import FPS, Recorder, save_path
-from clsplat.viewer.session import LARGEST_SIDE, MOST_PIXELS, Level, quaternion_of
-from clsplat.viewer.viewing import Viewing
+from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
+from clsplat.viewer.path_recorder import FPS, Recorder, save_path
+from clsplat.viewer.refinement import LARGEST_SIDE, MOST_PIXELS, Level, quaternion_of
+from clsplat.viewer.scheduler import Viewing
 
 if TYPE_CHECKING:
-    from clsplat.scene import View
+    from clsplat.scenes.scene import View
     from clsplat.viewer.models import Model
     from clsplat.viewer.server import World
 

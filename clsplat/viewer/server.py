@@ -25,13 +25,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config import HOST, PORT
+from clsplat.config.training import HOST, PORT
 from clsplat.errors import InputError, plain
-from clsplat.viewer.session import Start, read_pose
-from clsplat.viewer.viewing import Viewing
+from clsplat.viewer.refinement import Start, read_pose
+from clsplat.viewer.scheduler import Viewing
 
 if TYPE_CHECKING:
-    from clsplat.scene import View
+    from clsplat.scenes.scene import View
 
 Float64 = NDArray[np.float64]
 LOCAL = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"

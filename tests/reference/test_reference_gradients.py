@@ -18,14 +18,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference.adam import adam
 from clsplat.reference.blend import ALPHA_MAX, blend, blend_grad, footprint
 from clsplat.reference.loss import l1_dssim
-from clsplat.reference.project import (
-    ALPHA_MIN,
-    conic_grad,
-    covariance_grad,
-    frustum_limits,
-    project,
-    project_grad,
-)
+from clsplat.reference.project import ALPHA_MIN, conic_grad, covariance_grad, frustum_limits, project, project_grad
 from clsplat.reference.render import forward, parameters, render_grad
 from clsplat.reference.sh import sh_basis, sh_basis_grad
 from clsplat.reference.sort import depth_order

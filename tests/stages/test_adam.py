@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from compare import assert_close
 
-from clsplat.config import OptimiserConfig
+from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.reference.adam import adam as reference

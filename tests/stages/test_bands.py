@@ -10,11 +10,11 @@ from pipeline import BACKGROUND, Pipeline
 from quick import quick
 from scenes import NAMED, SHAPE_MATTERS, overlap, random_cloud
 
-from clsplat.config import RasterizerConfig
+from clsplat.config.training import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
-from clsplat.rendering import Rasterizer
+from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.duplicate import Band
 from clsplat.stages.project import GROUPS, allocate_gaussians, upload_gaussians

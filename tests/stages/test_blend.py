@@ -11,12 +11,12 @@ import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
 from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 
-from clsplat.config import RasterizerConfig
+from clsplat.config.training import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
-from clsplat.device.switches import kernel_defines
 from clsplat.reference import render as reference
-from clsplat.rendering import Rasterizer
+from clsplat.rendering.build_flags import kernel_defines
+from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import blend_grad
 from clsplat.stages.project import upload_gaussians
 

@@ -9,7 +9,7 @@ import scenes
 from pipeline import Pipeline
 from quick import quick
 
-from clsplat.config import RasterizerConfig
+from clsplat.config.training import RasterizerConfig
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
@@ -53,7 +53,7 @@ def assert_lists_hold_every_tile(device: Device, name: str) -> None:
 def test_few_tiles_are_listed_in_vain(device: Device, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make(name)
     run = Pipeline.run(device, scene)
-    monkeypatch.setattr("clsplat.rendering.kernel_defines", lambda _config: {"SMALL_BOX": 0})
+    monkeypatch.setattr("clsplat.rendering.rasterizer.kernel_defines", lambda _config: {"SMALL_BOX": 0})
     exact = Pipeline.run(device, scene)
     projected = reference.forward(*scene).projected
     wanted = sum(len(t) for t in touched_tiles(projected, run.camera.width, run.camera.height))

@@ -14,18 +14,18 @@ from drivers import KEPT
 from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 
 from clsplat.camera import Camera
-from clsplat.config import RasterizerConfig
-from clsplat.deep import bin_bounds, depths_in_view, render_deep
+from clsplat.config.pictures import DeepConfig
+from clsplat.config.training import RasterizerConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
-from clsplat.framing import crop, on_tiles
-from clsplat.picture_config import DeepConfig
+from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep
+from clsplat.frame.window import crop, on_tiles
 from clsplat.reference import deep as deep_twin
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
 from clsplat.reference.cameras import pixel_from_world
 from clsplat.reference.project import rotation_matrices
-from clsplat.rendering import ChannelResult, Renderer, RenderResult
+from clsplat.rendering.rasterizer import ChannelResult, Renderer, RenderResult
 
 FEATURES = ("normal", "position", "motion")
 

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run time against error, for every switch of the rasterizer: what `clsplat bench --plot` measures and draws."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.bench.stages import (
+    Float32,
+    Float64,
+    Progress,
+    Subject,
+    columns,
+    held_kind,
+    picture_of,
+    trainer_of,
+    wall_ms,
+)
+from clsplat.camera import Camera
+from clsplat.config.training import PRESETS, RasterizerConfig
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device
+from clsplat.device.layout import PLAIN_SLOTS
+from clsplat.gaussians import Gaussians
+from clsplat.rendering.memory_needs import plan_step
+from clsplat.rendering.rasterizer import Frame, Rasterizer, held_sh
+from clsplat.stages.project import AnyGaussians, upload_gaussians
+
+if TYPE_CHECKING:
+    from clsplat.reference.project import Projected
+
+CROP = 192
+"""Side in pixels of what is compared with the float64 reference, in the middle of the image; smaller ones are whole."""
+ALL_OFF = "all exact switches off"
+"""Of several values that a switch can have, the one that does most."""
+PSNR_MAX = 160.0
+"""PSNR of equal images, which would be infinite."""
+
+
+@dataclass(frozen=True)
+class Error:
+    """Of a picture: PSNR over all pixels and channels in dB, at most PSNR_MAX, and the largest absolute difference."""
+
+    psnr: float
+    max_abs: float
+
+    @classmethod
+    def of(cls, picture: NDArray[Any], wanted: NDArray[Any]) -> Error:
+        """Compared in float64, not clamped."""
+        difference = np.asarray(picture, np.float64) - np.asarray(wanted, np.float64)
+        mse = float(np.mean(np.square(difference)))
+        psnr = min(-10 * float(np.log10(mse)), PSNR_MAX) if mse > 0 else PSNR_MAX
+        return cls(psnr, float(np.abs(difference).max()))
+
+
+def settings() -> dict[str, RasterizerConfig]:
+    """The points of the plot: presets, and each switch away from its default alone, and the exact ones together."""
+    named = {f"preset {name}": config for name, config in PRESETS.items()}
+    changes: dict[str, dict[str, Any]] = {
+        "extent constant": {"extent": "constant"},
+        "tile-test box": {"tile_test": "box"},
+        "tile-test square": {"tile_test": "square"},
+        "depth-sort pairs": {"depth_sort": "pairs"},
+        "key-bits all": {"key_bits": "all"},
+        "no row-skip": {"row_skip": False},
+        "no column-skip": {"column_skip": False},
+        "no vector-skip": {"vector_skip": False},
+        "no early-stop": {"early_stop": False},
+        "no last-contributor": {"last_contributor": False},
+        "no record-cells": {"record_cells": False},
+        "no gradient-skip": {"gradient_skip": False},
+        "no frustum-cull": {"frustum_cull": False},
+        "no opacity-cull": {"opacity_cull": False},
+    }
+    together: dict[str, Any] = {key: value for change in changes.values() for key, value in change.items()}
+    changes[ALL_OFF] = together
+    changes["extent 3sigma"] = {"extent": "3sigma"}
+    changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
+    changes.update({f"sh-tolerance {steps}/255": {"sh_tolerance": steps / 255} for steps in (4, 16, 64)})
+    changes["sh-storage half"] = {"sh_storage": "half"}
+    changes.update({f"alpha-min {steps}/255": {"alpha_min": steps / 255} for steps in (2, 4)})
+    changes.update({f"transmittance-min {value:g}": {"transmittance_min": value} for value in (1e-3, 1e-2)})
+    named.update({name: replace(RasterizerConfig(), **change) for name, change in changes.items()})
+    merged: dict[RasterizerConfig, str] = {}
+    for name, config in named.items():
+        merged[config] = f"{merged[config]} = {name.removeprefix('preset ')}" if config in merged else name
+    return {name: config for config, name in merged.items()}
+
+
+def compare(
+    subject: Subject,
+    device: Device,
+    candidates: dict[str, RasterizerConfig] | None = None,
+    *,
+    repeat: int = 5,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Run time against error of each setting: median times of a frame and of a training step, the settings taken in
+    turn; the frame's difference from the float64 reference on a crop, and from the exact preset's frame on the whole
+    image. Where both are among the settings, also how many times faster all exact switches together make them.
+    """
+    say = progress or (lambda *_: None)
+    candidates = candidates or settings()
+    trainer, camera = trainer_of(subject, device, PRESETS["exact"]), subject.camera
+    model, work = trainer.parameters, trainer.rasterizer.work
+    background = upload(device, np.zeros(3, np.float32))
+    x0, y0, width, height = crop = _crop(camera)
+    say("float64 reference", None)
+    reference = reference_crop(subject.gaussians, camera, crop)
+
+    def errors(picture: Float32) -> tuple[Error, Error]:
+        part = picture[y0 : y0 + height, x0 : x0 + width]
+        return Error.of(part, reference), Error.of(picture, exact)
+
+    def draw(rasterizer: Rasterizer) -> Frame:
+        held = models[held_kind(rasterizer.config)]
+        return rasterizer.forward(held, camera, background, backward=False)
+
+    def step(rasterizer: Rasterizer) -> None:
+        trainer.rasterizer = rasterizer
+        trainer.train_step()
+
+    models: dict[tuple[object, ...], AnyGaussians] = {held_kind(PRESETS["exact"]): model}
+    for config in candidates.values():
+        if (kind := held_kind(config)) not in models:
+            models[kind] = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
+    exact = picture_of(draw(trainer.rasterizer))
+    rasterizers = {name: Rasterizer(device, config, work) for name, config in candidates.items()}
+    for rasterizer in rasterizers.values():
+        config = rasterizer.config
+        rasterizer.follow(
+            plan_step(device, model.count, model.coefficients, [camera], config, fields=PLAIN_SLOTS, agreement=False)
+        )
+    found = {}
+    for done, (name, rasterizer) in enumerate(rasterizers.items()):
+        say("settings", done / len(rasterizers))
+        found[name] = errors(picture_of(draw(rasterizer)))
+        step(rasterizer)
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in rasterizers}
+    for done in range(repeat):
+        say("times", done / repeat)
+        for name, rasterizer in rasterizers.items():
+            both = wall_ms(device, partial(draw, rasterizer)), wall_ms(device, partial(step, rasterizer))
+            times[name].append(both)
+    medians = {name: tuple(map(statistics.median, zip(*each, strict=True))) for name, each in times.items()}
+    whole = (width, height) == (camera.width, camera.height)
+    return {
+        "exact_switches_faster": _faster(candidates, medians),
+        "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
+        "crop": list(crop),
+        "exact_against_float64": asdict(errors(exact)[0]),
+        "points": _points(found, medians, whole=whole),
+    }
+
+
+def _points(
+    found: Mapping[str, tuple[Error, Error]], medians: Mapping[str, tuple[float, ...]], *, whole: bool
+) -> list[dict[str, Any]]:
+    points = []
+    for name, (from_reference, from_exact) in found.items():
+        points.append(
+            {
+                "name": name,
+                "frame_ms": medians[name][0],
+                "iteration_ms": medians[name][1],
+                "against_float64": asdict(from_reference),
+                "against_exact": asdict(from_exact),
+                **asdict(from_reference if whole else from_exact),
+            }
+        )
+    on_front = front([(point["frame_ms"], point["psnr"]) for point in points])
+    for point, best in zip(points, on_front, strict=True):
+        point["on_front"] = best
+    return points
+
+
+def _faster(
+    candidates: Mapping[str, RasterizerConfig], medians: Mapping[str, tuple[float, ...]]
+) -> dict[str, float] | None:
+    on = next((name for name, config in candidates.items() if config == PRESETS["exact"]), None)
+    if on is None or ALL_OFF not in medians:
+        return None
+    return {key: medians[ALL_OFF][k] / medians[on][k] for k, key in enumerate(("frame", "iteration"))}
+
+
+def front(points: list[tuple[float, float]]) -> list[bool]:
+    """Of (cost, quality) pairs those that none beats in one without losing in the other."""
+    return [
+        not any(c <= cost and q >= quality and (c < cost or q > quality) for c, q in points) for cost, quality in points
+    ]
+
+
+def _crop(camera: Camera) -> tuple[int, int, int, int]:
+    """x, y, width, height."""
+    width, height = min(CROP, camera.width), min(CROP, camera.height)
+    return (camera.width - width) // 2, (camera.height - height) // 2, width, height
+
+
+def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, int, int]) -> Float64:
+    """A part of the frame in float64, over black, (height, width, 3): the twin, but for Gaussians that cannot reach."""
+    from clsplat.reference.blend import blend
+    from clsplat.reference.project import project
+    from clsplat.reference.render import parameters
+    from clsplat.reference.sort import depth_order
+
+    x, y, width, height = crop
+    projected: Projected = project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
+    means = projected.means2d - (x, y)
+    reach = 1.1 * projected.half_extents + 1.0
+    near = (means > -reach).all(axis=1) & (means < np.array([width, height]) + reach).all(axis=1)
+    order = depth_order(projected.depths, projected.visible & near)
+    image: Float64 = blend(replace(projected, means2d=means), order, width, height).image
+    return image
+
+
+def settings_table(result: dict[str, Any]) -> str:
+    """What `compare` measured, for people."""
+    rows: list[tuple[str, ...]] = [("setting", "ms", "step ms", "PSNR dB", "largest", "front")]
+    for point in result["points"]:
+        psnr = "same bits" if point["max_abs"] == 0 else f"{point['psnr']:.1f}"
+        front_mark = "*" if point["on_front"] else ""
+        times = (f"{point['frame_ms']:.2f}", f"{point['iteration_ms']:.2f}")
+        rows.append((point["name"], *times, psnr, f"{point['max_abs']:.2g}", front_mark))
+    known, (_, _, width, height) = result["exact_against_float64"], result["crop"]
+    note = (
+        f"error against {result['error_is_against']}; exact against float64 on {width}x{height} pixels: "
+        f"{known['psnr']:.1f} dB, {known['max_abs']:.2g}"
+    )
+    lines = [*columns(rows), "", note]
+    if (faster := result["exact_switches_faster"]) is not None:
+        each = f"a frame {faster['frame']:.2f} times faster, a training step {faster['iteration']:.2f} times"
+        lines.append(f"the exact switches together: {each}")
+    return "\n".join(lines)

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo: photos of a scene of our own, their poses thrown away and recovered, trained, measured and shown."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from clsplat.config.training import DEMO_ITERATIONS, TrainConfig
+from clsplat.demo.ray_caster import Progress, ignore_progress, write_photos
+from clsplat.errors import InputError, examples
+from clsplat.files import atomic_write, is_file
+from clsplat.runs.locks import locked
+from clsplat.scenes import sfm
+from clsplat.shots.viewpoints import turntable
+
+PHOTOS = 40
+WIDTH, HEIGHT = 320, 240
+TURNTABLE_FRAMES = 60
+MARK = ".clsplat-demo"
+"""The file that says of a folder that a demo has made what is in it."""
+MADE = ("photos", "scene", "run", "turntable")
+
+
+def run_demo(
+    output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS, frames: int = TURNTABLE_FRAMES
+) -> dict[str, Any]:
+    """Make everything below output: photos/, scene/, run/ and turntable/; returns the evaluation, as in eval.json.
+
+    What an earlier, interrupted demo has finished is used again. device: as `clsplat devices` names it; iterations: of
+    training; frames: of the turntable. Raises InputError for a folder that holds something else, and what the steps
+    raise.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    with locked(output, "demo"):
+        claim(output)
+        return _run_demo(output, device=device, iterations=iterations, frames=frames)
+
+
+def claim(output: Path) -> None:
+    """Mark a folder as a demo's. Raises InputError where it has what a demo would replace, and is not marked."""
+    if is_file(output / MARK):
+        return
+    found = [name for name in MADE if (output / name).exists() or (output / name).is_symlink()]
+    if found:
+        raise InputError(
+            f"{output}: holds {examples(found, len(MADE))}, which no demo has made and a demo would replace; choose "
+            "another folder, or remove them"
+        )
+    atomic_write(output / MARK, b"What is beside this file was made by clsplat demo, which may replace it.\n")
+
+
+def _run_demo(output: Path, *, device: str | None, iterations: int, frames: int) -> dict[str, Any]:
+    """As `run_demo`, alone in the folder."""
+    from clsplat.device.context import open_device
+    from clsplat.progress import StageProgress
+
+    start = time.monotonic()
+    # before minutes of work: is there a device of that name?
+    opened = open_device(device)
+    scene_folder = make_scene(output, StageProgress())
+    run_folder, turntable_folder = output / "run", output / "turntable"
+    result = _train(scene_folder, run_folder, iterations, opened)
+    _render_turntable(scene_folder, run_folder, turntable_folder, frames, opened)
+
+    minutes, seconds = divmod(round(time.monotonic() - start), 60)
+    print(
+        f"done in {minutes} min {seconds} s: PSNR {result['mean']['psnr']:.2f} dB, SSIM {result['mean']['ssim']:.3f} "
+        f"on {len(result['views'])} held-out photos\n"
+        f"  the photos:           {output / 'photos'}\n"
+        f"  held-out renders:     {run_folder / 'test'}\n"
+        f"  the turntable:        {turntable_folder}\n"
+        f"  the model (any viewer of splats opens it): {run_folder / 'model.ply'}",
+        file=sys.stderr,
+    )
+    return result
+
+
+def make_scene(output: Path, progress: Progress | None = None) -> Path:
+    """Photos in output/photos and the scene recovered from them in output/scene, whose path is returned.
+
+    Both are used again where they are complete. Raises InputError where output/photos holds other files.
+    """
+    photos, scene = output / "photos", output / "scene"
+    existing = sorted(path.name for path in photos.glob("[!.]*"))
+    expected = [f"photo_{index:03d}.jpg" for index in range(PHOTOS)]
+    if not set(existing).issubset(expected):
+        raise InputError(f"{photos}: holds files that are not the demo's, expected a new folder")
+    if existing != expected:
+        write_photos(photos, count=PHOTOS, width=WIDTH, height=HEIGHT, progress=progress or ignore_progress)
+    # the ray caster's lens has no distortion, as ours is known to have none: photos need no resampling
+    return sfm.reconstruct(photos, scene, camera_model="SIMPLE_PINHOLE", overwrite=True, progress=progress)
+
+
+def _train(scene_folder: Path, run_folder: Path, iterations: int, device: Any) -> dict[str, Any]:
+    """Train a run and give its evaluation on the held-out photos. An earlier demo's run is replaced."""
+    from clsplat.progress import TrainProgress
+    from clsplat.runs.run import Run
+    from clsplat.scenes.scene import load_scene
+    from clsplat.training.loop import train
+
+    config = TrainConfig(iterations=iterations)
+    scene = load_scene(scene_folder)
+    run = Run.create(run_folder, config, scene=scene_folder, resume=False, overwrite=True)
+    with TrainProgress(iterations) as progress:
+        train(scene, config, device=device, run=run, on_step=progress)
+    result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
+    return result
+
+
+def _render_turntable(scene_folder: Path, run_folder: Path, target: Path, frames: int, device: Any) -> None:
+    """A closed camera path around the scene as PNG files."""
+    from clsplat.gaussians import Gaussians
+    from clsplat.images.reading import write_image
+    from clsplat.progress import StageProgress
+    from clsplat.rendering.rasterizer import Renderer
+    from clsplat.scenes.scene import load_scene
+
+    progress = StageProgress()
+    cameras = [view.camera for view in load_scene(scene_folder).views]
+    gaussians = Gaussians.load(run_folder / "model.ply")
+    renderer = Renderer(device)
+    target.mkdir(parents=True, exist_ok=True)
+    for index, camera in enumerate(turntable(cameras, frames)):
+        write_image(target / f"frame_{index:03d}.png", renderer.render(gaussians, camera, (0.0, 0.0, 0.0)).image)
+        progress("rendering the turntable", (index + 1) / frames)

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Held-out views against their photographs: the numbers of eval.json and the pictures of test/."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.errors import ClsplatError, InputError
+from clsplat.evaluation import metrics
+from clsplat.files import identity
+
+Image = NDArray[Any]
+
+
+class EvaluatedView(Protocol):
+    """What is asked of a view, `clsplat.scenes.scene.View` for one."""
+
+    @property
+    def name(self) -> str: ...
+
+    def load(self) -> Image:
+        """(H, W, 3) or, with straight alpha, (H, W, 4); float in [0, 1] or an integer type."""
+        ...
+
+
+ViewT = TypeVar("ViewT", bound=EvaluatedView)
+
+
+def background_colour(name: str) -> tuple[float, float, float]:
+    """The colour behind held-out views: white, or black also for "random"."""
+    return (1.0, 1.0, 1.0) if name == "white" else (0.0, 0.0, 0.0)
+
+
+def composite(image: Image, background: ArrayLike) -> Image:
+    """(H, W, 3) floats: the image, with straight alpha if it has four channels, over the colour `background` (3,)."""
+    pixels: Image = image
+    if np.issubdtype(image.dtype, np.integer):
+        pixels = image.astype(np.float32) / np.iinfo(image.dtype).max
+    if pixels.shape[2] == 3:
+        return pixels
+    alpha = pixels[:, :, 3:]
+    over: Image = pixels[:, :, :3] * alpha + np.asarray(background, pixels.dtype) * (1 - alpha)
+    return over
+
+
+def evaluate(
+    render: Callable[[ViewT], Image],
+    views: Sequence[ViewT],
+    background: ArrayLike,
+    save_dir: Path | None = None,
+    *,
+    step: int | None,
+    gaussians: int,
+    seconds: float | None,
+    space: str = "sRGB",
+) -> dict[str, Any]:
+    """Measure every view; the result is what eval.json holds.
+
+    render: gives a view's image (H, W, 3), float, over `background` (3,), at the size of `view.load()`; save_dir: the
+    renders go there as PNG in sRGB, under the view's name. space: the colour space of renders and photographs, in
+    which they are measured. step, gaussians, seconds are passed through. Without views the
+    mean is empty; lpips_missing says why there is no LPIPS, where there is none. Raises ClsplatError where a render is
+    not finite, InputError naming a view that is too small, or a space that is not known.
+    """
+    records: list[dict[str, Any]] = []
+    if save_dir is not None:
+        from clsplat.images.colour import displayed
+        from clsplat.images.reading import write_image
+    names = picture_names([view.name for view in views])
+    for view, name in zip(views, names, strict=True):
+        truth = composite(view.load(), background)
+        image = np.asarray(render(view))
+        if not np.isfinite(image).all():
+            raise ClsplatError(f"the render of {view.name} has values that are not finite")
+        try:
+            record: dict[str, Any] = {
+                "name": view.name,
+                "psnr": metrics.psnr(image, truth),
+                "ssim": metrics.ssim(image, truth),
+            }
+        except (InputError, ValueError) as error:
+            raise InputError(f"{view.name}: {error}") from None
+        perceptual = metrics.lpips(image, truth)
+        if perceptual is not None:
+            record["lpips"] = perceptual
+        records.append(record)
+        if save_dir is not None:
+            path = save_dir / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_image(path, displayed(image, space))
+    keys = [key for key in ("psnr", "ssim", "lpips") if records and key in records[0]]
+    mean = {key: float(np.mean([record[key] for record in records])) for key in keys}
+    result: dict[str, Any] = {"step": step, "gaussians": gaussians, "seconds": seconds, "mean": mean, "views": records}
+    if records and (reason := metrics.lpips_missing()):
+        result["lpips_missing"] = reason
+    return result
+
+
+def picture_names(names: Sequence[str], extension: str = ".png") -> list[str]:
+    """Relative file names for views: the extension replaced, sub-folders kept; where two would be one, on a file system
+    that ignores case too, added."""
+    stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
+    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names on every system
+    uses = Counter(keys)
+    return [(stem if uses[key] == 1 else name) + extension for stem, key, name in zip(stems, keys, names, strict=True)]

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How close a render is to its photograph: PSNR, SSIM, and LPIPS where the optional extra is installed.
+
+Images are (H, W, 3), clamped to [0, 1] and compared in float64.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import ClsplatError, InputError
+from clsplat.evaluation import lpips_weights
+
+MIN_SQUARED_ERROR = 1e-12
+"""Equal images would have an infinite PSNR, which JSON cannot hold; this floor makes it 120 dB."""
+SSIM_WINDOW = 11
+
+Image = NDArray[Any]
+
+
+def psnr(image: Image, truth: Image) -> float:
+    """Peak signal-to-noise ratio in dB, at most 120. Raises ValueError for images of different shapes."""
+    a, b = _pair(image, truth)
+    return float(-10 * np.log10(max(float(np.mean(np.square(a - b))), MIN_SQUARED_ERROR)))
+
+
+def ssim(image: Image, truth: Image) -> float:
+    """Mean structural similarity: the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5, mean of the channels.
+
+    Raises InputError for images smaller than the window, ValueError for images of different shapes.
+    """
+    structural_similarity: Any = import_module("skimage.metrics").structural_similarity  # slow to import, untyped
+    a, b = _pair(image, truth)
+    height, width = a.shape[:2]
+    if min(height, width) < SSIM_WINDOW:
+        raise InputError(f"an image of {width}x{height} pixels is too small for SSIM, expected at least 11x11")
+    value = structural_similarity(
+        a, b, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2
+    )
+    return float(value)
+
+
+def lpips(image: Image, truth: Image) -> float | None:
+    """LPIPS (VGG, as the paper reports), or None where it is not installed: `lpips_missing` says why."""
+    model = _lpips_model()
+    if isinstance(model, str):
+        return None
+    a, b = _pair(image, truth)
+    return model(a, b)
+
+
+def lpips_missing() -> str | None:
+    """Why there is no LPIPS, in a few words; None where there is."""
+    model = _lpips_model()
+    return model if isinstance(model, str) else None
+
+
+@functools.cache
+def prepare_lpips() -> str | None:
+    """See to what LPIPS needs, in seconds but for the network's weights, which are fetched if they are not there: why
+    it cannot be had and what to do, None where it can. Loads nothing."""
+    for name in ("lpips", "torch"):
+        if find_spec(name) is None:
+            return f"the optional extra is not installed (no {name}): pip install 'clsplat[lpips]'"
+    try:
+        lpips_weights.fetch()
+    except ClsplatError as error:
+        return str(error)
+    return None
+
+
+@functools.cache
+def _lpips_model() -> Callable[[Image, Image], float] | str:
+    """The metric as a function of two images, or the reason why there is none."""
+    if reason := prepare_lpips():
+        return reason
+    try:
+        with contextlib.redirect_stdout(sys.stderr):  # standard output is for results
+            package: Any = import_module("lpips")
+            torch: Any = import_module("torch")
+            network = package.LPIPS(net="vgg", verbose=False).eval()
+    except Exception as error:  # noqa: BLE001  # whatever fails there must not fail an evaluation
+        return f"its network could not be loaded ({' '.join(str(error).split())[:100]})"
+
+    def measure(a: Image, b: Image) -> float:
+        tensors = [torch.from_numpy(x.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1 for x in (a, b)]
+        with torch.no_grad():
+            return float(network(*tensors))
+
+    return measure
+
+
+def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Both images clamped, in float64."""
+    if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"image {image.shape} and truth {truth.shape}: expected (H, W, 3) both")
+    return np.clip(image.astype(np.float64), 0, 1), np.clip(truth.astype(np.float64), 0, 1)

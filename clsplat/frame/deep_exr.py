@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deep EXR: the samples of a pixel are slices of the scene by depth, each with its alpha and associated colour.
+
+Over each other, front to back, they are the flat picture: the Gaussians of a slice are those that the pixel takes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from itertools import repeat
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.pictures import DEEP_STRIP_FLOATS, DeepConfig
+from clsplat.device.context import Device
+from clsplat.device.layout import TILE
+from clsplat.errors import InputError
+from clsplat.frame.strips import strips
+from clsplat.frame.window import on_tiles
+from clsplat.gaussians import Gaussians
+from clsplat.images.channels import DEEP, HALF_MAX, Encoding, Header, deep_spec
+from clsplat.images.colour import Colours
+from clsplat.images.reading import atomic_output
+from clsplat.rendering.memory_needs import frame_pixels
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.stages.deep import DEEP_FLOATS
+
+Float32 = NDArray[np.float32]
+
+_OUTLIERS = 0.01
+"""Share of the Gaussians in view that is nearer than the first bound, and that is further than the last."""
+
+
+def bin_bounds(gaussians: Gaussians, camera: Camera, config: DeepConfig) -> Float32:
+    """(bins - 1,): the depths at which the next slice begins, a constant ratio apart, for all of a frame's pictures."""
+    if config.bins == 1:
+        return np.zeros(0, np.float32)
+    near, far = config.near, config.far
+    if not (near and far):
+        depths = depths_in_view(gaussians, camera)
+        low, high = np.quantile(depths, [_OUTLIERS, 1 - _OUTLIERS]) if len(depths) else (1.0, 2.0)
+        near, far = near or min(float(low), far or inf), far or max(float(high), near)
+    return np.geomspace(near, far, config.bins - 1).astype(np.float32) if near < far else np.full(1, near, np.float32)
+
+
+def depths_in_view(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
+    """Depths of the means that are in front of the camera and, if it has an image plane, in its frame."""
+    camera = gaussians.local(camera)
+    p = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
+    if camera.projection not in ("perspective", "orthographic"):
+        distances: NDArray[np.float64] = np.linalg.norm(p, axis=1)
+        return distances[distances > camera.near]
+    p = p[p[:, 2] > camera.near]
+    frame = camera.window or camera
+    by = p[:, 2] if camera.projection == "perspective" else 1.0
+    x, y = camera.fx * p[:, 0] / by + camera.cx, camera.fy * p[:, 1] / by + camera.cy
+    return np.asarray(p[(x >= 0) & (x <= frame.width) & (y >= 0) & (y <= frame.height), 2])
+
+
+def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
+    """(bins, H, W, 6): red, green, blue, associated with alpha; alpha; least and largest depth. All 0 where a pixel has
+    nothing in a slice."""
+    larger, rows, columns = on_tiles(camera)
+    return renderer.render_deep(gaussians, larger, bounds)[:, rows, columns]
+
+
+def flattened(slices: Float32) -> Float32:
+    """(bins, H, W, 6) to (H, W, 4): the slices over each other, front to back."""
+    flat = np.zeros((*slices.shape[1:3], 4), np.float64)
+    for each in slices.astype(np.float64):
+        flat += (1 - flat[:, :, 3:]) * each[:, :, :4]
+    return flat.astype(np.float32)
+
+
+def deep_rows(device: Device, camera: Camera, bins: int) -> int:
+    """Rows of the strips that a deep picture of so many slices is rendered in, whole tiles of them."""
+    floats = DEEP_FLOATS * bins
+    pixels = min(DEEP_STRIP_FLOATS // floats, frame_pixels(device, planes=4 * floats))
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with what fills the first and last tile
+
+
+def write_deep(
+    path: Path,
+    renderer: Renderer,
+    gaussians: Gaussians,
+    camera: Camera,
+    config: DeepConfig | None = None,
+    encoding: Encoding | None = None,
+    header: Header | None = None,
+    colours: Colours | None = None,
+) -> None:
+    """Render and write a deep scanline EXR, atomically, in strips that bound the memory.
+
+    Channels R G B A Z ZBack; a pixel has a sample for each slice that it has something in, with the depths of the first
+    and the last Gaussian that it takes there. Colours are half or float as the encoding says, depths are float. Raises
+    InputError and ClsplatError as `images.channels.write_layers`.
+    """
+    path, config = Path(path), config or DeepConfig()
+    encoding, header, colours = encoding or Encoding(), header or Header(), colours or Colours()
+    if path.suffix.lower() != ".exr":
+        raise InputError(f"{path}: deep samples want an .exr file")
+    bounds = bin_bounds(gaussians, camera, config)
+    kinds = [oiio.TypeDesc("half" if encoding.depth == "half" else "float")] * 4 + [oiio.TypeDesc("float")] * 2
+    spec = deep_spec(camera.width, camera.height, header)
+    spec.nchannels = len(DEEP)
+    spec.channelnames = DEEP
+    spec.channelformats = tuple(kinds)
+    spec.alpha_channel, spec.z_channel = 3, 4
+    spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
+    rows = deep_rows(renderer.device, camera, len(bounds) + 1)
+    with atomic_output(path, [spec], "exr") as output:
+        row = spec.y
+        for strip in strips(camera, rows):
+            slices = render_deep(renderer, gaussians, strip, bounds)
+            for each in slices:
+                rgb, alpha = np.ascontiguousarray(each[:, :, :3]), np.ascontiguousarray(each[:, :, 3])
+                each[:, :, :3] = colours.convert(rgb, alpha, colours.model, colours.output)
+            for data, count in _deep_rows(slices, kinds, half=encoding.depth == "half"):
+                output.take(output.file.write_deep_scanlines(row, row + count, 0, data))
+                row += count
+
+
+def _deep_rows(slices: Float32, kinds: list[Any], *, half: bool) -> Iterator[tuple[Any, int]]:
+    """(samples, rows) from the top, a few rows at a time."""
+    bins, height, width, _ = slices.shape
+    if half:
+        slices[:, :, :, :4] = np.clip(slices[:, :, :, :4], -HALF_MAX, HALF_MAX)
+    for top in range(0, height, step := max((1 << 18) // width, 1)):
+        rows = slices[:, top : top + step].reshape(bins, -1, DEEP_FLOATS).transpose(1, 0, 2)
+        there = rows[:, :, 3] > 0
+        data = oiio.DeepData()
+        data.init(len(rows), len(DEEP), kinds, list(DEEP))
+        _each(data.set_samples, range(len(rows)), there.sum(axis=1).tolist())
+        pixels = np.nonzero(there)[0].tolist()
+        samples = (np.cumsum(there, axis=1) - 1)[there].tolist()
+        values = rows[there]
+        for channel in range(len(DEEP)):
+            _each(data.set_deep_value, pixels, repeat(channel), samples, values[:, channel].tolist())
+        yield data, len(rows) // width
+
+
+def _each(function: Any, *arguments: Any) -> None:
+    """Call it with each row of arguments: OpenImageIO takes deep values one by one, and a loop takes twice as long."""
+    deque(map(function, *arguments), maxlen=0)

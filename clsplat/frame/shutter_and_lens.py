@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion blur and depth of field: the mean of frames over the shutter's time and the lens's area, in one loop.
+
+Samples have equal weights and fixed places: the same frame again has the same bits, wherever a single frame has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.pictures import SamplingConfig
+from clsplat.errors import InputError
+from clsplat.frame.window import COLOUR, Draw, Layers, reframed
+from clsplat.images.channels import LAYERS
+
+Float64 = NDArray[np.float64]
+
+GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
+
+
+def sample_times(count: int) -> Float64:
+    """`count` times in (0, 1), each in an interval of its own, in an order that has nothing to do with the lens's
+    (ranks of van der Corput's sequence)."""
+    index, radical, digit = np.arange(count), np.zeros(count), 0.5
+    while index.any():
+        radical += digit * (index & 1)
+        index, digit = index >> 1, digit / 2
+    return np.asarray((np.argsort(np.argsort(radical)) + 0.5) / count)
+
+
+def lens_points(count: int) -> Float64:
+    """(count, 2) on the unit disc, each for as much of its area (Vogel's spiral)."""
+    index = np.arange(count)
+    radius, angle = np.sqrt((index + 0.5) / count), GOLDEN_ANGLE * index
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
+def lens_radius(camera: Camera, config: SamplingConfig) -> float:
+    """In the scene's units; camera: of a whole frame."""
+    if config.f_stop is None:
+        return config.aperture
+    focal_length = camera.fx * config.sensor_width / camera.width / 1000 / config.metres
+    return focal_length / (2 * config.f_stop)
+
+
+def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
+    """The camera from the point (x, y) of its lens, in the scene's units, sheared so that what is at the depth `focus`
+    stays where it is in the picture. Raises InputError for a camera without an image plane."""
+    if camera.projection != "perspective":
+        raise InputError(f"depth of field is not defined for {camera.projection} cameras, expected a perspective one")
+    return replace(
+        camera,
+        translation=camera.translation - np.array([x, y, 0.0]),
+        cx=camera.cx + camera.fx * x / focus,
+        cy=camera.cy + camera.fy * y / focus,
+    )
+
+
+def shutter_middle(config: SamplingConfig) -> float:
+    """The time half way between open and close, in frames from the frame."""
+    begin, end = config.shutter
+    return 0.5 * (begin + end)
+
+
+def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tuple[Camera, list[Camera]]:
+    """(the camera in the middle of shutter and lens, one for each sample), of whole frames.
+
+    at: the camera at a time in frames from the frame, such as `Shot.at` gives; one sample is the middle itself.
+    """
+    begin, end = config.shutter
+    middle = at(shutter_middle(config))
+    if not config.on or config.samples == 1:
+        return middle, [middle]
+    times = begin + (end - begin) * sample_times(config.samples)
+    cameras = [at(float(time)) for time in times] if config.moves else [middle] * config.samples
+    if config.has_lens:
+        cameras = [
+            through_lens(camera, lens_radius(camera, config) * x, lens_radius(camera, config) * y, config.focus)
+            for camera, (x, y) in zip(cameras, lens_points(config.samples).tolist(), strict=True)
+        ]
+    return middle, cameras
+
+
+def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera]) -> Draw:
+    """rgb and alpha as the mean over the cameras, of whole frames; other layers, of which there is no mean, from the
+    middle one. The camera that is drawn says the size and the window alone.
+
+    `draw` has to give rgb in linear light. Sums are of float64, in the cameras' order.
+    """
+
+    def blurred(camera: Camera, names: Collection[str]) -> Layers:
+        light = [name for name in COLOUR if name in names]
+        rest = [name for name in names if name not in COLOUR]
+        layers = draw(reframed(middle, camera), rest) if rest else {}
+        if light and len(cameras) == 1:
+            layers |= draw(reframed(cameras[0], camera), light)
+        elif light:
+            sums: dict[str, Float64] = {}
+            for each in cameras:
+                for name, plane in draw(reframed(each, camera), light).items():
+                    if name in sums:
+                        sums[name] += plane
+                    else:
+                        sums[name] = plane.astype(np.float64)
+            layers |= {name: (total / len(cameras)).astype(np.float32) for name, total in sums.items()}
+        return {name: layers[name] for name in LAYERS if name in names}
+
+    return blurred

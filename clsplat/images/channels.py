@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a rendered frame is written as: layers of channels in EXR, one part or several, or a plain picture.
+
+EXR names follow the OpenEXR documentation ("Technical introduction", layers): R G B A Z, N.x N.y N.z, P.x P.y P.z,
+forward.u forward.v. Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
+vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standard attributes (ImfStandardAttributes.h).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera, Window
+from clsplat.config.training import EXR_DEPTH, Compression, ExrDepth, Parts
+from clsplat.errors import InputError, examples
+from clsplat.files import native_name
+from clsplat.images.reading import image_size, steps_of, unassociate, write_spec
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """names: of the channels in a file. kind: colour is half or float as asked for; exact stays float, as a half has 11
+    bits of a depth; whole is uint32 in a part of its own, else float. part: its name in a file of several parts."""
+
+    names: tuple[str, ...]
+    kind: Literal["colour", "exact", "whole"]
+    part: str
+
+
+LAYERS: dict[str, Layer] = {
+    "rgb": Layer(("R", "G", "B"), "colour", "rgba"),
+    "alpha": Layer(("A",), "colour", "rgba"),
+    "depth": Layer(("Z",), "exact", "depth"),
+    "median": Layer(("median.Z",), "exact", "median"),
+    "first": Layer(("first.Z",), "exact", "first"),
+    "normals": Layer(("N.x", "N.y", "N.z"), "colour", "N"),
+    "position": Layer(("P.x", "P.y", "P.z"), "exact", "P"),
+    "motion": Layer(("forward.u", "forward.v"), "exact", "forward"),
+    "count": Layer(("count",), "whole", "count"),
+    "id": Layer(("id",), "whole", "id"),
+}
+"""Every channel that `--channels` takes, in the order of a file."""
+
+HALF_MAX = np.float32(65504)
+_PNG_LEVEL, _PNG_FILTER = 1, 0x40
+"""Each pixel from the mean of the two beside it, rather than the best of five filters for each row. A fifth of the time
+of level 6, which can be more than a CPU device takes for the frame, for a file that is a tenth larger at most."""
+_EXR_LEVEL = 1
+"""Of zip and zips: two thirds of the time of the usual 4, for 2 to 7 % more bytes."""
+_LARGEST_FLOAT_INDEX = 2**24
+_BLOCK, _ROWS = 1 << 12, 64
+"""Bytes of a disk's block; rows that are decoded at a time to see whether they are whole."""
+
+EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
+VIDEO = ".mp4"
+DEEP = ("R", "G", "B", "A", "Z", "ZBack")
+"""Channels of a deep picture."""
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How pictures are encoded. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
+
+    depth: ExrDepth = EXR_DEPTH
+    parts: Parts = "one"
+    compression: Compression = "zip"
+    bits: int = 8
+    quality: int = 95
+
+
+@dataclass(frozen=True, eq=False)
+class Header:
+    """What goes into the file beside pixels; window: None where the picture is the display window; chromaticities: x
+    and y of red, green, blue and white, none where they are not known; is_srgb: whether the colours are sRGB's."""
+
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    matrices: Mapping[str, Float64] = field(default_factory=dict)
+    window: Window | None = None
+    pixel_aspect: float = 1.0
+    chromaticities: Sequence[float] = ()
+    is_srgb: bool = True
+
+
+def parse_channels(text: str) -> tuple[str, ...]:
+    """The names in `text`, comma-separated, in the order of LAYERS. Raises InputError."""
+    asked = [word.strip() for word in text.split(",") if word.strip()]
+    unknown = [word for word in asked if word not in LAYERS]
+    if unknown or not asked:
+        found = f"has {examples(map(repr, unknown))}" if unknown else "is empty"
+        raise InputError(f"--channels {text}: {found}, expected some of {', '.join(LAYERS)}")
+    return tuple(name for name in LAYERS if name in asked)
+
+
+def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
+    """Raise InputError where a file of that name cannot hold the channels. video: it may be one, too."""
+    extension, known = Path(path).suffix.lower(), (*EXTENSIONS, VIDEO) if video else EXTENSIONS
+    if extension not in known:
+        raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(known)}")
+    if extension == ".exr":
+        return
+    holds = ("rgb",) if extension in (".jpg", ".jpeg", VIDEO) else ("rgb", "alpha")
+    over = [name for name in channels if name not in holds]
+    if over or "rgb" not in channels:
+        lacking = f"cannot hold {', '.join(over)}" if over else "needs rgb"
+        article = "an" if extension == VIDEO else "a"
+        raise InputError(f"{path}: {article} {extension[1:].upper()} {lacking}; write .exr, or other --channels")
+
+
+def camera_matrices(camera: Camera) -> dict[str, Float64]:
+    """worldToCamera and worldToNDC of row vectors, as OpenEXR defines them, for a camera that has an image plane; none
+    for others.
+
+    In the camera's space x is right, y up and z along the view, a left-handed frame. NDC: (0, 0) is the upper left
+    corner of the display window, (1, 1) the lower right one; z, of which OpenEXR says nothing, is 0 at the near plane
+    and 1 at infinity, or of an orthographic camera at its far plane; if that has none, 1 more a world unit.
+    """
+    if camera.projection not in ("perspective", "orthographic"):
+        return {}
+    to_camera = np.eye(4)
+    flip = np.diag([1.0, -1.0, 1.0])
+    to_camera[:3, :3] = (flip @ camera.rotation).T
+    to_camera[3, :3] = flip @ camera.translation
+    display = camera.window or camera
+    centre = camera.cx / display.width, camera.cy / display.height
+    projection = np.zeros((4, 4))
+    projection[0, 0] = camera.fx / display.width
+    projection[1, 1] = -camera.fy / display.height
+    if camera.projection == "perspective":  # w = z
+        projection[2] = [*centre, 1.0, 1.0]
+        projection[3, 2] = -camera.near
+    else:
+        along = 1 / (camera.far - camera.near) if np.isfinite(camera.far) else 1.0
+        projection[2, 2] = along
+        projection[3] = [*centre, -along * camera.near, 1.0]
+    return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
+
+
+def write_layers(
+    path: Path, layers: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
+) -> None:
+    """Write a frame, atomically.
+
+    layers: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
+    numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `reading.write_image`.
+    """
+    path, encoding, header = Path(path), encoding or Encoding(), header or Header()
+    check_format(str(path), layers)
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such folder to write {path.name} to")
+    ordered = {name: layers[name] for name in LAYERS if name in layers}
+    pairs = encoded(path.suffix.lower(), ordered, encoding, header)
+    write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], path.suffix.lower()[1:])
+
+
+def encoded(
+    extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+) -> list[tuple[NDArray[Any], Any]]:
+    """(pixels, OpenImageIO's specification) of each part of a file. layers: in the order of LAYERS."""
+    if extension != ".exr":
+        return [_picture(extension, layers, encoding, header)]
+    groups = _parts(tuple(layers)) if encoding.parts == "several" else [tuple(layers)]
+    return [_exr_part(group, layers, encoding, header, named=len(groups) > 1) for group in groups]
+
+
+def is_whole(
+    path: Path,
+    width: int,
+    height: int,
+    channels: Iterable[str],
+    encoding: Encoding,
+    attributes: Mapping[str, str | int | float] | None = None,
+    *,
+    deep: bool = False,
+) -> bool:
+    """Whether a file is there that holds these channels, as `write_layers` would have them, in a picture of that size,
+    with no other values of these attributes, and that decodes to its last row, with a block of zeros in it in all rows.
+    A file that was cut short does not.
+
+    deep: whether it is to be a deep picture, whose channels are DEEP.
+    """
+    channels = [name for name in LAYERS if name in set(channels)]
+    exr = path.suffix.lower() == ".exr"
+    groups = _parts(channels) if exr and encoding.parts == "several" else [tuple(channels)]
+    if not path.is_file():
+        return False
+    try:
+        image_size(path)  # finds a PNG that is cut short, of which libpng would print
+    except InputError:
+        return False
+    source = oiio.ImageInput.open(native_name(path))
+    if source is None:
+        oiio.geterror()
+        return False
+    holed = _has_hole(path)
+    try:
+        for part, group in enumerate(groups):
+            if not source.seek_subimage(part, 0):
+                return False
+            spec = source.spec()
+            names = DEEP if deep else tuple(channel for name in group for channel in LAYERS[name].names)
+            if (spec.width, spec.height, tuple(spec.channelnames)) != (width, height, names) or spec.deep != deep:
+                return False
+            if any(spec.getattribute(key) not in (None, value) for key, value in (attributes or {}).items()):
+                return False
+            bottom = spec.y + spec.height
+            row = (
+                source.read_native_deep_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels)
+                if deep
+                else source.read_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels, oiio.FLOAT)
+            )
+            if row is None or source.geterror() or (holed and not _decodes(source, part)):
+                return False
+        return not source.seek_subimage(len(groups), 0)
+    finally:
+        source.geterror()
+        source.close()
+
+
+def _has_hole(path: Path) -> bool:
+    """Whether a block of the disk in the file is all zeros, as where a machine stopped before it was written."""
+    empty = bytes(_BLOCK)
+    with open(path, "rb") as file:
+        return any(empty in block for block in iter(lambda: file.read(_BLOCK << 8), b""))
+
+
+def _decodes(source: Any, part: int) -> bool:
+    """Whether every row of the part does."""
+    spec = source.spec()
+    for first in range(spec.y, spec.y + spec.height, _ROWS):
+        of = (part, 0, first, min(first + _ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
+        rows = source.read_native_deep_scanlines(*of) if spec.deep else source.read_scanlines(*of, oiio.FLOAT)
+        if rows is None or source.geterror():
+            return False
+    return True
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether a file is a picture that clsplat has not made."""
+    source = oiio.ImageInput.open(native_name(path))
+    if source is None:
+        oiio.geterror()
+        return False
+    maker = source.spec().getattribute("Software")
+    source.close()
+    return "clsplat" not in str(maker)
+
+
+def attribute(path: Path, name: str) -> Any:
+    """The value of an attribute of a file's first part, None where it has none or is no picture."""
+    source = oiio.ImageInput.open(native_name(path))
+    if source is None:
+        oiio.geterror()
+        return None
+    value = source.spec().getattribute(name)
+    source.close()
+    return value
+
+
+def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
+    grouped: dict[str, list[str]] = {}
+    for name in names:
+        grouped.setdefault(LAYERS[name].part, []).append(name)
+    return [tuple(group) for group in grouped.values()]
+
+
+def _exr_part(
+    names: Sequence[str], layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
+) -> tuple[NDArray[Any], Any]:
+    kinds = [LAYERS[name].kind for name in names for _ in LAYERS[name].names]
+    planes = [_planes(layers[name]) for name in names]
+    if set(kinds) == {"whole"}:
+        pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes the largest
+        spec = _spec(pixels, oiio.UINT32, header)
+    else:
+        formats = [oiio.HALF if kind == "colour" and encoding.depth == "half" else oiio.FLOAT for kind in kinds]
+        pixels = np.empty((*planes[0].shape[:2], len(kinds)), np.float32)
+        at = 0
+        for name, plane in zip(names, planes, strict=True):
+            _check_floats(name, plane)
+            for channel in range(plane.shape[2]):
+                if formats[at] == oiio.HALF:  # else what is over its largest would become infinite
+                    np.clip(plane[:, :, channel], -HALF_MAX, HALF_MAX, out=pixels[:, :, at])
+                else:
+                    pixels[:, :, at] = plane[:, :, channel]
+                at += 1
+        spec = _spec(pixels, formats[0] if len(set(formats)) == 1 else oiio.FLOAT, header)
+        if len(set(formats)) > 1:
+            spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
+    spec.channelnames = tuple(channel for name in names for channel in LAYERS[name].names)
+    if "alpha" in names:
+        spec.alpha_channel = spec.channelnames.index("A")
+    deflated = encoding.compression.startswith("zip")
+    spec.attribute("compression", f"{encoding.compression}:{_EXR_LEVEL}" if deflated else encoding.compression)
+    if named:
+        spec.attribute("oiio:subimagename", LAYERS[names[0]].part)
+    _add_matrices(spec, header)
+    return np.ascontiguousarray(pixels), spec
+
+
+def _check_floats(name: str, plane: NDArray[Any]) -> None:
+    if LAYERS[name].kind == "whole" and plane.max(initial=0) > _LARGEST_FLOAT_INDEX:
+        raise InputError(
+            f"--channels {name}: the largest is {plane.max():,}, more than a float holds exactly; use --parts several, "
+            "where it is a whole number"
+        )
+
+
+def _picture(
+    extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+) -> tuple[NDArray[Any], Any]:
+    planes = [_planes(plane) for plane in layers.values()]
+    if extension == ".png" and "alpha" in layers:
+        planes = [unassociate(np.concatenate(planes, axis=2))]
+    bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
+    whole = steps_of(planes, bits)
+    spec = _spec(whole, oiio.UINT8 if bits == 8 else oiio.UINT16, header)
+    spec.channelnames = ("R", "G", "B", "A")[: whole.shape[2]]
+    if extension == ".png":
+        if not header.is_srgb:  # else OpenImageIO says so in the chunks sRGB, gAMA and cHRM
+            spec.attribute("oiio:ColorSpace", "unknown")
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+        spec.attribute("png:compressionLevel", _PNG_LEVEL)
+        spec.attribute("png:filter", _PNG_FILTER)
+    if extension in (".jpg", ".jpeg"):
+        spec.attribute("Compression", f"jpeg:{encoding.quality}")
+    return whole, spec
+
+
+def _planes(plane: NDArray[Any]) -> NDArray[Any]:
+    return plane[:, :, None] if plane.ndim == 2 else plane
+
+
+def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    _add_header(spec, header)
+    return spec
+
+
+def deep_spec(width: int, height: int, header: Header) -> Any:
+    """Of a deep EXR, its channels and their formats left to say."""
+    spec = oiio.ImageSpec(width, height, 1, oiio.FLOAT)
+    spec.deep = True
+    _add_header(spec, header)
+    _add_matrices(spec, header)
+    return spec
+
+
+def _add_matrices(spec: Any, header: Header) -> None:
+    for name, matrix in header.matrices.items():
+        spec.attribute(name, oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
+
+
+def _add_header(spec: Any, header: Header) -> None:
+    if header.window is not None:
+        spec.x, spec.y = header.window.x, header.window.y
+        spec.full_x = spec.full_y = 0
+        spec.full_width, spec.full_height = header.window.width, header.window.height
+    if header.pixel_aspect != 1.0:
+        spec.attribute("PixelAspectRatio", float(header.pixel_aspect))
+    if header.chromaticities:
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(header.chromaticities))
+    spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes
+    for name, value in header.attributes.items():
+        spec.attribute(name, value)

@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is in a glTF file: its JSON, the nodes of its scene, and the arrays of its buffers, as they lie in the file.
+
+Everything that the file says is checked before it is used; a buffer is the .glb's own, a file in the same folder or
+below it, or a data: URI.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+import os
+import struct
+import warnings
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import unquote, urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError, plain
+from clsplat.files import MAX_DOCUMENT, open_input, parse_json, read_document
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.models.codec import values as packing
+from clsplat.models.codec.axes import LEFT_UP, flip
+from clsplat.models.codec.values import BLOCK_ROWS
+from clsplat.models.formats import spz
+
+EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
+SPZ_EXTENSIONS = (SPZ_EXTENSION, "KHR_gaussian_splatting_compression_spz")
+"""The second is what the draft's own example calls it."""
+UNDERSTOOD = {EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization", "KHR_materials_unlit"}
+COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")
+
+JSON_CHUNK, BIN_CHUNK = 0x4E4F534A, 0x004E4942
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+MAX_NODES, MAX_PRIMITIVES = 100_000, 4096
+"""Of a scene; the second of those that have Gaussians: more are a bomb, which may be one mesh in many nodes."""
+
+Array = NDArray[Any]
+
+
+@dataclass
+class Asset:
+    """A file: its JSON, and what its buffers are, as far as they were needed."""
+
+    path: Path
+    document: dict[str, Any]
+    binary: tuple[int, int] | None = None
+    """Where the .glb's own buffer begins, and how long it is."""
+    size: int = 0
+    buffers: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
+    total: int = 0
+
+    @classmethod
+    def open(cls, path: Path) -> Asset:
+        with open_input(path, "a glTF file") as file:
+            size = os.fstat(file.fileno()).st_size
+            if file.read(4) == b"glTF":
+                text, binary = _chunks(file, size, path)
+            else:
+                text, binary = read_document(path, "a glTF file").encode(), None
+        try:
+            document = parse_json(text)
+        except ValueError as error:
+            raise InputError(f"{path}: its JSON does not parse ({error}); is it a glTF file?") from None
+        if not isinstance(document, dict):
+            raise InputError(f"{path}: its JSON is no object, expected a glTF file")
+        asset = cls(path, document, binary, size)
+        version = as_object(document.get("asset")).get("version")
+        if not str(version).startswith("2."):
+            raise InputError(f"{path}: glTF version {version!r}, expected 2.0")
+        required = document.get("extensionsRequired", [])
+        if (
+            unknown := [name for name in required if name not in UNDERSTOOD]
+            if isinstance(required, list)
+            else [required]
+        ):
+            raise InputError(f"{path}: requires {str(unknown[0])[:80]}, which is not supported; save it without")
+        return asset
+
+    def item(self, kind: str, index: object) -> dict[str, Any]:
+        """An object of one of the document's lists."""
+        items = self.document.get(kind)
+        if not isinstance(items, list) or not isinstance(index, int) or not 0 <= index < len(items):
+            raise InputError(f"{self.path}: {kind} has no {index!r}; is it damaged?")
+        if not isinstance(items[index], dict):
+            raise InputError(f"{self.path}: {kind} {index} is no object; is it damaged?")
+        found: dict[str, Any] = items[index]
+        return found
+
+    def integer(self, holder: dict[str, Any], key: str, default: int | None = None) -> int:
+        value = holder.get(key, default)
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 62:
+            raise InputError(f"{self.path}: {key} is {str(value)[:40]!r}, expected a number from 0 on")
+        return value
+
+    def primitives(self) -> Iterator[tuple[str, NDArray[np.float64], dict[str, Any]]]:
+        """Those of Gaussians in the default scene: what to call them, the node's matrix in the world, and they."""
+        nodes = self.document.get("nodes", [])
+        if "scenes" in self.document:
+            roots = self.item("scenes", self.document.get("scene", 0)).get("nodes", [])
+        else:
+            roots = list(range(len(nodes))) if isinstance(nodes, list) else []
+        todo: deque[tuple[object, NDArray[np.float64]]] = deque((root, np.eye(4)) for root in _list(roots))
+        seen: set[int] = set()
+        found = 0
+        while todo:
+            index, parent = todo.popleft()
+            node = self.item("nodes", index)
+            assert isinstance(index, int)
+            if index in seen or len(seen) >= MAX_NODES:
+                raise InputError(
+                    f"{self.path}: node {index} is there twice, expected a tree of up to {MAX_NODES} nodes"
+                )
+            seen.add(index)
+            matrix = parent @ self.matrix(node, index)
+            todo += [(child, matrix) for child in _list(node.get("children", []))]
+            if "mesh" not in node:
+                continue
+            for place, primitive in enumerate(_list(self.item("meshes", node["mesh"]).get("primitives", []))):
+                if isinstance(primitive, dict) and EXTENSION in as_object(primitive.get("extensions")):
+                    found += 1
+                    if found > MAX_PRIMITIVES:
+                        raise InputError(f"{self.path}: has more than {MAX_PRIMITIVES} primitives of Gaussians")
+                    yield f"primitive {place} of node {index}", matrix, primitive
+
+    def matrix(self, node: dict[str, Any], index: int) -> NDArray[np.float64]:
+        from scipy.spatial.transform import Rotation
+
+        def numbers(key: str, default: list[float]) -> NDArray[np.float64]:
+            value = node.get(key, default)
+            try:
+                found = np.array(value, np.float64)
+            except (TypeError, ValueError, OverflowError):
+                found = np.empty(0)
+            if found.shape != (len(default),) or not np.isfinite(found).all():
+                raise InputError(f"{self.path}: {key} of node {index} is no list of {len(default)} numbers")
+            return found
+
+        if "matrix" in node:
+            return numbers("matrix", list(np.eye(4).ravel())).reshape(4, 4).T
+        result = np.eye(4)
+        rotation = numbers("rotation", [0, 0, 0, 1])
+        if not rotation.any():
+            raise InputError(f"{self.path}: rotation of node {index} is 0, expected a quaternion")
+        result[:3, :3] = Rotation.from_quat(rotation).as_matrix() * numbers("scale", [1, 1, 1])
+        result[:3, 3] = numbers("translation", [0, 0, 0])
+        return result
+
+    def extension(self, primitive: dict[str, Any]) -> dict[str, Any]:
+        return as_object(primitive["extensions"][EXTENSION])
+
+    def gaussians(self, name: str, primitive: dict[str, Any]) -> Gaussians:
+        """In our frame."""
+        said = self.extension(primitive)
+        kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
+        if kernel != "ellipse":
+            raise InputError(f"{self.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse")
+        if space != COLOR_SPACES[0]:
+            warnings.warn(plain(f"{self.path}: the colours are in {str(space)[:40]}, kept as they are"), stacklevel=3)
+        nested = as_object(said.get("extensions", {}))
+        for extension in SPZ_EXTENSIONS:
+            if extension in nested:
+                blob = self.view(as_object(nested[extension]).get("bufferView"))
+                return spz.read_from(io.BytesIO(blob.data), len(blob), self.path)
+        return self.attributes(name, as_object(primitive.get("attributes")))
+
+    def attributes(self, name: str, indices: dict[str, Any]) -> Gaussians:
+        def array(semantic: str, width: int) -> Array:
+            if semantic not in indices:
+                raise InputError(f"{self.path}: {name} lacks the attribute {semantic}")
+            return self.accessor(indices[semantic], width, semantic)
+
+        position = array("POSITION", 3)
+        count = len(position)
+        self.total += count
+        size = self.size + sum(len(buffer) for buffer in self.buffers.values())
+        packing.require_count(self.path, self.total if count else 0, size)
+        names = [
+            [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
+            for degree in range(MAX_SH_DEGREE + 1)
+        ]
+        degree = max((degree for degree in range(4) if any(each in indices for each in names[degree])), default=0)
+        sources = {
+            "means": position,
+            "quaternions": array(f"{EXTENSION}:ROTATION", 4),
+            "log_scales": array(f"{EXTENSION}:SCALE", 3),
+            "opacities": array(f"{EXTENSION}:OPACITY", 1),
+        }
+        coefficients = [array(each, 3) for band in names[: degree + 1] for each in band]
+        for each in (*sources.values(), *coefficients):
+            if len(each) != count:
+                raise InputError(f"{self.path}: {name} has {len(each)} values of an attribute, expected {count}")
+        result = packing.empty(count, degree)
+        for first in range(0, count, BLOCK_ROWS):
+            rows = slice(first, min(first + BLOCK_ROWS, count))
+            result.means[rows] = _real(position[rows])
+            result.quaternions[rows] = _real(sources["quaternions"][rows])[:, [3, 0, 1, 2]]
+            scales = _real(sources["log_scales"][rows])
+            result.log_scales[rows] = packing.log_scales(scales, f"{self.path}: {name}", first)
+            opacity = _real(sources["opacities"][rows])[:, 0]
+            if not ((opacity >= 0) & (opacity <= 1)).all():
+                raise InputError(f"{self.path}: {name} has an opacity outside [0, 1]")
+            result.opacity_logits[rows] = packing.logits(opacity)
+            for index, coefficient in enumerate(coefficients):
+                result.sh[rows, index] = _real(coefficient[rows])
+        flip(result, LEFT_UP)
+        return result
+
+    def accessor(self, index: object, width: int, semantic: str) -> Array:
+        """(count, width), as it lies in the file."""
+        said = self.item("accessors", index)
+        kind = COMPONENTS.get(self.integer(said, "componentType"))
+        count, offset = self.integer(said, "count"), self.integer(said, "byteOffset", 0)
+        if kind is None or WIDTHS.get(str(said.get("type"))) != width:
+            raise InputError(
+                f"{self.path}: {semantic} is of the type {str(said.get('type'))[:20]}, expected {width} numbers"
+            )
+        if "sparse" in said or "bufferView" not in said:
+            raise InputError(f"{self.path}: {semantic} is sparse or has no values of its own, which is not supported")
+        view = self.item("bufferViews", said["bufferView"])
+        data = self.view(said["bufferView"])
+        item = np.dtype(kind)
+        stride = self.integer(view, "byteStride", width * item.itemsize)
+        need = offset + stride * (count - 1) + width * item.itemsize if count else offset
+        if need > len(data) or stride < width * item.itemsize:
+            raise InputError(f"{self.path}: {semantic} needs {need} bytes, its buffer view has {len(data)}")
+        values = np.ndarray((count, width), item, data.data, offset, (stride, item.itemsize))
+        return values.view(_Normalised) if said.get("normalized") is True and item.kind != "f" else values
+
+    def view(self, index: object) -> NDArray[np.uint8]:
+        """The bytes of a buffer view."""
+        said = self.item("bufferViews", index)
+        if "EXT_meshopt_compression" in as_object(said.get("extensions", {})):
+            raise InputError(f"{self.path}: is compressed with EXT_meshopt_compression, which is not supported")
+        offset, length = self.integer(said, "byteOffset", 0), self.integer(said, "byteLength")
+        data = self.buffer(self.integer(said, "buffer"))
+        if length > len(data) - offset:
+            raise InputError(
+                f"{self.path}: truncated: a buffer view ends at byte {offset + length}, its buffer has {len(data)}"
+            )
+        return data[offset : offset + length]
+
+    def buffer(self, index: int) -> NDArray[np.uint8]:
+        if index not in self.buffers:
+            said = self.item("buffers", index)
+            length = self.integer(said, "byteLength")
+            if "uri" not in said:
+                if self.binary is None or index != 0:
+                    raise InputError(f"{self.path}: buffer {index} has no place, expected a uri or the .glb's own")
+                start, have = self.binary
+                data = _map(self.path, start, have)
+            else:
+                data = self.outside(str(said["uri"]))
+            if len(data) < length:
+                raise InputError(f"{self.path}: truncated: buffer {index} needs {length} bytes, {len(data)} are there")
+            self.buffers[index] = data
+        return self.buffers[index]
+
+    def outside(self, uri: str) -> NDArray[np.uint8]:
+        """A data: URI, or a file in the same folder or below it."""
+        if uri.startswith("data:"):
+            try:
+                return np.frombuffer(base64.b64decode(uri.partition(";base64,")[2], validate=True), np.uint8)
+            except (binascii.Error, ValueError):
+                raise InputError(f"{self.path}: has a data URI that is not in base64") from None
+        try:
+            parts = urlsplit(uri)
+            name = unquote(parts.path)
+            folder = Path(os.path.realpath(self.path)).parent
+            file = Path(os.path.realpath(folder / name))
+            inside = not parts.scheme and not parts.netloc and name and file.is_relative_to(folder)
+        except ValueError:  # a zero byte in the name, or brackets that are no address
+            inside = False
+        if not inside:
+            raise InputError(f"{self.path}: has its buffer in {uri[:80]!r}, expected a file beside it")
+        with open_input(file, f"the buffer of {self.path}") as opened:
+            size = os.fstat(opened.fileno()).st_size
+        return _map(file, 0, size)
+
+
+class _Normalised(np.ndarray[Any, Any]):
+    """Integers that stand for fractions of their largest."""
+
+
+def _real(values: Array) -> NDArray[np.float32]:
+    floats = np.asarray(values).astype(np.float32)
+    if isinstance(values, _Normalised):
+        floats = np.maximum(floats / np.float32(np.iinfo(values.dtype).max), np.float32(-1))
+    return floats
+
+
+def _map(path: Path, start: int, size: int) -> NDArray[np.uint8]:
+    if size == 0:
+        return np.empty(0, np.uint8)
+    try:
+        return np.memmap(path, np.uint8, "r", start, (size,))
+    except OSError as error:  # more than there is room for in addresses
+        raise InputError(f"{path}: {size} bytes cannot be read ({error.strerror})") from None
+
+
+def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, int] | None]:
+    """The JSON of a .glb, and where its buffer is."""
+    head = file.read(16)
+    if len(head) < 16:
+        raise InputError(f"{path}: truncated: {size} bytes, expected a .glb")
+    version, _, length, kind = struct.unpack("<IIII", head)
+    if version != 2 or kind != JSON_CHUNK:
+        raise InputError(f"{path}: .glb of version {version} with a first chunk {kind:#x}, expected version 2 and JSON")
+    if length > min(MAX_DOCUMENT, size - 20):
+        raise InputError(f"{path}: truncated: its JSON has {length} bytes, {size - 20} are there")
+    text = file.read(length)
+    head = file.read(8)
+    if len(head) < 8:
+        return text, None
+    have, kind = struct.unpack("<II", head)
+    start = 20 + length + 8
+    if kind != BIN_CHUNK:
+        return text, None
+    if have > size - start:
+        raise InputError(f"{path}: truncated: its buffer has {have} bytes, {size - start} are there")
+    return text, (start, have)
+
+
+def as_object(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _list(value: object) -> list[Any]:
+    return value if isinstance(value, list) else []

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far a model is from another that it should equal, row by row: what a format has lost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians import Float64, Gaussians
+from clsplat.models.codec import values as packing
+
+UNITS = {
+    "position": "world units",
+    "position_relative": "of the extent",
+    "scale": "of the Gaussian's largest",
+    "rotation": "degrees",
+    "opacity": "of 1",
+    "colour": "of 1",
+    "sh": "in a coefficient beyond degree 0",
+}
+_BLOCK = 1 << 16
+
+
+def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
+    """The largest and the mean error of each attribute of UNITS, over the Gaussians; of several numbers the largest
+    counts, of positions the distance. scale: of standard deviations, as a part of the Gaussian's largest: the thickness
+    of a disc may be far below anything that is seen, and be cut to what a format holds. sh: as if coefficients that one
+    of them lacks were 0.
+
+    Raises ValueError for models of different sizes.
+    """
+    if len(original) != len(read):
+        raise ValueError(f"{len(original)} and {len(read)} Gaussians")
+    low, high = original.means.min(axis=0).astype(np.float64), original.means.max(axis=0).astype(np.float64)
+    extent = float(np.linalg.norm(high - low))
+    found: dict[str, list[Float64]] = {name: [] for name in UNITS}
+    shift = read.origin - original.origin
+    for start in range(0, len(original), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        moved = read.means[rows].astype(np.float64) - original.means[rows] + shift
+        distance = np.linalg.norm(moved, axis=1)
+        found["position"].append(distance)
+        found["position_relative"].append(distance / extent if extent else distance * 0)
+        found["scale"].append(_scale_errors(original.log_scales[rows], read.log_scales[rows]))
+        found["rotation"].append(_angles(original.quaternions[rows], read.quaternions[rows]))
+        logits = original.opacity_logits[rows], read.opacity_logits[rows]
+        found["opacity"].append(np.abs(packing.opacities(logits[1]) - packing.opacities(logits[0])))
+        dc = packing.colours(read.sh[rows, 0]) - packing.colours(original.sh[rows, 0])
+        found["colour"].append(np.abs(dc).max(axis=1))
+        found["sh"].append(_sh_errors(original.sh[rows, 1:], read.sh[rows, 1:]))
+    whole = {name: np.concatenate(values) for name, values in found.items()}
+    return {name: {"largest": float(all_.max()), "mean": float(all_.mean())} for name, all_ in whole.items()}
+
+
+def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
+    """(n,), from logs (n, 3): against the largest of each a, so that nothing but their differences overflows."""
+    largest = a.max(axis=1, keepdims=True).astype(np.float64)
+    with np.errstate(over="ignore"):
+        p, q = np.exp(a - largest), np.exp(b - largest)
+    return np.asarray(np.abs(q - p).max(axis=1))
+
+
+def _angles(a: NDArray[Any], b: NDArray[Any]) -> Float64:
+    """Degrees between the rotations, (n,): by the chord, which is exact for small angles."""
+    p, q = packing.unit_quaternions(a), packing.unit_quaternions(b)
+    q *= np.where((p * q).sum(axis=1) < 0, -1, 1)[:, None]
+    chord = np.linalg.norm(p - q, axis=1)
+    return np.asarray(np.degrees(4 * np.arcsin(np.minimum(chord / 2, 1))))
+
+
+def _sh_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
+    width = max(a.shape[1], b.shape[1])
+    if width == 0:
+        return np.zeros(len(a))
+    p, q = (np.pad(each.astype(np.float64), ((0, 0), (0, width - each.shape[1]), (0, 0))) for each in (a, b))
+    return np.asarray(np.abs(p - q).max(axis=(1, 2)))
+
+
+def table(found: dict[str, dict[str, float]]) -> str:
+    """A line for each attribute."""
+    names = {"position_relative": "", "sh": "SH"}
+    lines = ["error      largest      mean"]
+    for name, unit in UNITS.items():
+        label = names.get(name, name)
+        lines.append(f"{label:9}  {found[name]['largest']:<11.3g}  {found[name]['mean']:<11.3g}  {unit}")
+    return "\n".join(lines)

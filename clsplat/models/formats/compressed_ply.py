@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PlayCanvas' compressed PLY: 16 bytes a Gaussian in chunks of 256, and a byte for each higher SH coefficient.
+
+https://blog.playcanvas.com/compressing-gaussian-splats and https://github.com/playcanvas/splat-transform (read-ply,
+write-compressed-ply). Frame, quaternion order, log scales and signs are the PLY's.
+
+- element `chunk`: least and largest position, log scale and colour (0.5 + C0 f_dc) of 256 Gaussians; older files have
+  no colours, which are then 0 to 1. Log scales are cut to -20 to 20 when written.
+- element `vertex`: packed_position and packed_scale, 11, 10 and 11 bits from the top, between the chunk's bounds;
+  packed_rotation, in the top 2 bits which of w x y z is the largest, then the others in order, 10 bits each for
+  -1/sqrt(2) to 1/sqrt(2), the largest being positive; packed_color, 8 bits each of red, green, blue, between the
+  bounds, and opacity, 0 to 1.
+- element `sh`, where there are higher coefficients: f_rest_*, channel-major, bytes for -4 to 4: the middle of one of
+  256 steps, but 0 and 255 are the ends.
+
+A chunk's Gaussians share its bounds, so that they are sorted to lie near each other when written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError
+from clsplat.files import atomic_writer, open_input
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.models.codec import values as packing
+from clsplat.models.formats import ply
+
+NAME = "compressed PLY"
+SUFFIXES = (".compressed.ply",)
+FLOAT = False
+LOSES = "position and scale to 10 or 11 bits of a chunk's range, rotation to 10, colour and opacity to 8, SH to 1/32"
+
+CHUNK = 256
+BLOCK_ROWS = 64 * CHUNK
+MAX_LOG_SCALE = 20.0
+BOUNDS = tuple(
+    f"{end}_{name}"
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for end in ("min", "max")
+    for name in names
+)
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_111011 = ((21, 11), (11, 10), (0, 11))
+_8888 = ((24, 8), (16, 8), (8, 8))
+_ROTATION = ((20, 10), (10, 10), (0, 10))
+
+
+def recognises(head: bytes) -> bool:
+    """A PLY whose header names a packed property."""
+    return head.startswith(b"ply") and b"packed_position" in head.partition(b"end_header")[0]
+
+
+def read(path: Path) -> Gaussians:
+    """Read it. Raises InputError: not a compressed PLY, elements or properties missing, truncated, values that are
+    not finite."""
+    with open_input(path, "a compressed PLY") as file:
+        header = ply.read_header(file, path)
+        chunks, vertex, sh = _elements(header, path)
+        starts = _starts(header, file, path)
+        bounds = _bounds(file, header, chunks, starts[chunks.name], path)
+        rest = [] if sh is None else [f"f_rest_{index}" for index in range(len(sh.properties))]
+        found = packing.empty(vertex.count, {0: 0, 9: 1, 24: 2, 45: 3}[len(rest)])
+        for start in range(0, vertex.count, BLOCK_ROWS):
+            count = min(BLOCK_ROWS, vertex.count - start)
+            block = _rows(file, header, vertex, starts["vertex"], start, count, path)
+            of_chunk = bounds[np.arange(start, start + count) // CHUNK]
+            _unpack(block, of_chunk, found, slice(start, start + count))
+            if sh is not None:
+                table = _rows(file, header, sh, starts["sh"], start, count, path)
+                columns = np.stack([table[name] for name in rest], axis=1).astype(np.float32)
+                steps = np.where(columns == 0, 0, np.where(columns == 255, 256, columns + np.float32(0.5)))
+                values = (steps / 256 - 0.5) * 8
+                found.sh[start : start + count, 1:] = values.reshape(count, 3, -1).transpose(0, 2, 1)
+    packing.require_finite(path, found)
+    return found
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Of `clsplat info`: comments."""
+    with open_input(path, "a compressed PLY") as file:
+        return {"comments": ply.read_header(file, path).comments}
+
+
+def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> None:
+    """Write it, atomically, the Gaussians in the order of `order`. comments: lines of the header, in ASCII."""
+    ply.check_comments(comments)
+    gaussians.check()
+    packing.require_finite(path, gaussians, writing=True)
+    rows, count = order(gaussians), len(gaussians)
+    rest = 3 * (gaussians.sh.shape[1] - 1)
+    lines = ["ply", "format binary_little_endian 1.0", "comment clsplat"]
+    lines += [f"comment {line}" for line in comments]
+    lines += [f"element chunk {-(-count // CHUNK)}", *(f"property float {name}" for name in BOUNDS)]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
+    lines += [f"element sh {count}", *(f"property uchar f_rest_{index}" for index in range(rest))] if rest else []
+    starts = range(0, count, BLOCK_ROWS)
+    bounds = [_ranges(*_values(gaussians, rows[start : start + BLOCK_ROWS])) for start in starts]
+    with atomic_writer(path) as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
+        for block in bounds:
+            file.write(block.astype("<f4").tobytes())
+        for start, block in zip(starts, bounds, strict=True):
+            file.write(_pack(gaussians, rows[start : start + BLOCK_ROWS], block).tobytes())
+        for start in starts if rest else ():
+            sh = gaussians.sh[rows[start : start + BLOCK_ROWS], 1:].transpose(0, 2, 1)
+            file.write(np.clip(np.floor((sh / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
+
+
+def order(gaussians: Gaussians) -> NDArray[np.int64]:
+    """(n,) which Gaussian each row of the file is."""
+    return packing.morton_order(gaussians.means)
+
+
+def _elements(header: ply.Header, path: Path) -> tuple[ply.Element, ply.Element, ply.Element | None]:
+    """chunk, vertex and sh, if there is one, their properties checked."""
+    names = [element.name for element in header.elements]
+    if header.format == "ascii":
+        raise InputError(f"{path}: a compressed PLY in ascii, expected binary")
+    for name in ("chunk", "vertex"):
+        if names.count(name) != 1:
+            raise InputError(f"{path}: {names.count(name)} elements {name!r} in the header, expected one")
+    chunks, vertex = (header.elements[names.index(name)] for name in ("chunk", "vertex"))
+    sh = header.elements[names.index("sh")] if "sh" in names else None
+    has = {name for name, _ in chunks.properties}
+    wanted = BOUNDS if has & set(BOUNDS[12:]) else BOUNDS[:12]
+    if missing := [name for name in wanted if (name, "f4") not in chunks.properties]:
+        raise InputError(f"{path}: element chunk lacks {' '.join(missing)}, expected floats")
+    if missing := [name for name in PACKED if (name, "u4") not in vertex.properties]:
+        raise InputError(f"{path}: element vertex lacks {' '.join(missing)}, expected uints")
+    if vertex.count == 0:
+        raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
+    if chunks.count * CHUNK < vertex.count:
+        raise InputError(f"{path}: {chunks.count} chunks are too few for {vertex.count} Gaussians, {CHUNK} in each")
+    if sh is not None:
+        counts = [3 * degree * (degree + 2) for degree in range(1, MAX_SH_DEGREE + 1)]
+        properties = [(f"f_rest_{index}", "u1") for index in range(len(sh.properties))]
+        if len(sh.properties) not in counts or set(properties) != set(sh.properties):
+            raise InputError(f"{path}: element sh, expected uchars f_rest_*, {', '.join(map(str, counts))} of them")
+        if sh.count != vertex.count:
+            raise InputError(f"{path}: element sh has {sh.count} rows, expected {vertex.count}, as vertex has")
+    for element in header.elements:
+        kept = [name for name, _ in element.properties]
+        if element.has_list or len(set(kept)) < len(kept):
+            raise InputError(f"{path}: element {element.name} has a list or a property twice, expected numbers")
+    return chunks, vertex, sh
+
+
+def _starts(header: ply.Header, file: BinaryIO, path: Path) -> dict[str, int]:
+    """Where each element begins, the file's size checked for all of them."""
+    starts, at = {}, header.size
+    for element in header.elements:
+        starts[element.name] = at
+        at += element.count * header.row_type(element).itemsize
+    if (have := os.fstat(file.fileno()).st_size) < at:
+        raise InputError(f"{path}: truncated: its header promises {at} bytes, {have} are there")
+    return starts
+
+
+def _rows(
+    file: BinaryIO, header: ply.Header, element: ply.Element, at: int, start: int, count: int, path: Path
+) -> NDArray[Any]:
+    kind = header.row_type(element)
+    file.seek(at + start * kind.itemsize)
+    return packing.read_rows(file, kind, count, path)
+
+
+def _bounds(file: BinaryIO, header: ply.Header, chunks: ply.Element, at: int, path: Path) -> NDArray[np.float32]:
+    """(chunks, 3, 2, 3): of position, log scale and colour, the least and the largest."""
+    table = _rows(file, header, chunks, at, 0, chunks.count, path)
+    bounds = np.zeros((chunks.count, 18), np.float32)
+    bounds[:, 15:] = 1
+    for index, name in enumerate(BOUNDS):
+        if name in (table.dtype.names or ()):
+            bounds[:, index] = table[name]
+    if not np.isfinite(bounds).all():
+        at_chunk = int((~np.isfinite(bounds).all(axis=1)).argmax())
+        raise InputError(f"{path}: chunk {at_chunk} has bounds that are not finite")
+    return bounds.reshape(-1, 3, 2, 3)
+
+
+def _fields(words: NDArray[Any], layout: tuple[tuple[int, int], ...]) -> NDArray[np.float32]:
+    """(n, fields), each 0 to 1, of (shift, bits)."""
+    columns = [(words >> shift & (1 << bits) - 1) / np.float32((1 << bits) - 1) for shift, bits in layout]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], found: Gaussians, rows: slice) -> None:
+    """block: rows of `vertex`; bounds (n, 3, 2, 3) of each."""
+
+    def between(words: NDArray[Any], layout: tuple[tuple[int, int], ...], what: int) -> NDArray[np.float32]:
+        part = _fields(words, layout)
+        return bounds[:, what, 0] * (1 - part) + bounds[:, what, 1] * part
+
+    words = {name: block[name].astype(np.uint32) for name in PACKED}
+    found.means[rows] = between(words["packed_position"], _111011, 0)
+    found.log_scales[rows] = between(words["packed_scale"], _111011, 1)
+    with np.errstate(over="ignore"):  # refused below
+        found.sh[rows, 0] = packing.coefficients(between(words["packed_color"], _8888, 2))
+    found.opacity_logits[rows] = packing.byte_logits()[words["packed_color"] & 255]
+    others = (_fields(words["packed_rotation"], _ROTATION) - np.float32(0.5)) * np.float32(np.sqrt(2))
+    largest = np.sqrt(np.maximum(1 - np.square(others).sum(axis=1), 0))
+    which = words["packed_rotation"] >> 30
+    quaternions = found.quaternions[rows]
+    for index in range(4):
+        of = which == index
+        quaternions[of, index] = largest[of]
+        quaternions[np.ix_(of, [each for each in range(4) if each != index])] = others[of]
+
+
+def _values(gaussians: Gaussians, rows: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
+    """Position, log scale and colour, float64 (n, 3) each."""
+    return (
+        packing.world_means(gaussians, rows),
+        np.clip(gaussians.log_scales[rows].astype(np.float64), -MAX_LOG_SCALE, MAX_LOG_SCALE),
+        packing.colours(gaussians.sh[rows, 0]),
+    )
+
+
+def _ranges(*values: NDArray[Any]) -> NDArray[np.float32]:
+    """(chunks, 3, 2, 3) as `_bounds`, of whole chunks but for the last."""
+    at = np.arange(0, len(values[0]), CHUNK)
+    ends = [[np.minimum.reduceat(each, at), np.maximum.reduceat(each, at)] for each in values]
+    return np.asarray(ends, np.float32).transpose(2, 0, 1, 3)
+
+
+def _pack(gaussians: Gaussians, rows: NDArray[np.int64], ranges: NDArray[np.float32]) -> NDArray[Any]:
+    """(n, 4) uint32: the rows of `vertex`."""
+    bounds = ranges[np.arange(len(rows)) // CHUNK].astype(np.float64)
+
+    def fields(parts: NDArray[Any], layout: tuple[tuple[int, int], ...]) -> NDArray[np.uint32]:
+        word = np.zeros(len(parts), np.uint32)
+        for column, (shift, bits) in zip(parts.T, layout, strict=True):
+            top = (1 << bits) - 1
+            word |= np.clip(np.rint(column * top), 0, top).astype(np.uint32) << np.uint32(shift)
+        return word
+
+    def part(values: NDArray[Any], what: int) -> NDArray[Any]:
+        low, width = bounds[:, what, 0], bounds[:, what, 1] - bounds[:, what, 0]
+        return (values - low) / np.where(width > 0, width, 1)
+
+    means, scales, rgb = _values(gaussians, rows)
+    words = np.empty((len(rows), 4), "<u4")
+    words[:, 0] = fields(part(means, 0), _111011)
+    words[:, 2] = fields(part(scales, 1), _111011)
+    opacity = packing.to_bytes(packing.opacities(gaussians.opacity_logits[rows]))
+    words[:, 3] = fields(part(rgb, 2), _8888) | opacity
+    q = packing.unit_quaternions(gaussians.quaternions[rows])
+    which = np.abs(q).argmax(axis=1)
+    n = np.arange(len(q))
+    q *= np.where(q[n, which] < 0, -1, 1)[:, None]
+    others = q[np.arange(4) != which[:, None]].reshape(-1, 3)
+    words[:, 1] = fields(others / np.sqrt(2) + 0.5, _ROTATION) | which.astype(np.uint32) << np.uint32(30)
+    return words

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""glTF 2.0 with KHR_gaussian_splatting: .glb, or .gltf with a .bin beside it.
+
+Specifications: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, and for Gaussians
+https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting (ratified).
+
+- Frame: x left, y up, z forward, as the base specification says; ours is half a turn about z away. What is written has
+  that turn in its values, not in a node, as not every viewer turns spherical harmonics with their node; an `origin` is
+  the node's translation. What is read goes through the nodes' transforms.
+- Values are float32: linear scales, opacities in [0, 1], unit quaternions x y z w; SH coefficients in an attribute
+  each, order and signs as ours. Normalised integers are read too. COLOR_0 is there for viewers that draw points, in
+  linear light as glTF wants it.
+- Colour space: srgb_rec709_display, unless told that the model was trained in linear light (lin_rec709_display).
+- Compression: KHR_gaussian_splatting_compression_spz_2, a draft, has an SPZ file in a buffer view, by its text in
+  version 2 and to be unpacked into glTF's frame. It is read, and written when asked for.
+
+The container is a JSON object and arrays at offsets, which are read here as they lie in the file: libraries for it load
+files whole, and trust what they say.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from clsplat.errors import InputError
+from clsplat.files import atomic_write, atomic_writer
+from clsplat.gaussians import Gaussians
+from clsplat.images.colour import srgb_to_linear
+from clsplat.models.codec import axes, values
+from clsplat.models.codec.axes import LEFT_UP
+from clsplat.models.codec.gltf_asset import (
+    BIN_CHUNK,
+    COLOR_SPACES,
+    EXTENSION,
+    JSON_CHUNK,
+    SPZ_EXTENSION,
+    SPZ_EXTENSIONS,
+    Array,
+    Asset,
+    as_object,
+)
+from clsplat.models.codec.values import BLOCK_ROWS
+from clsplat.models.edit import merge
+from clsplat.models.formats import spz
+from clsplat.reference.sh import C0
+
+NAME = "glTF"
+SUFFIXES = (".gltf", ".glb")
+LOSES = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
+FLOAT = True
+
+GLB_MAGIC = 0x46546C67
+FLOAT32, UINT16 = 5126, 5123
+LARGEST_GLB = (1 << 32) - 1
+
+
+def recognises(head: bytes) -> bool:
+    """Whether a file begins as a .glb; a .gltf has JSON's beginning and nothing else."""
+    return head[:4] == b"glTF" or head.lstrip()[:1] == b"{"
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """What the extension says of the first primitive that has it."""
+    asset = Asset.open(path)
+    for _, _, primitive in asset.primitives():
+        said = asset.extension(primitive)
+        compression = next((name for name in SPZ_EXTENSIONS if name in as_object(said.get("extensions"))), "none")
+        return {"color_space": str(said.get("colorSpace", "")), "compression": compression}
+    return {}
+
+
+def read(path: Path) -> Gaussians:
+    """Read every primitive of Gaussians in the scene, as one model. Raises InputError."""
+    asset = Asset.open(path)
+    parts = []
+    for name, matrix, primitive in list(asset.primitives()):  # all of them are counted first
+        part = asset.gaussians(name, primitive)
+        # the node's matrix is in glTF's frame, the Gaussians are in ours already
+        turn = np.diag([*LEFT_UP, 1.0])
+        parts.append(axes.place(part, turn @ matrix @ turn, f"{path}: {name}"))
+    if not parts:
+        raise InputError(f"{path}: has no primitive with {EXTENSION} in its scene, expected at least one")
+    model = merge(parts)
+    values.require_finite(path, model)
+    return model
+
+
+def write(
+    path: Path, gaussians: Gaussians, *, spz_compression: bool = False, color_space: str = COLOR_SPACES[0]
+) -> None:
+    """Write a .glb, or a .gltf and the .bin with its buffer, which is there before the .gltf is; atomically, each.
+
+    spz_compression: by the draft KHR_gaussian_splatting_compression_spz_2, which few viewers read. Raises InputError
+    for values that are not finite, and a .glb of more than 4 GiB.
+    """
+    if color_space not in COLOR_SPACES:
+        raise ValueError(f"color_space {color_space!r}: expected {' or '.join(COLOR_SPACES)}")
+    gaussians.check()
+    values.require_finite(path, gaussians, writing=True)
+    if not len(gaussians):
+        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    document, buffer = _document(path, gaussians, spz_compression, color_space)
+    if path.suffix.lower() == ".gltf":
+        binary = path.with_suffix(".bin")
+        with atomic_writer(binary, buffer.length) as file:
+            length = buffer.write(file)
+        document["buffers"] = [{"byteLength": length, "uri": binary.name}]
+        atomic_write(path, json.dumps(document, indent=1).encode())
+        return
+    length = buffer.length
+    document["buffers"] = [{"byteLength": length}]
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    padded = length + -length % 4
+    total = 28 + len(text) + padded
+    if total > LARGEST_GLB:
+        raise InputError(f"{path}: a .glb holds 4 GiB at most, {total} bytes would be needed; write a .gltf")
+    with atomic_writer(path, total) as file:
+        file.write(struct.pack("<IIIII", GLB_MAGIC, 2, total, len(text), JSON_CHUNK) + text)
+        file.write(struct.pack("<II", padded, BIN_CHUNK))
+        buffer.write(file)
+        file.write(bytes(padded - length))
+
+
+@dataclass
+class _Buffer:
+    """What the buffer will hold: arrays by the block of rows, or an SPZ file."""
+
+    gaussians: Gaussians
+    attributes: list[str]
+    color_space: str
+    blob: bytes | None = None
+
+    @property
+    def length(self) -> int:
+        if self.blob is not None:
+            return len(self.blob)
+        return sum(_layout(name)[2] for name in self.attributes) * len(self.gaussians)
+
+    def write(self, file: BinaryIO) -> int:
+        if self.blob is not None:
+            file.write(self.blob)
+            return self.length
+        for name in self.attributes:
+            for first in range(0, len(self.gaussians), BLOCK_ROWS):
+                block = _block(name, self.gaussians, slice(first, first + BLOCK_ROWS), self.color_space)
+                file.write(np.ascontiguousarray(block).data)
+        return self.length
+
+
+def _layout(name: str) -> tuple[str, int, int]:
+    """Type, component type, and bytes of one Gaussian."""
+    if name == "COLOR_0":
+        return "VEC4", UINT16, 8
+    width = {"ROTATION": 4, "OPACITY": 1}.get(name.partition(":")[2], 3)
+    return {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width], FLOAT32, 4 * width
+
+
+def _block(name: str, gaussians: Gaussians, rows: slice, color_space: str) -> Array:
+    """Some rows of an attribute, in glTF's frame."""
+    block: Array
+    match name.partition(":")[2] or name:
+        case "POSITION":
+            block = (gaussians.means[rows] * np.array(LEFT_UP, np.float32)).astype("<f4")
+        case "ROTATION":
+            unit = values.unit_quaternions(gaussians.quaternions[rows])
+            block = (unit * axes.quaternion_signs(LEFT_UP))[:, [1, 2, 3, 0]].astype("<f4")
+        case "SCALE":
+            block = np.exp(np.clip(gaussians.log_scales[rows], -103.0, 88.0)).astype("<f4")
+        case "OPACITY":
+            block = values.opacities(gaussians.opacity_logits[rows]).astype("<f4")
+        case "COLOR_0":
+            colors = np.clip(gaussians.sh[rows, 0] * np.float32(C0) + np.float32(0.5), 0, 1)
+            if color_space == COLOR_SPACES[0]:
+                colors = srgb_to_linear(colors)
+            opacity = values.opacities(gaussians.opacity_logits[rows])
+            block = np.rint(np.column_stack([colors, opacity]) * 65535).astype("<u2")
+        case coefficient:
+            _, _, degree, _, index = coefficient.split("_")
+            k = int(degree) ** 2 + int(index)
+            block = (gaussians.sh[rows, k] * axes.sh_signs(LEFT_UP)[k]).astype("<f4")
+    return block
+
+
+def _document(
+    path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
+) -> tuple[dict[str, Any], _Buffer]:
+    count = len(gaussians)
+    attributes = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))]
+    degrees = range(gaussians.sh_degree + 1)
+    attributes += [
+        f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for degree in degrees for index in range(2 * degree + 1)
+    ]
+    attributes.append("COLOR_0")
+    corners = [gaussians.means.min(axis=0) * LEFT_UP, gaussians.means.max(axis=0) * LEFT_UP]
+    bounds = {"min": np.minimum(*corners).tolist(), "max": np.maximum(*corners).tolist()}
+    accessors: list[dict[str, Any]] = []
+    for index, name in enumerate(attributes):
+        kind, component, _ = _layout(name)
+        accessor: dict[str, Any] = {"componentType": component, "count": count, "type": kind}
+        accessor |= {} if spz_compression else {"bufferView": index}
+        accessor |= bounds if name == "POSITION" else {}
+        accessor |= {"normalized": True} if component == UINT16 else {}
+        accessors.append(accessor)
+    said: dict[str, Any] = {"kernel": "ellipse", "colorSpace": color_space}
+    used = [EXTENSION]
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "clsplat"},
+        "extensionsUsed": used,
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [],
+        "accessors": accessors,
+    }
+    buffer = _Buffer(gaussians, attributes, color_space)
+    if spz_compression:
+        buffer.blob = _spz_blob(path, gaussians)
+        used.append(SPZ_EXTENSION)
+        document["extensionsRequired"] = used
+        said["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
+        document["bufferViews"] = [{"buffer": 0, "byteLength": buffer.length}]
+    else:
+        sizes = [_layout(name)[2] * count for name in attributes]
+        offsets = np.cumsum([0, *sizes]).tolist()
+        views = zip(offsets, sizes, strict=False)
+        target = 34962  # ARRAY_BUFFER
+        document["bufferViews"] = [
+            {"buffer": 0, "byteOffset": offset, "byteLength": size, "target": target} for offset, size in views
+        ]
+    places = {name: index for index, name in enumerate(attributes)}
+    primitive = {"attributes": places, "mode": 0, "extensions": {EXTENSION: said}}
+    document["meshes"] = [{"primitives": [primitive]}]
+    if gaussians.origin.any():
+        document["nodes"][0]["translation"] = [float(value) for value in gaussians.origin * LEFT_UP]
+    return document, buffer
+
+
+def _spz_blob(path: Path, gaussians: Gaussians) -> bytes:
+    """Its means count from the node."""
+    local = Gaussians(
+        gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh
+    )
+    blob = io.BytesIO()
+    spz.write_to(blob, local, spz.header_for(path, local, 2))
+    return blob.getvalue()

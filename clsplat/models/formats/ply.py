@@ -1,0 +1,483 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The 3DGS model file: a PLY with one vertex a Gaussian, as the paper's authors wrote it and every tool reads it.
+
+https://github.com/graphdeco-inria/gaussian-splatting (scene/gaussian_model.py, save_ply).
+Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. f_rest is channel-major: all higher
+coefficients of red, then of green, then of blue. Files are streamed in blocks of rows, so that reading or writing
+costs the model's own memory and little more.
+
+Means that count from elsewhere than the world's origin are written in the world, as every tool expects, which rounds
+them; and once more as they are, in an element behind the vertices, with their origin in a comment. Other tools pass
+over both.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import NEAR
+from clsplat.errors import InputError, examples, plain
+from clsplat.files import atomic_writer, open_input
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.models.codec import values
+
+NAME = "3DGS PLY"
+SUFFIXES = (".ply",)
+FLOAT = True
+LOSES = "nothing"
+
+BLOCK_ROWS = 1 << 15
+MAX_HEADER_LINES = 10_000
+MAX_LINE_BYTES = 1 << 20
+MAX_BLOCK_BYTES, MAX_BLOCK_WORDS = 1 << 26, 1 << 21
+MAX_NUMBER_BYTES = 128
+"""The longest number in text, as a row of them is made an array whose elements have the width of the widest."""
+
+TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+POSITION = ("x", "y", "z")
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALE = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+ORIGIN = ["comment", "clsplat", "origin"]
+NEAR_PLANE = ["comment", "clsplat", "near"]
+FILTER = "filter_3D"
+"""Mip-splatting's property: what its renderer adds to the scales."""
+LOCAL = "clsplat_local"
+"""The element that has the means as they count from the origin."""
+REQUIRED = (*POSITION, *DC, "opacity", *SCALE, *ROTATION)
+
+
+@dataclass
+class Element:
+    """An element of the header: rows of `properties`, (name, NumPy type without byte order), "" for a list."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def has_list(self) -> bool:
+        return any(code == "" for _, code in self.properties)
+
+
+@dataclass
+class Header:
+    """format: "ascii" or a key of BYTE_ORDERS; size: the header's length in bytes, `end_header` included; origin: of
+    the element LOCAL; near: the near plane, where it is not the usual one."""
+
+    format: str
+    elements: list[Element]
+    size: int
+    origin: NDArray[np.float64] | None = None
+    near: float = NEAR
+    comments: list[str] = field(default_factory=list)
+
+    def row_type(self, element: Element) -> np.dtype[Any]:
+        """The packed record of one row of a binary file."""
+        order = BYTE_ORDERS[self.format]
+        return np.dtype([(name, order + code) for name, code in element.properties])
+
+
+def recognises(head: bytes) -> bool:
+    """A PLY that is not the compressed one."""
+    return head.startswith(b"ply") and b"packed_position" not in head.partition(b"end_header")[0]
+
+
+def read(path: str | os.PathLike[str]) -> Gaussians:
+    """Read a 3DGS PLY: ascii or binary of either byte order, properties in any order, of any numeric type.
+
+    SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45); of degree 4 (72) the fourth is left out, with a
+    warning. Other properties are ignored; FILTER, and bytes after the data, give a warning. Raises InputError, one line
+    with the path: not a PLY, truncated, a property missing, values that are not finite, no Gaussians, no such file.
+    """
+    path = Path(path)
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+        vertex, skipped = _vertex_element(header, path)
+        rest = _check_properties(vertex, path)
+        if FILTER in dict(vertex.properties):
+            warnings.warn(plain(f"{path}: {FILTER}, mip-splatting's filter, is ignored; fuse it first"), stacklevel=4)
+        if vertex.count == 0:
+            raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
+        gaussians = _assemble(read_vertices(file, header, path, "Gaussian"), vertex.count, rest, path)
+        if header.origin is not None:
+            _count_from(header.origin, gaussians, _local_means(file, header, vertex, skipped, path), path)
+        gaussians.near = header.near
+        return gaussians
+
+
+def read_blocks(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians in the file's order, some rows at a time, in the world; values that are not finite are passed on.
+    Raises InputError as `read`."""
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+        vertex, _ = _vertex_element(header, path)
+        rest = _check_properties(vertex, path)
+        higher, kept = rest // 3, min(rest // 3, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
+        names = [*DC, *(f"f_rest_{c * higher + k}" for k in range(kept) for c in range(3))]
+        if vertex.count == 0:
+            yield _none(kept)
+        for block in read_vertices(file, header, path, "Gaussian") if vertex.count else ():
+
+            def columns(*of: str, block: Block = block) -> NDArray[np.float32]:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    return np.stack([block[name].astype(np.float32) for name in of], axis=1)
+
+            sh = columns(*names).reshape(-1, 1 + kept, 3)
+            yield Gaussians(columns(*POSITION), columns(*ROTATION), columns(*SCALE), columns("opacity")[:, 0], sh)
+
+
+def _none(kept: int) -> Gaussians:
+    def array(*shape: int) -> NDArray[np.float32]:
+        return np.empty((0, *shape), np.float32)
+
+    return Gaussians(array(3), array(4), array(3), array(), array(1 + kept, 3))
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Of `clsplat info`: encoding, comments, properties that are ignored."""
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+    vertex, _ = _vertex_element(header, path)
+    known = {*REQUIRED, "nx", "ny", "nz"}
+    ignored = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
+    return {"encoding": header.format, "comments": header.comments, "ignored": ignored, "near": header.near}
+
+
+def write(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    *,
+    sh_degree: int | None = None,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write a binary little-endian 3DGS PLY of float32, atomically; the same Gaussians give the same bytes.
+
+    sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given. comments: lines of
+    the header, such as `colour.comment`. Raises ValueError where the degree is lower than the model's, a comment is no
+    line of ASCII, or an array is not as `Gaussians` says; InputError for values that are not finite.
+    """
+    check_comments(comments)
+    gaussians.check()
+    values.require_finite(Path(path), gaussians, writing=True)
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    if not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
+        raise ValueError(f"sh_degree {degree}: expected {gaussians.sh_degree} (the model's) to {MAX_SH_DEGREE}")
+    stored, padded = gaussians.sh.shape[1] - 1, (degree + 1) ** 2 - 1
+    rest_names = [f"f_rest_{index}" for index in range(3 * padded)]
+    names = [*POSITION, "nx", "ny", "nz", *DC, *rest_names, "opacity", *SCALE, *ROTATION]
+    far, count = bool(gaussians.origin.any()), len(gaussians)
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    lines += [" ".join([*ORIGIN, *(repr(float(value)) for value in gaussians.origin)])] if far else []
+    lines += [" ".join([*NEAR_PLANE, repr(float(gaussians.near))])] if gaussians.near != NEAR else []
+    lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
+    lines += [f"element {LOCAL} {count}", *(f"property float {name}" for name in POSITION)] if far else []
+    lines += ["end_header", ""]
+    head = "\n".join(lines).encode("ascii")
+    with atomic_writer(path, len(head) + 4 * count * (len(names) + (3 if far else 0))) as file:
+        file.write(head)
+        for start in range(0, len(gaussians), BLOCK_ROWS):
+            rows = slice(start, start + BLOCK_ROWS)
+            sh = gaussians.sh[rows]
+            block = np.zeros((len(sh), len(names)), "<f4")
+            block[:, 0:3] = gaussians.means[rows] + gaussians.origin if far else gaussians.means[rows]
+            block[:, 6:9] = sh[:, 0]
+            rest = block[:, 9 : 9 + 3 * padded]
+            for channel in range(3):
+                rest[:, channel * padded : channel * padded + stored] = sh[:, 1:, channel]
+            block[:, -8] = gaussians.opacity_logits[rows]
+            block[:, -7:-4] = gaussians.log_scales[rows]
+            block[:, -4:] = gaussians.quaternions[rows]
+            file.write(block.data)
+        if far:
+            file.write(np.ascontiguousarray(gaussians.means, "<f4").data)
+
+
+def check_comments(comments: Sequence[str]) -> None:
+    """Raise ValueError for one that is no line of ASCII."""
+    for line in comments:
+        if not (line.isascii() and line.isprintable()):
+            raise ValueError(f"comment {line!r}: expected one line of ASCII")
+
+
+def read_header(file: BinaryIO, path: Path) -> Header:
+    """Read the header and leave `file` at the first byte after it. Raises InputError."""
+    if file.read(3) != b"ply" or file.readline(16).strip():
+        raise InputError(f"{path}: not a PLY file (it does not begin with a line 'ply')")
+    form = ""
+    elements: list[Element] = []
+    comments: list[str] = []
+    origin, near = None, NEAR
+    for _ in range(MAX_HEADER_LINES):
+        line = file.readline(4096)
+        if not line.endswith(b"\n"):
+            break
+        words = line.decode("ascii", "replace").split()
+        if not words or words[0] in ("comment", "obj_info"):
+            origin = _origin(words) if words[:3] == ORIGIN else origin
+            near = _near(words) if words[:3] == NEAR_PLANE else near
+            comments += [" ".join(words[1:])] if words else []
+            continue
+        if words == ["end_header"]:
+            if form not in ("ascii", *BYTE_ORDERS):
+                expected = "ascii, binary_little_endian or binary_big_endian"
+                raise InputError(f"{path}: PLY header has the format {form or 'missing'!r}, expected {expected}")
+            return Header(form, elements, file.tell(), origin, near, comments)
+        try:
+            match words:
+                case ["format", name, _]:
+                    form = name
+                case ["element", name, count]:
+                    elements.append(Element(name, _count(count)))
+                case ["property", "list", _, _, name]:
+                    elements[-1].properties.append((name, ""))
+                case ["property", kind, name]:
+                    elements[-1].properties.append((name, TYPES[kind]))
+                case _:
+                    raise ValueError
+        except (ValueError, KeyError, IndexError):
+            raise InputError(
+                f"{path}: PLY header has a line that is of no PLY header: {' '.join(words)[:80]!r}"
+            ) from None
+    raise InputError(f"{path}: PLY header is truncated or damaged (no line 'end_header')")
+
+
+def _origin(words: list[str]) -> NDArray[np.float64] | None:
+    """None where the comment is not one of ours after all."""
+    try:
+        origin = np.array([float(word) for word in words[3:]])
+    except ValueError:
+        return None
+    return origin if origin.shape == (3,) and np.isfinite(origin).all() else None
+
+
+def _near(words: list[str]) -> float:
+    """The usual one where the comment is not one of ours after all."""
+    try:
+        near = float(words[3])
+    except (ValueError, IndexError):
+        return NEAR
+    return near if len(words) == 4 and 0 < near < np.inf else NEAR
+
+
+def _local_means(
+    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path
+) -> NDArray[np.float32] | None:
+    """The element LOCAL, if it is right behind the vertices. Raises InputError where it is cut."""
+    behind = header.elements[len(skipped) + 1 :]
+    wanted = Element(LOCAL, vertex.count, [(name, "f4") for name in POSITION])
+    if header.format == "ascii" or not behind or behind[0] != wanted:
+        return None
+    before = [*skipped, vertex]
+    file.seek(header.size + sum(element.count * header.row_type(element).itemsize for element in before))
+    row = header.row_type(wanted)
+    data = file.read(vertex.count * row.itemsize)
+    if len(data) != vertex.count * row.itemsize:
+        need = vertex.count * row.itemsize
+        raise InputError(f"{path}: truncated: element {LOCAL} needs {need} bytes, {len(data)} are there")
+    rows = np.frombuffer(data, row)
+    return np.stack([rows[name] for name in POSITION], axis=1).astype(np.float32)
+
+
+def _count_from(
+    origin: NDArray[np.float64], gaussians: Gaussians, local: NDArray[np.float32] | None, path: Path
+) -> None:
+    """Have the means count from the origin: as they were written, unless somebody has moved the vertices since."""
+    world = gaussians.means.astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        means = (world - origin).astype(np.float32)
+        if local is not None:
+            means = np.where((local + origin).astype(np.float32) == world, local, means)
+    if not np.isfinite(means).all():
+        raise InputError(f"{path}: the origin in the comment, {origin}, leaves means that are not finite")
+    gaussians.origin, gaussians.means = origin, np.ascontiguousarray(means)
+
+
+def _count(text: str) -> int:
+    count = int(text)
+    if count < 0:
+        raise ValueError
+    return count
+
+
+def _vertex_element(header: Header, path: Path) -> tuple[Element, list[Element]]:
+    """The vertex element and those stored before it."""
+    names = [element.name for element in header.elements]
+    if "vertex" not in names:
+        found = examples(names) or "none"
+        raise InputError(f"{path}: PLY has no element 'vertex' (elements: {found})")
+    at = names.index("vertex")
+    return header.elements[at], header.elements[:at]
+
+
+def _check_properties(vertex: Element, path: Path) -> int:
+    """The number of f_rest properties. Raises InputError where the layout is not a 3DGS model's."""
+    names = [name for name, _ in vertex.properties]
+    missing = [name for name in REQUIRED if name not in names]
+    if missing:
+        noun = "property" if len(missing) == 1 else "properties"
+        raise InputError(f"{path}: PLY lacks the {noun} {examples(missing)}, expected a 3DGS model")
+    rest = sum(name.startswith("f_rest_") for name in names)
+    counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 2)]
+    if rest not in counts:
+        raise InputError(f"{path}: PLY has {rest} f_rest properties, expected {', '.join(map(str, counts))} (SH)")
+    for index in range(rest):
+        if f"f_rest_{index}" not in names:
+            raise InputError(f"{path}: PLY lacks the property f_rest_{index}, though it has {rest} of f_rest")
+    if rest == counts[-1]:
+        left_out = f"SH of degree {MAX_SH_DEGREE + 1} is left out, {MAX_SH_DEGREE} is the highest that is known"
+        warnings.warn(plain(f"{path}: {left_out}"), stacklevel=3)
+    return rest
+
+
+Block = dict[str, NDArray[Any]]
+
+
+def read_vertices(file: BinaryIO, header: Header, path: Path, what: str) -> Iterator[Block]:
+    """Columns of the vertices by name, a block of rows at a time; `what` a vertex is, for messages.
+
+    That the file has as many as its header says is checked before the first block, binary files to the byte and ascii
+    ones as far as their length can tell, so that `count` rows may be allocated then. Raises InputError.
+    """
+    vertex, skipped = _vertex_element(header, path)
+    names = [name for name, _ in vertex.properties]
+    if double := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"{path}: PLY has the property {double} twice")
+    if vertex.has_list:
+        raise InputError(f"{path}: PLY has a list property in its vertices, expected numbers only")
+    read = _ascii_blocks if header.format == "ascii" else _binary_blocks
+    return read(file, header, vertex, skipped, path, what)
+
+
+def _binary_blocks(
+    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path, what: str
+) -> Iterator[Block]:
+    start = header.size
+    for element in skipped:
+        if element.has_list:
+            raise InputError(f"{path}: PLY has lists (element {element.name!r}) before its vertices, not supported")
+        start += element.count * sum(np.dtype(code).itemsize for _, code in element.properties)
+    row = header.row_type(vertex)
+    need, have = vertex.count * row.itemsize, max(0, os.fstat(file.fileno()).st_size - start)
+    if have < need:
+        whole = have // row.itemsize
+        raise InputError(
+            f"{path}: truncated: {vertex.count} {what}s need {need} bytes, {have} are there ({whole} {what}s)"
+        )
+    if have > need and header.elements[-1] is vertex:
+        warnings.warn(plain(f"{path}: {have - need} bytes after the last {what} ignored"), stacklevel=4)
+    file.seek(start)
+    block = min(BLOCK_ROWS, max(MAX_BLOCK_BYTES // max(row.itemsize, 1), 1))
+    for first in range(0, vertex.count, block):
+        count = min(block, vertex.count - first)
+        data = file.read(count * row.itemsize)
+        if len(data) != count * row.itemsize:
+            raise InputError(f"{path}: truncated while it was read")
+        rows = np.frombuffer(data, row)
+        yield {name: rows[name] for name, _ in vertex.properties}
+
+
+def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
+    """Lines that are not empty. Raises InputError for one too long to be a row."""
+    while line := file.readline(MAX_LINE_BYTES + 1):
+        if len(line) > MAX_LINE_BYTES:
+            raise InputError(f"{path}: has a line of more than {MAX_LINE_BYTES} bytes, expected rows of numbers")
+        if not line.isspace():
+            yield line
+
+
+def _ascii_blocks(
+    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path, what: str
+) -> Iterator[Block]:
+    """float64. A row is at least a character and a blank for each property."""
+    lines = _text_lines(file, path)
+    least, have = 2 * vertex.count * len(vertex.properties) - 1, os.fstat(file.fileno()).st_size - header.size
+    too_many = have < least
+    for element in skipped:
+        for _ in islice(lines, element.count):
+            pass
+    width = len(vertex.properties)
+    block = min(BLOCK_ROWS, max(MAX_BLOCK_WORDS // max(width, 1), 1))
+    for first in range(0, vertex.count, block):
+        count = min(block, vertex.count - first)
+        rows = [line.split() for line in islice(lines, count)]
+        for index, words in enumerate(rows):
+            if len(words) != width:
+                raise InputError(f"{path}: {what} {first + index} has {len(words)} values, expected {width}")
+            if max(map(len, words), default=0) > MAX_NUMBER_BYTES:
+                raise InputError(f"{path}: {what} {first + index} has a value that is no number")
+        if len(rows) < count:
+            raise InputError(f"{path}: truncated: {vertex.count} {what}s expected, {first + len(rows)} are there")
+        if too_many:
+            raise InputError(f"{path}: truncated: {vertex.count} {what}s expected, {have} bytes are too few for them")
+        try:
+            table = np.array(rows, dtype="S").astype(np.float64).reshape(count, width)
+        except ValueError as error:
+            raise InputError(f"{path}: a value after {what} {first} is no number ({error})") from None
+        yield {name: table[:, index] for index, (name, _) in enumerate(vertex.properties)}
+    if header.elements[-1] is vertex and next(lines, None) is not None:
+        warnings.warn(plain(f"{path}: text after the last {what} ignored"), stacklevel=4)
+
+
+def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gaussians:
+    """Gather the columns into arrays and refuse values that are not finite."""
+    higher = rest // 3
+    kept = min(higher, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
+    # The first block is read before anything is allocated: an ascii file's count is only a claim.
+    first_block = next(blocks)
+    means, scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    quaternions, opacities = np.empty((count, 4), np.float32), np.empty(count, np.float32)
+    sh = np.empty((count, 1 + kept, 3), np.float32)
+    columns: dict[str, NDArray[np.float32]] = {"opacity": opacities}
+    for names, array in ((POSITION, means), (SCALE, scales), (ROTATION, quaternions), (DC, sh[:, 0])):
+        columns.update({name: array[:, index] for index, name in enumerate(names)})
+    for index in range(rest):
+        if index % higher < kept:
+            columns[f"f_rest_{index}"] = sh[:, 1 + index % higher, index // higher]
+
+    start, bad_positions, first_bad = 0, 0, -1
+    other: tuple[int, str] | None = None
+    block: Block | None = first_block
+    while block is not None:
+        stop = start + len(block["x"])
+        bad = np.zeros(stop - start, bool)
+        for name, column in columns.items():
+            with np.errstate(over="ignore", invalid="ignore"):  # a double beyond float32 becomes inf, refused below
+                column[start:stop] = block[name]
+            not_finite = ~np.isfinite(column[start:stop])
+            if name in POSITION:
+                bad |= not_finite
+            elif other is None and not_finite.any():
+                other = (start + int(not_finite.argmax()), name)
+        if bad.any():
+            first_bad = first_bad if bad_positions else start + int(bad.argmax())
+            bad_positions += int(bad.sum())
+        start, block = stop, next(blocks, None)
+
+    if bad_positions:
+        raise InputError(
+            f"{path}: {bad_positions} of {count} Gaussians have a position that is not finite, the first is {first_bad}"
+        )
+    if other is not None:
+        raise InputError(f"{path}: {other[1]} of Gaussian {other[0]} is not finite")
+    return Gaussians(means, quaternions, scales, opacities, sh)

@@ -1,0 +1,438 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SOG, PlayCanvas's models in pictures: meta.json with lossless WebP beside it, or all of it in a .sog archive (zip).
+
+Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2; version 1,
+without a number in meta.json, is read as https://github.com/playcanvas/splat-transform does).
+
+- Frame: as ours (that of the PLY). A pixel is a Gaussian, row by row from the top.
+- means_l, means_u: low and high bytes of 16 bits between an axis's smallest and largest sign(x) ln(1 + |x|).
+- quats: w x y z, the largest component left out, 252 + its index in alpha, the others in steps of 1/180.
+- scales, sh0: bytes of a codebook of 256 natural logs, and of as many SH coefficients 0; alpha is the opacity in steps
+  of 1/255, and where it is 0 the colours are lost.
+- shN: a palette of up to 65,536 sets of coefficients, which are bytes of a third codebook; order and signs as ours.
+- Version 1 has ranges, cut in 255 steps, instead of codebooks, and opacity as a logit.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError, plain
+from clsplat.files import (
+    MAX_DOCUMENT,
+    atomic_write,
+    atomic_writer,
+    is_file,
+    native_name,
+    open_input,
+    parse_json,
+    read_document,
+    scratch_folder,
+    write_error,
+)
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.images.reading import error_of, open_image
+from clsplat.models.codec import values as packing
+from clsplat.models.codec.palette import codebook, nearest, palette
+
+NAME = "SOG"
+SUFFIXES = ("meta.json", ".sog")
+LOSES = "positions to 16 bits, the rest to 8, spherical harmonics to a palette"
+FLOAT = False
+
+Bytes = NDArray[np.uint8]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+Progress = Callable[[str, float | None], None]
+
+META = "meta.json"
+PICTURES = ("means", "quats", "scales", "sh0", "shN")
+"""Beginnings of the pictures' names that are written."""
+SH_PICTURES = ("shN_centroids.webp", "shN_labels.webp")
+MAX_PALETTE = 1 << 16
+PALETTE_COLUMNS = 64
+LARGEST_TAG = 252
+COEFFICIENTS = {degree: (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
+FREE_BYTES = 16 << 20
+"""Of a picture in an archive; beyond that 8 for each Gaussian, twice what its pixels have."""
+
+
+def recognises(head: bytes) -> bool:
+    """Whether a file begins as an archive, or as JSON."""
+    return head.startswith(b"PK\x03\x04") or head.lstrip()[:1] == b"{"
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """What meta.json says."""
+    with _opened(path) as files:
+        meta = files.meta()
+    return {"version": meta.get("version", 1), "antialiased": bool(meta.get("antialias", False))}
+
+
+def read(path: Path) -> Gaussians:
+    """Read a .sog, or a meta.json with its pictures, or the folder that has them. Raises InputError."""
+    with _opened(path) as files:
+        meta = _Meta(files, files.meta())
+        model = meta.gaussians()
+    packing.require_finite(path, model)
+    return model
+
+
+class _Files:
+    """The pictures beside a meta.json."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path / META if path.is_dir() else path
+        self.size = 0
+
+    def meta(self) -> dict[str, Any]:
+        return self.parsed(read_document(self.path, "SOG's meta.json"))
+
+    def parsed(self, text: str | bytes) -> dict[str, Any]:
+        try:
+            meta = parse_json(text)
+        except ValueError as error:
+            raise InputError(f"{self.path}: {META} does not parse ({error})") from None
+        if not isinstance(meta, dict) or "means" not in meta:
+            raise InputError(f"{self.path}: {META} has no means, expected that of a SOG model")
+        return meta
+
+    def file(self, name: str, limit: int) -> Path:  # noqa: ARG002  # an archive needs the limit
+        folder = Path(os.path.realpath(self.path)).parent
+        try:
+            found = Path(os.path.realpath(folder / name))
+        except ValueError:  # a zero byte
+            found = folder
+        if found.parent != folder:
+            raise InputError(f"{self.path}: has a picture {name[:80]!r}, expected one beside it")
+        if not is_file(found):
+            raise InputError(f"{self.path}: its picture {name} is missing")
+        self.size += found.stat().st_size
+        return found
+
+
+class _Archive(_Files):
+    """Those in a .sog, unpacked one by one into a folder for a while."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, folder: Path) -> None:
+        super().__init__(path)
+        self.archive, self.folder = archive, folder
+
+    def meta(self) -> dict[str, Any]:
+        return self.parsed(self.unpacked(META, MAX_DOCUMENT).read_bytes())
+
+    def file(self, name: str, limit: int) -> Path:
+        found = self.unpacked(name, limit)
+        self.size += found.stat().st_size
+        return found
+
+    def unpacked(self, name: str, limit: int) -> Path:
+        target = self.folder / f"file{META[-5:] if name == META else '.webp'}"
+        try:
+            with self.archive.open(name) as source, target.open("wb") as file:
+                left = limit
+                while block := source.read(min(1 << 20, left + 1)):
+                    left -= len(block)
+                    if left < 0:
+                        raise InputError(f"{self.path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
+                    _write(file, block, target)
+        except KeyError:
+            raise InputError(f"{self.path}: has no {name[:80]} in it") from None
+        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+            raise InputError(f"{self.path}: {name[:80]} does not unpack ({error}); is it damaged?") from None
+        return target
+
+
+def _write(file: BinaryIO, block: bytes, path: Path) -> None:
+    try:
+        file.write(block)
+        file.flush()  # here and not at the end, where it would seem that reading failed
+    except OSError as error:
+        raise write_error(path, error) from None
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Files]:
+    if path.is_dir() or path.name.lower().endswith(".json"):
+        yield _Files(path)
+        return
+    with open_input(path, "a .sog archive") as file, scratch_folder(0) as folder:
+        try:
+            archive = zipfile.ZipFile(file)
+        except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
+            raise InputError(f"{path}: is no .sog archive ({error})") from None
+        with archive:
+            yield _Archive(path, archive, folder)
+
+
+class _Meta:
+    """meta.json, and what it leads to."""
+
+    def __init__(self, files: _Files, meta: dict[str, Any]) -> None:
+        self.files, self.meta, self.path = files, meta, files.path
+        self.version = meta.get("version", 1)
+        if self.version not in (1, 2):
+            raise InputError(f"{self.path}: SOG version {str(self.version)[:20]}, expected 1 or 2")
+        shape = self.section("means").get("shape", [0])
+        count = meta.get("count") if self.version == 2 else shape[0] if isinstance(shape, list) and shape else 0
+        if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count < 1 << 32:
+            raise InputError(f"{self.path}: has {str(count)[:20]} Gaussians, expected at least one")
+        self.count = count
+        if meta.get("antialias"):
+            warnings.warn(
+                plain(f"{self.path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=4
+            )
+
+    def section(self, name: str) -> dict[str, Any]:
+        found = self.meta.get(name)
+        if not isinstance(found, dict):
+            raise InputError(f"{self.path}: {META} has no {name}")
+        return found
+
+    def numbers(self, section: str, key: str, least: int, most: int) -> NDArray[np.float64]:
+        value = self.section(section).get(key)
+        try:
+            found = np.atleast_1d(np.array(value, np.float64))
+        except (TypeError, ValueError, OverflowError):
+            found = np.empty(0)
+        if found.ndim != 1 or not least <= len(found) <= most or not np.isfinite(found).all():
+            raise InputError(f"{self.path}: {key} of {section} in {META} are not {least} numbers")
+        return found
+
+    def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
+        """(height, width, channels) of the bytes, with room for every Gaussian, or `least` pixels."""
+        names = self.section(section).get("files")
+        if not isinstance(names, list) or len(names) <= index or not isinstance(names[index], str):
+            raise InputError(f"{self.path}: {section} in {META} has no file {index}")
+        least = self.count if least is None else least
+        file = self.files.file(names[index], FREE_BYTES + 8 * least)
+        hints = oiio.ImageSpec()
+        hints.attribute("oiio:UnassociatedAlpha", 1)
+        try:
+            source = open_image(file, hints)
+            spec = source.spec()
+            pixels = spec.width * spec.height
+            if pixels < least or spec.nchannels < channels:
+                raise InputError(
+                    f"{file}: is {spec.width} x {spec.height} with {spec.nchannels} channels, expected at least "
+                    f"{least} pixels with {channels}"
+                )
+            found = source.read_image(oiio.UINT8)
+            reason = error_of(source)
+            source.close()
+            if found is None or reason:
+                raise InputError(f"{file}: does not decode: {reason or 'the decoder gives no reason'}")
+        except InputError as error:
+            raise InputError(str(error).replace(str(file), f"{self.path}: {names[index][:80]}", 1)) from None
+        return np.asarray(found).reshape(spec.height, spec.width, -1)[:, :, :channels]
+
+    def pixels(self, section: str, index: int, channels: int) -> Bytes:
+        return self.picture(section, index, channels).reshape(-1, channels)[: self.count]
+
+    def gaussians(self) -> Gaussians:
+        means = self.means()
+        quaternions = _unpacked_quaternions(self.pixels("quats", 0, 4))
+        scales = self.dequantised("scales", self.pixels("scales", 0, 3))
+        bytes_ = self.pixels("sh0", 0, 4)
+        if self.version == 2:
+            opacity_logits = packing.byte_logits()[bytes_[:, 3]]
+        else:
+            low, high = (self.numbers("sh0", key, 4, 4)[3] for key in ("mins", "maxs"))
+            opacity_logits = (low + (high - low) * (bytes_[:, 3] / 255)).astype(np.float32)
+        sh0 = self.dequantised("sh0", bytes_[:, :3])[:, None]
+        sh = np.concatenate([sh0, self.rest()], axis=1) if "shN" in self.meta else sh0
+        return Gaussians(means, quaternions, scales, opacity_logits, sh)
+
+    def means(self) -> Float32:
+        fine, coarse = (self.pixels("means", index, 3).astype(np.uint16) for index in (0, 1))
+        low, high = (self.numbers("means", key, 3, 3) for key in ("mins", "maxs"))
+        if not max(np.abs(low).max(), np.abs(high).max()) < 88:  # beyond, exp leaves float32
+            raise InputError(f"{self.path}: mins and maxs of means in {META} are too large")
+        folded = low + (high - low) * ((coarse << 8 | fine) / 65535)
+        return (np.sign(folded) * np.expm1(np.abs(folded))).astype(np.float32)
+
+    def dequantised(self, section: str, values: Bytes) -> Float32:
+        if self.version == 2:
+            entries = self.numbers(section, "codebook", 1, 256).astype(np.float32)
+            if int(values.max()) >= len(entries):
+                raise InputError(f"{self.path}: {section} has an index {values.max()} into {len(entries)} entries")
+            return entries[values]
+        width = {"scales": (3, 3), "sh0": (4, 4), "shN": (1, 1)}[section]
+        low, high = (self.numbers(section, key, *width)[:3] for key in ("mins", "maxs"))
+        return (low + (high - low) * (values / 255)).astype(np.float32)
+
+    def rest(self) -> Float32:
+        """Coefficients above 0, (n, K - 1, 3)."""
+        labels = self.pixels("shN", 1, 2).astype(np.uint32)
+        label = labels[:, 0] | labels[:, 1] << 8
+        needed = int(label.max()) + 1
+        table = self.picture("shN", 0, 3, least=needed)
+        width = table.shape[1] // PALETTE_COLUMNS
+        said = self.section("shN").get("bands") if self.version == 2 else None
+        bands = next((degree for degree, each in COEFFICIENTS.items() if each == width and degree), 0)
+        if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
+            raise InputError(f"{self.path}: shN's palette is {table.shape[1]} pixels wide for {str(said)[:20]} bands")
+        colours = table.reshape(-1, width, 3)
+        if needed > len(colours):
+            raise InputError(f"{self.path}: shN has an index {needed - 1} into a palette of {len(colours)}")
+        rest: Float32 = self.dequantised("shN", colours)[label]
+        return rest
+
+
+def _unpacked_quaternions(pixels: Bytes) -> Float32:
+    tag = pixels[:, 3].astype(np.int64) - LARGEST_TAG
+    three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
+    largest = np.sqrt(np.maximum(0, 1 - np.square(three).sum(axis=1)))
+    result = np.zeros((len(pixels), 4), np.float32)
+    result[tag < 0, 0] = 1  # no rotation, as the other reader has it
+    for index in range(4):
+        chosen = tag == index
+        result[np.ix_(chosen, [each for each in range(4) if each != index])] = three[chosen]
+        result[chosen, index] = largest[chosen]
+    return result
+
+
+def _no_progress(stage: str, part: float | None = None) -> None:
+    """Nobody listens."""
+
+
+def write(
+    path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool = False, progress: Progress = _no_progress
+) -> None:
+    """Write version 2: a .sog archive, or a meta.json with its pictures beside it, which are there before it is.
+
+    iterations: of k-means for the palette. sort: by place (Morton's order), so that the pictures compress better; the
+    Gaussians come back in that order. progress: hears what is made, and what part of it is there. Means count from the
+    world's origin: far from it they lose more. The same Gaussians give the same values. Raises InputError for values
+    that are not finite.
+    """
+    gaussians.check()
+    packing.require_finite(path, gaussians, writing=True)
+    if not len(gaussians):
+        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    with scratch_folder(_room(len(gaussians))) as folder:
+        order = packing.morton_order(gaussians.means) if sort else slice(None)
+        meta = _pictures(folder, gaussians, order, iterations, progress)
+        text = json.dumps(meta, separators=(",", ":")).encode()
+        files = sorted(folder.iterdir())
+        if path.name.lower().endswith(".json"):
+            for each in files:
+                with atomic_writer(path.with_name(each.name), each.stat().st_size) as file, each.open("rb") as source:
+                    shutil.copyfileobj(source, file)
+            atomic_write(path, text)
+            for name in {*SH_PICTURES} - {each.name for each in files}:  # of a model that had more SH
+                path.with_name(name).unlink(missing_ok=True)
+            return
+        total = sum(each.stat().st_size for each in files)
+        with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:  # stored: WebP is compressed
+            archive.writestr(zipfile.ZipInfo(META), text)
+            for each in files:
+                archive.writestr(zipfile.ZipInfo(each.name), each.read_bytes())
+
+
+def _room(count: int) -> int:
+    """More bytes than the pictures have: the encoder of WebP crashes where there is no room."""
+    return 24 * count + 64 * min(count, MAX_PALETTE) + (1 << 16)
+
+
+def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, progress: Progress) -> dict[str, Any]:
+    """Write them, and give meta.json."""
+    count = len(gaussians)
+    width = 4 * math.ceil(math.sqrt(count) / 4)
+    height = 4 * math.ceil(count / width / 4)
+
+    def picture(name: str, columns: list[Bytes]) -> str:
+        pixels = np.zeros((height * width, sum(each.shape[1] for each in columns)), np.uint8)
+        pixels[:count] = np.concatenate(columns, axis=1)
+        _write_webp(folder / name, pixels.reshape(height, width, -1))
+        return name
+
+    world = packing.world_means(gaussians)[order]
+    folded = np.sign(world) * np.log1p(np.abs(world))
+    low, high = folded.min(axis=0), folded.max(axis=0)
+    steps = np.rint((folded - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
+    means = [
+        picture(f"means_{half}.webp", [(steps >> shift & 255).astype(np.uint8)]) for half, shift in (("l", 0), ("u", 8))
+    ]
+    log_scales, sh0 = gaussians.log_scales[order], gaussians.sh[order, 0]
+    scale_codes, colour_codes = codebook(log_scales), codebook(sh0)
+    opacity = packing.to_bytes(packing.opacities(gaussians.opacity_logits[order]))
+    quats = _packed_quaternions(packing.unit_quaternions(gaussians.quaternions[order]))
+    scales = picture("scales.webp", [_indices(scale_codes, log_scales)])
+    colours = picture("sh0.webp", [_indices(colour_codes, sh0), opacity[:, None]])
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "clsplat"},
+        "count": count,
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": means},
+        "scales": {"codebook": scale_codes.tolist(), "files": [scales]},
+        "quats": {"files": [picture("quats.webp", [quats])]},
+        "sh0": {"codebook": colour_codes.tolist(), "files": [colours]},
+    }
+    if gaussians.sh_degree:
+        rest = gaussians.sh[order, 1:]
+        meta["shN"] = _palette(folder, rest, picture, iterations, gaussians.sh_degree, progress)
+    return meta
+
+
+def _palette(
+    folder: Path,
+    rest: Float32,
+    picture: Callable[[str, list[Bytes]], str],
+    iterations: int,
+    bands: int,
+    progress: Progress,
+) -> dict[str, Any]:
+    count, width = rest.shape[:2]
+    size = min(MAX_PALETTE, 1 << (count.bit_length() - 1))
+    stage = f"SOG: {size:,} sets of SH coefficients for {count:,} Gaussians"
+    progress(stage, 0.0)
+    sets, labels = palette(rest.reshape(count, -1), size, iterations, lambda part: progress(stage, part))
+    entries = codebook(sets)
+    rows = -(-size // PALETTE_COLUMNS)
+    table = np.zeros((rows * PALETTE_COLUMNS, width, 3), np.uint8)
+    table[:size] = _indices(entries, sets).reshape(size, width, 3)
+    centroids, marks = SH_PICTURES
+    _write_webp(folder / centroids, table.reshape(rows, PALETTE_COLUMNS * width, 3))
+    halves = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)
+    files = [centroids, picture(marks, [halves])]
+    return {"count": size, "bands": bands, "codebook": entries.tolist(), "files": files}
+
+
+def _indices(entries: Float32, values: Float32) -> Bytes:
+    return nearest(entries, values).astype(np.uint8)
+
+
+def _packed_quaternions(unit: Float64) -> Bytes:
+    largest = np.abs(unit).argmax(axis=1)
+    sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1, 1)
+    others = np.array([[each for each in range(4) if each != index] for index in range(4)])[largest]
+    three = np.take_along_axis(unit, others, axis=1) * sign
+    steps = np.rint(np.clip(three * 2**0.5 * 0.5 + 0.5, 0, 1) * 255)
+    return np.column_stack([steps, largest + LARGEST_TAG]).astype(np.uint8)
+
+
+def _write_webp(path: Path, pixels: Bytes) -> None:
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
+    spec.attribute("compression", "lossless")
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # or colours would be divided by alpha
+    name = native_name(path)
+    output = oiio.ImageOutput.create(name)
+    if output is None or not output.open(name, spec) or not output.write_image(pixels) or not output.close():
+        raise OSError(f"{path.name}: OpenImageIO cannot write it: {error_of(output or oiio)}")

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""antimatter15's .splat: 32 bytes a Gaussian, little-endian, no header.
+
+https://github.com/antimatter15/splat (convert.py and main.js). A record: position, 3 float32, in the frame of the PLY;
+scale, 3 float32, standard deviations, not logs; red, green, blue, opacity, 4 bytes; quaternion w x y z, 4 bytes,
+128 (q + 1) of a unit one. Colour is that of SH coefficient 0, cut to 0 to 1: there are no further coefficients.
+The order is ours: other writers sort by size and opacity.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.errors import InputError
+from clsplat.files import atomic_writer, open_input
+from clsplat.gaussians import Gaussians
+from clsplat.models.codec import values
+from clsplat.models.codec.values import BLOCK_ROWS
+
+NAME = "splat"
+SUFFIXES = (".splat",)
+FLOAT = False
+LOSES = "SH beyond degree 0; colour, opacity and rotation to 8 bits, colour beyond 0 to 1"
+MAX_SH_DEGREE = 0
+UNIT_SLACK = 0.1
+"""Bytes make unit quaternions longer by 0.02 at most."""
+
+ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quaternions", "u1", 4)])
+
+
+def read(path: Path) -> Gaussians:
+    """Read it. Raises InputError: no whole number of records, none, values that are not finite, negative scales."""
+    with open_input(path, "a .splat file") as file:
+        size = os.fstat(file.fileno()).st_size
+        count, over = divmod(size, ROW.itemsize)
+        if over or not count:
+            raise InputError(f"{path}: has {size} bytes, expected some Gaussians of {ROW.itemsize} bytes each")
+        _check_first(values.read_rows(file, ROW, min(BLOCK_ROWS, count), path), path)
+        file.seek(0)
+        found = values.empty(count, 0)
+        for start in range(0, count, BLOCK_ROWS):
+            block = values.read_rows(file, ROW, min(BLOCK_ROWS, count - start), path)
+            rows = slice(start, start + len(block))
+            found.means[rows] = block["means"]
+            found.log_scales[rows] = values.log_scales(block["scales"], path, start)
+            found.sh[rows, 0] = values.coefficients(block["rgba"][:, :3] / 255)
+            found.opacity_logits[rows] = values.byte_logits()[block["rgba"][:, 3]]
+            found.quaternions[rows] = block["quaternions"].astype(np.float32) / 128 - 1
+    values.require_finite(path, found)
+    return found
+
+
+def _check_first(block: Any, path: Path) -> None:
+    """Raise InputError where most of these have no rotation: there is no header to tell what else this might be."""
+    lengths = np.linalg.norm(block["quaternions"].astype(np.float32) / 128 - 1, axis=1)
+    if np.median(lengths) > 1 + UNIT_SLACK:
+        raise InputError(f"{path}: not a .splat file (rotations of length {np.median(lengths):.2f}, expected 1)")
+
+
+def write(path: Path, gaussians: Gaussians) -> None:
+    """Write it, atomically."""
+    gaussians.check()
+    values.require_finite(path, gaussians, writing=True)
+    with atomic_writer(path, ROW.itemsize * len(gaussians)) as file:
+        for start in range(0, len(gaussians), BLOCK_ROWS):
+            rows = slice(start, start + BLOCK_ROWS)
+            block: Any = np.empty(len(gaussians.means[rows]), ROW)
+            block["means"] = values.world_means(gaussians, rows)
+            with np.errstate(over="ignore"):  # a scale beyond float32 is cut
+                scales = np.exp(gaussians.log_scales[rows].astype(np.float64))
+            block["scales"] = np.minimum(scales, np.finfo(np.float32).max)
+            block["rgba"][:, :3] = values.to_bytes(values.colours(gaussians.sh[rows, 0]))
+            block["rgba"][:, 3] = values.to_bytes(values.opacities(gaussians.opacity_logits[rows]))
+            unit = values.unit_quaternions(gaussians.quaternions[rows])
+            block["quaternions"] = np.clip(np.rint(unit * 128 + 128), 0, 255)
+            file.write(block.tobytes())

@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SPZ, Niantic's compressed models: versions 2, 3 (gzip) and 4 (a Zstandard stream for each attribute).
+
+Specification: https://github.com/nianticlabs/spz (README.md and src/cc/load-spz.cc). Attributes one after another, each
+for all Gaussians: positions, alphas, colours, scales, rotations, spherical harmonics.
+
+- Frame: x right, y up, z backward (RUB); an extension of Adobe's may name another, which is honoured. Ours is half a
+  turn about x away. Other extensions are passed over.
+- Positions: 24-bit fixed point with `fractional_bits` after the point.
+- Alphas: opacity in steps of 1/255. Colours: SH coefficient 0 in steps of 1/38.25, within +-3.33.
+- Scales: natural logs in steps of 1/16, -10 to 5.94.
+- Rotations: x y z w. Version 2: x y z in steps of 1/127.5 where w is positive. From version 3: the largest component is
+  left out, its index in 2 bits, the others in 10 (a sign, and steps of 1/723).
+- SH: order and signs as ours, red green blue of each coefficient together, in steps of 1/128 within +-1, of which
+  writers keep fewer bits so that they compress.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import struct
+import warnings
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError, plain
+from clsplat.files import atomic_writer, open_input
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.models.codec import spz_bytes, values
+from clsplat.models.codec.axes import UP_BACK, Signs, flip, quaternion_signs, sh_signs
+from clsplat.models.codec.values import BLOCK_ROWS
+
+NAME = "SPZ"
+SUFFIXES = (".spz",)
+LOSES = "positions to 24 bits fixed point, the rest to 8 or 10 bits, spherical harmonics to 6"
+FLOAT = False
+
+MAGIC = b"NGSP"
+VERSIONS = (2, 3, 4)
+DEFAULT_VERSION = 4
+"""What the format's library and splat-transform write."""
+SH_BITS = (6, 6)
+"""Of band 1, and of those above. The format's library keeps 5 and 4: files a fifth smaller, and a trained model of
+strong view dependence 11 dB worse, at 36 (docs/formats.md). Readers need not know."""
+ANTIALIASED, HAS_EXTENSIONS = 1, 2
+COORDINATE_SYSTEM = 0xADBE0003
+FRAMES: tuple[Signs, ...] = (
+    *(UP_BACK, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), UP_BACK),  # unspecified, LDB, RDB, LUB, RUB
+    *((-1, 1, 1), (1, 1, 1), (-1, -1, 1), (1, -1, 1)),  # LDF, RDF, LUF, RUF
+)
+"""Between ours and each value of that extension; those after these have z up."""
+MAX_EXTENSIONS = 1 << 20
+MAX_WINDOW = 1 << 27
+"""Bytes that a Zstandard frame may have the decoder keep: the library's own limit."""
+COLOUR_SCALE = 0.15 * 255
+
+
+class Stream(Protocol):
+    def readinto(self, buffer: memoryview, /) -> int | None: ...
+
+
+@dataclass(frozen=True)
+class Header:
+    version: int
+    count: int
+    degree: int
+    fractional_bits: int
+    flags: int
+    streams: int = 0
+    table: int = 0
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Bytes that a Gaussian has of each attribute, in the file's order."""
+        rest = 3 * (self.degree * (self.degree + 2))
+        rotations = 3 if self.version == 2 else 4
+        return {"positions": 9, "alphas": 1, "colours": 3, "scales": 3, "rotations": rotations, "sh": rest}
+
+
+def recognises(head: bytes) -> bool:
+    """Whether a file begins as one of this format."""
+    if head[:2] != b"\x1f\x8b":
+        return head.startswith(MAGIC)
+    try:
+        return zlib.decompressobj(31).decompress(head, 4) == MAGIC
+    except zlib.error:
+        return False
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """What the header says."""
+    with open_input(path, "an SPZ file") as file:
+        header, _ = _open(file, os.fstat(file.fileno()).st_size, path)
+    antialiased = bool(header.flags & ANTIALIASED)
+    return {"version": header.version, "fractional_bits": header.fractional_bits, "antialiased": antialiased}
+
+
+def read(path: Path) -> Gaussians:
+    """Read an SPZ file; SH of degree 4 lose their fourth band. Raises InputError."""
+    with open_input(path, "an SPZ file") as file:
+        return read_from(file, os.fstat(file.fileno()).st_size, path)
+
+
+def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
+    """Read what an SPZ file of `size` bytes has from the beginning of `file`; `path` is for messages."""
+    header, stream = _open(file, size, path)
+    values.require_count(path, header.count, size)
+    if header.degree > MAX_SH_DEGREE:
+        warnings.warn(
+            plain(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out"), stacklevel=3
+        )
+    if header.flags & ANTIALIASED:
+        warnings.warn(plain(f"{path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=3)
+    result = values.empty(header.count, min(header.degree, MAX_SH_DEGREE))
+    if header.version == 4:
+        signs = _frame(_records(file.read(header.table - 32), path), path) if header.flags & HAS_EXTENSIONS else UP_BACK
+        _unpack(_zstd_streams(file, header, size, path), header, signs, result, path)
+        return result
+    assert stream is not None
+    _unpack(((name, stream) for name, width in header.widths.items() if width), header, UP_BACK, result, path)
+    behind = _rest(stream, path)
+    if header.flags & HAS_EXTENSIONS and (signs := _frame(_records(behind, path), path)) != UP_BACK:
+        flip(result, (signs[0] * UP_BACK[0], signs[1] * UP_BACK[1], signs[2] * UP_BACK[2]))
+    elif behind and not header.flags & HAS_EXTENSIONS:
+        warnings.warn(plain(f"{path}: bytes after the last Gaussian ignored"), stacklevel=3)
+    return result
+
+
+def _open(file: BinaryIO, size: int, path: Path) -> tuple[Header, Any]:
+    """The header; and up to version 3 what is to be read on from, behind it."""
+    head = file.read(32)
+    if head[:4] == MAGIC and head[4:8] == struct.pack("<I", 4):
+        if len(head) < 32:
+            raise InputError(f"{path}: truncated: {len(head)} bytes, expected a header of 32")
+        header = Header(4, *struct.unpack("<IBBBBI", head[8:20]))
+        _check(header, path)
+        expected = sum(width > 0 for width in header.widths.values())
+        if header.streams != expected:
+            raise InputError(f"{path}: SPZ has {header.streams} streams, expected {expected}")
+        if not 32 <= header.table <= min(32 + MAX_EXTENSIONS, size - 16 * expected):
+            raise InputError(f"{path}: SPZ's table of streams is at byte {header.table} of {size}; is it damaged?")
+        return header, None
+    if head[:2] == b"\x1f\x8b":
+        file.seek(0)
+        stream: Any = gzip.GzipFile(fileobj=file, mode="rb")
+    elif head[:4] == MAGIC:
+        file.seek(0)
+        stream = file
+    else:
+        raise InputError(f"{path}: not an SPZ file (it begins with neither gzip's signature nor NGSP)")
+    start = bytearray(16)
+    _fill(stream, memoryview(start), path, "the header")
+    if start[:4] != MAGIC:
+        raise InputError(f"{path}: not an SPZ file (a gzip file of something else)")
+    header = Header(*struct.unpack("<IIBBB", start[4:15]))
+    _check(header, path)
+    return header, stream
+
+
+def _check(header: Header, path: Path) -> None:
+    if header.version not in VERSIONS:
+        raise InputError(f"{path}: SPZ version {header.version}, expected 2, 3 or 4")
+    if header.degree > 4:
+        raise InputError(f"{path}: SPZ has SH of degree {header.degree}, expected 0 to 4")
+    if header.fractional_bits > 31:
+        raise InputError(f"{path}: SPZ has {header.fractional_bits} fractional bits, expected at most 31")
+
+
+def _records(data: bytes, path: Path) -> dict[int, bytes]:
+    """Extensions by their type: type and length of 32 bits each, and then so many bytes."""
+    found, at = {}, 0
+    while len(data) - at >= 8:
+        kind, length = struct.unpack_from("<II", data, at)
+        if length > len(data) - at - 8:
+            raise InputError(f"{path}: truncated: SPZ extension {kind:#x} of {length} bytes")
+        found[kind] = data[at + 8 : at + 8 + length]
+        at += 8 + length
+    return found
+
+
+def _frame(records: dict[int, bytes], path: Path) -> Signs:
+    if len(found := records.get(COORDINATE_SYSTEM, b"")) != 4:
+        return UP_BACK
+    (value,) = struct.unpack("<I", found)
+    if value >= len(FRAMES):
+        raise InputError(f"{path}: SPZ in the coordinate system {value}, expected one with y up or down (0 to 8)")
+    return FRAMES[value]
+
+
+class _Slice(io.BytesIO):
+    """The next `left` bytes of a file."""
+
+    def __init__(self, file: BinaryIO, left: int) -> None:
+        super().__init__()
+        self.file, self.left = file, left
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = self.file.read(self.left if size is None or size < 0 else min(size, self.left))
+        self.left -= len(data)
+        return data
+
+
+def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iterator[tuple[str, Stream]]:
+    import zstandard
+
+    file.seek(header.table)
+    table = file.read(16 * header.streams)
+    at = header.table + len(table)
+    names = [name for name, width in header.widths.items() if width]
+    for name, (packed, unpacked) in zip(names, struct.iter_unpack("<QQ", table), strict=True):
+        wanted = header.count * header.widths[name]
+        if packed > size - at:
+            raise InputError(f"{path}: truncated: {name} have {packed} bytes, {size - at} are there")
+        if unpacked != wanted:
+            raise InputError(f"{path}: {name} have {unpacked} bytes unpacked, expected {wanted}")
+        file.seek(at)
+        at += packed
+        decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
+        with decompressor.stream_reader(_Slice(file, packed), read_size=1 << 18) as stream:
+            yield name, stream
+            if _rest(stream, path):
+                raise InputError(f"{path}: {name} have more than {wanted} bytes unpacked")
+    if at != size:
+        warnings.warn(plain(f"{path}: {size - at} bytes after the last Gaussian ignored"), stacklevel=5)
+
+
+def _fill(stream: Stream, buffer: memoryview, path: Path, what: str) -> None:
+    import zstandard
+
+    at = 0
+    try:
+        while at < len(buffer):
+            got = stream.readinto(buffer[at:])
+            if not got:
+                raise EOFError
+            at += got
+    except EOFError:
+        raise InputError(f"{path}: truncated within {what}") from None
+    except (zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as error:
+        raise InputError(f"{path}: does not decompress within {what} ({error}); is it damaged?") from None
+
+
+def _rest(stream: Any, path: Path) -> bytes:
+    """What follows the Gaussians, a little of it; gzip checks its sum at the end."""
+    import zstandard
+
+    try:
+        return bytes(stream.read(MAX_EXTENSIONS))
+    except EOFError:
+        raise InputError(f"{path}: truncated at its end") from None
+    except (zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as error:
+        raise InputError(f"{path}: does not decompress to its end ({error}); is it damaged?") from None
+
+
+def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs, result: Gaussians, path: Path) -> None:
+    buffer = bytearray(BLOCK_ROWS * max(header.widths.values()))
+    alpha_logits = values.byte_logits()
+    # as wide as the array: NumPy is several times slower where the last axis is short
+    sh_factor = np.repeat(sh_signs(signs)[1 : result.sh.shape[1], None] / np.float32(128), 3, axis=1)
+    for name, stream in streams:
+        width = header.widths[name]
+        for first in range(0, header.count, BLOCK_ROWS):
+            rows = slice(first, min(first + BLOCK_ROWS, header.count))
+            view = memoryview(buffer)[: (rows.stop - first) * width]
+            _fill(stream, view, path, f"its {name}")
+            block = np.frombuffer(view, np.uint8).reshape(-1, width)
+            match name:
+                case "positions":
+                    result.means[rows] = spz_bytes.fixed(block) * _means_factor(header, signs)
+                case "alphas":
+                    result.opacity_logits[rows] = alpha_logits[block[:, 0]]
+                case "colours":
+                    result.sh[rows, 0] = (block - np.float32(127.5)) * np.float32(1 / COLOUR_SCALE)
+                case "scales":
+                    result.log_scales[rows] = block * np.float32(1 / 16) - np.float32(10)
+                case "rotations":
+                    unpack = spz_bytes.first_three if width == 3 else spz_bytes.smallest_three
+                    result.quaternions[rows] = unpack(block) * quaternion_signs(signs)
+                case _:
+                    kept = result.sh.shape[1]
+                    rest = result.sh[rows, 1:]
+                    np.subtract(block.reshape(len(block), -1, 3)[:, : kept - 1], np.float32(128), out=rest)
+                    rest *= sh_factor
+
+
+def _means_factor(header: Header, signs: Signs) -> NDArray[np.float32]:
+    return np.array(signs, np.float32) * np.float32(0.5**header.fractional_bits)
+
+
+def write(
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    version: int = DEFAULT_VERSION,
+    fractional_bits: int | None = None,
+    sh_bits: tuple[int, int] = SH_BITS,
+    antialiased: bool = False,
+) -> None:
+    """Write an SPZ file, atomically; the same Gaussians give the same bytes.
+
+    fractional_bits: of positions; by default 12, as the format's library has it, more for a model so small that this
+    would be coarse, fewer for one that does not fit. sh_bits: of band 1 and of those above, 1 to 8. Means count from
+    the world's origin: far from it they lose more. Raises InputError for values that are not finite or positions that
+    no number of bits holds, ValueError for settings out of range.
+    """
+    if version not in VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
+        raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
+    gaussians.check()
+    values.require_finite(path, gaussians, writing=True)
+    header = header_for(path, gaussians, version, fractional_bits, ANTIALIASED if antialiased else 0)
+    with atomic_writer(path) as file:
+        write_to(file, gaussians, header, sh_bits)
+
+
+def header_for(
+    path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None, flags: int = 0
+) -> Header:
+    """What `write_to` is to write. Raises InputError for positions that do not fit, and for no Gaussians."""
+    if not len(gaussians):
+        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    bits = _fractional_bits(path, gaussians, fractional_bits)
+    return Header(version, len(gaussians), gaussians.sh_degree, bits, flags)
+
+
+def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tuple[int, int] = SH_BITS) -> None:
+    """Write what an SPZ file has into a file that can seek, from where it is."""
+    if header.version < 4:
+        fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
+        with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:
+            stream.write(MAGIC + struct.pack("<IIBBBB", *fields))
+            for name in (name for name, width in header.widths.items() if width):
+                _pack(name, gaussians, header, sh_bits, stream.write)
+        return
+    import zstandard
+
+    names = [name for name, width in header.widths.items() if width]
+    numbers = (4, header.count, header.degree, header.fractional_bits, header.flags, len(names), 32)
+    file.write(MAGIC + struct.pack("<IIBBBBI12x", *numbers))
+    table = file.tell()
+    file.write(bytes(16 * len(names)))
+    sizes = b""
+    for name in names:
+        start, size = file.tell(), header.count * header.widths[name]
+        compressor = zstandard.ZstdCompressor(level=9)
+        with compressor.stream_writer(file, size=size, closefd=False) as stream:
+            _pack(name, gaussians, header, sh_bits, stream.write)
+        sizes += struct.pack("<QQ", file.tell() - start, size)
+    end = file.tell()
+    file.seek(table)
+    file.write(sizes)
+    file.seek(end)
+
+
+def _fractional_bits(path: Path, gaussians: Gaussians, wanted: int | None) -> int:
+    """As many as asked for, if the positions fit; or by the model's size, without its farthest hundredth."""
+    low, high = (
+        values.world_means(gaussians, rows) for rows in (gaussians.means.argmin(axis=0), gaussians.means.argmax(axis=0))
+    )
+    largest = max(float(np.abs(low).max()), float(np.abs(high).max()))
+    fits = 23 - max(0, int(np.ceil(np.log2(largest + 1e-30)))) if largest > 1 else 23
+    while fits >= 0 and round(largest * 2**fits) >= 1 << 23:
+        fits -= 1
+    if fits < 0 or (wanted is not None and wanted > fits):
+        raise InputError(
+            f"{path}: cannot be written: positions of up to {largest:g} do not fit into 24 bits"
+            + (f" with {wanted} after the point" if wanted is not None else "")
+        )
+    if wanted is not None:
+        if wanted < 0:
+            raise ValueError(f"fractional_bits {wanted}: expected 0 to 23")
+        return wanted
+    spread = np.quantile(np.abs(gaussians.means - np.median(gaussians.means, axis=0)).max(axis=1), 0.99)
+    # 2^-12 for a model of 16 units; the same share of a smaller one
+    return min(fits, max(12, 16 - int(np.ceil(np.log2(max(float(spread), 1e-6))))))
+
+
+def _pack(
+    name: str, gaussians: Gaussians, header: Header, sh_bits: tuple[int, int], write: Callable[[bytes], object]
+) -> None:
+    for first in range(0, header.count, BLOCK_ROWS):
+        rows = slice(first, first + BLOCK_ROWS)
+        match name:
+            case "positions":
+                data = spz_bytes.to_fixed(values.world_means(gaussians, rows) * UP_BACK * 2.0**header.fractional_bits)
+            case "alphas":
+                data = values.to_bytes(values.opacities(gaussians.opacity_logits[rows]))
+            case "colours":
+                data = spz_bytes.to_byte(gaussians.sh[rows, 0] * np.float32(COLOUR_SCALE) + np.float32(127.5))
+            case "scales":
+                data = spz_bytes.to_byte((gaussians.log_scales[rows] + np.float32(10)) * np.float32(16))
+            case "rotations":
+                unit = values.unit_quaternions(gaussians.quaternions[rows]).astype(np.float32) * quaternion_signs(
+                    UP_BACK
+                )
+                data = spz_bytes.to_first_three(unit) if header.version == 2 else spz_bytes.to_smallest_three(unit)
+            case _:
+                data = spz_bytes.to_sh(gaussians.sh[rows, 1:], sh_bits)
+        write(data.tobytes())

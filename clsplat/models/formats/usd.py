@@ -1,0 +1,294 @@
+# SPDX-License-Identifier: Apache-2.0
+"""OpenUSD's ParticleField3DGaussianSplat, through usd-core (an optional extra): .usd, .usda, .usdc and .usdz.
+
+Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html, in OpenUSD from
+26.03; a release without the schema writes the same prim with the same attributes.
+
+- Frame: the numbers in the stage are the model's world, as they are for cameras (clsplat/shots/usd.py): the world is
+  not turned to the stage's upAxis, nor scaled to its metersPerUnit. What is read goes through the prims' transforms. An
+  `origin` is the translation of the prim above.
+- Values are float32 (half is read too): linear scales, opacities in [0, 1], unit quaternions, SH coefficients by
+  Gaussian, order and signs as ours.
+- Hints: perspective projection, sorted by depth along the camera's axis, as this renderer does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError, plain
+from clsplat.files import atomic_writer, native_name, open_input, scratch_folder
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.models.codec import axes
+from clsplat.models.codec import values as packing
+from clsplat.models.edit import merge
+
+NAME = "OpenUSD"
+SUFFIXES = (".usda", ".usdc", ".usdz", ".usd")
+LOSES = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
+FLOAT = True
+
+TYPE = "ParticleField3DGaussianSplat"
+TYPES = (TYPE, "ParticleField_3DGaussianSplat")
+"""The second is what a draft, and Nuke 17.0, called it."""
+COEFFICIENTS, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
+MOST_LEVELS = 5000
+"""Braces in a text: under 20,000 levels of prims USD's stack of 8 MiB is enough."""
+WORLD, PRIM = "/World", "/World/Gaussians"
+
+Float32 = NDArray[np.float32]
+
+
+def _pxr(path: Path) -> Any:
+    try:
+        import pxr.Usd
+    except ImportError:
+        raise InputError(f"{path}: USD needs usd-core, expected it installed: pip install 'clsplat[usd]'") from None
+    return pxr
+
+
+def recognises(head: bytes) -> bool:
+    """Whether a file begins as text or binary of USD, or as an archive, which a .usdz is."""
+    return head.startswith((b"#usda", b"PXR-USDC", b"PK\x03\x04"))
+
+
+def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **arguments: Any) -> None:
+    """Raise InputError where there is no usd-core or no such file, and where a process that makes the `call`
+    (MODULE:FUNCTION, with the path and these arguments) does not live to its end: USD's library follows what a damaged
+    binary file says to anywhere, and so deep into a file that its stack ends."""
+    _pxr(path)
+    with open_input(path, "a USD stage") as file:
+        alone, found = _stands_alone(file), os.fstat(file.fileno())
+    words = json.dumps(arguments)
+    if not (alone or _lives(call, words, os.path.realpath(path), found.st_mtime_ns, found.st_size)):
+        raise InputError(f"{path}: USD's library crashes when it reads it; is it damaged, or a file that it refers to?")
+
+
+def _stands_alone(file: BinaryIO) -> bool:
+    """Whether it is text that refers to no other file, of few levels: USD reads that without harm."""
+    if file.read(5) != b"#usda":
+        return False
+    levels = 0
+    while block := file.read(1 << 20):
+        levels += block.count(b"{")
+        if b"@" in block or levels > MOST_LEVELS:
+            return False
+    return True
+
+
+@lru_cache(maxsize=32)
+def _lives(call: str, arguments: str, path: str, *_: int) -> bool:
+    module, function = call.split(":")
+    code = (
+        f"import json, sys; sys.path[:] = {sys.path!r}; from pathlib import Path; from {module} import {function}; "
+        f"{function}(Path(sys.argv[1]), **json.loads(sys.argv[2]))"
+    )
+    words = [sys.executable, "-c", code, path, arguments]
+    done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    return done.returncode in (0, 1)  # 1: an error, which this process will find itself
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """What the stage says of its axes and units, which move nothing here."""
+    survive(path)
+    stage = _open(path)
+    from pxr import UsdGeom
+
+    with readable(path):
+        return {"up_axis": str(UsdGeom.GetStageUpAxis(stage)), "meters_per_unit": UsdGeom.GetStageMetersPerUnit(stage)}
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Raises InputError for what USD's bindings raise for the names and values of a damaged file."""
+    from pxr import Tf
+
+    try:
+        yield
+    except (Tf.ErrorException, UnicodeDecodeError, TypeError, ValueError, RuntimeError):
+        raise InputError(f"{path}: has values that USD cannot read; is it damaged?") from None
+
+
+def _open(path: Path) -> Any:
+    """The stage, without payloads, all of whose layers are in the file's folder or below it."""
+    from pxr import Ar, Tf, Usd, UsdUtils
+
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
+    try:
+        stage = Usd.Stage.Open(native_name(os.path.realpath(path)), Usd.Stage.LoadNone)
+    except Tf.ErrorException:
+        stage = None
+    if stage is None:
+        raise InputError(f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more")
+    folder = Path(os.path.realpath(path)).parent
+    for layer in stage.GetUsedLayers():
+        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # of a layer in a .usdz, the .usdz
+        if file and not Path(os.path.realpath(file)).is_relative_to(folder):
+            raise InputError(f"{path}: refers to {layer.realPath}, expected layers in the same folder or below it")
+    del diagnostics
+    return stage
+
+
+def read(path: Path) -> Gaussians:
+    """Read every prim of Gaussians of a stage, at its first time, as one model. Raises InputError."""
+    survive(path)
+    return read_here(path)
+
+
+def read_here(path: Path) -> Gaussians:
+    """`read` of a file that is known not to end the process."""
+    stage = _open(path)
+    from pxr import Usd, UsdGeom
+
+    time = Usd.TimeCode.EarliestTime()
+    transforms = UsdGeom.XformCache(time)
+    parts = []
+    with readable(path):
+        for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+            if prim.GetTypeName() not in TYPES:
+                continue
+            where = f"{path}: {prim.GetPath()}"
+            part = _gaussians(where, prim, time)
+            # USD's vectors are rows, so its matrices are the transposes of ours
+            matrix = np.array(transforms.GetLocalToWorldTransform(prim), np.float64).T
+            parts.append(axes.place(part, matrix, where))
+    if not parts:
+        raise InputError(f"{path}: has no {TYPE} in it, expected at least one")
+    model = merge(parts)
+    packing.require_finite(path, model)
+    return model
+
+
+def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int | None) -> Float32 | None:
+    """(count, width), from the attribute of floats or that of halves; None where neither has a value."""
+    for each in (name, f"{name}h"):
+        attribute = prim.GetAttribute(each)
+        value = attribute.Get(time) if attribute else None
+        if value is not None:
+            found = np.asarray(value)
+            if found.size % width or not np.issubdtype(found.dtype, np.floating):
+                raise InputError(f"{where}: {each} are {found.dtype} {found.shape}, expected rows of {width} numbers")
+            rows = found.reshape(-1, width)
+            if count is not None and len(rows) < count:
+                raise InputError(f"{where}: has {len(rows)} {each}, expected {count}")
+            return rows[:count].astype(np.float32)
+    return None
+
+
+def _gaussians(where: str, prim: Any, time: Any) -> Gaussians:
+    means = _array(where, prim, "positions", time, 3, None)
+    if means is None or not len(means):
+        raise InputError(f"{where}: has no positions, expected at least one")
+    count = len(means)
+    degree = prim.GetAttribute(DEGREE).Get() if prim.GetAttribute(DEGREE) else 3
+    if not isinstance(degree, int) or not 0 <= degree <= 16:
+        raise InputError(f"{where}: {DEGREE} is {degree!r}, expected 0 to {MAX_SH_DEGREE}")
+    coefficients = (degree + 1) ** 2
+    sh = _array(where, prim, COEFFICIENTS, time, 3, count * coefficients)
+    if sh is None:
+        raise InputError(f"{where}: lacks {COEFFICIENTS}")
+    sh = sh.reshape(count, coefficients, 3)
+    if degree > MAX_SH_DEGREE:
+        warnings.warn(plain(f"{where}: SH of degree {degree}, those above {MAX_SH_DEGREE} left out"), stacklevel=3)
+        sh = np.ascontiguousarray(sh[:, : (MAX_SH_DEGREE + 1) ** 2])
+    # what the schema says where an attribute is absent: no rotation, unit scale, opaque
+    quaternions = _array(where, prim, "orientations", time, 4, count)
+    scales = _array(where, prim, "scales", time, 3, count)
+    opacity = _array(where, prim, "opacities", time, 1, count)
+    if opacity is not None and not ((opacity >= 0) & (opacity <= 1)).all():
+        raise InputError(f"{where}: has an opacity outside [0, 1]")
+    return Gaussians(
+        means,
+        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+        if quaternions is None
+        else quaternions[:, [3, 0, 1, 2]],
+        np.zeros((count, 3), np.float32) if scales is None else packing.log_scales(scales, where, 0).astype(np.float32),
+        packing.logits(np.ones(count, np.float32) if opacity is None else opacity[:, 0]),
+        sh,
+    )
+
+
+def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_unit: float = 1.0) -> None:
+    """Write a stage with one prim, atomically; .usd in binary.
+
+    up_axis, Y or Z, and meters_per_unit: what the stage says of the model's world, which stays as it is. Raises
+    InputError for values that are not finite, and where usd-core is not installed.
+    """
+    if up_axis not in ("Y", "Z") or not meters_per_unit > 0:
+        raise ValueError(f"up_axis {up_axis!r}, meters_per_unit {meters_per_unit}: expected Y or Z, and more than 0")
+    gaussians.check()
+    packing.require_finite(path, gaussians, writing=True)
+    if not len(gaussians):
+        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    _pxr(path)
+    from pxr import Usd, UsdUtils
+
+    suffix = path.suffix.lower()
+    with scratch_folder(4 * sum(array.size for array in _arrays(gaussians))) as folder:
+        made = folder / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
+        stage = Usd.Stage.CreateNew(native_name(made))
+        _author(stage, gaussians, up_axis, meters_per_unit)
+        stage.GetRootLayer().Save()
+        del stage
+        if suffix == ".usdz":
+            package = folder / "gaussians.usdz"
+            if not UsdUtils.CreateNewUsdzPackage(native_name(made), native_name(package)):
+                raise OSError(f"{path}: USD could not make the package")
+            made = package
+        with atomic_writer(path, made.stat().st_size) as file, made.open("rb") as source:
+            shutil.copyfileobj(source, file, 1 << 20)
+
+
+def _arrays(gaussians: Gaussians) -> tuple[Float32, ...]:
+    return (
+        gaussians.means,
+        gaussians.quaternions,
+        gaussians.log_scales,
+        gaussians.opacity_logits,
+        gaussians.sh,
+    )
+
+
+def _author(stage: Any, gaussians: Gaussians, up_axis: str, meters_per_unit: float) -> None:
+    from pxr import Gf, Sdf, UsdGeom, Vt
+
+    UsdGeom.SetStageUpAxis(stage, up_axis)
+    UsdGeom.SetStageMetersPerUnit(stage, meters_per_unit)
+    world = UsdGeom.Xform.Define(stage, WORLD)
+    stage.SetDefaultPrim(world.GetPrim())
+    if gaussians.origin.any():
+        world.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*gaussians.origin.tolist()))
+    prim = stage.DefinePrim(PRIM, TYPE)
+    types = Sdf.ValueTypeNames
+    scales = np.exp(np.clip(gaussians.log_scales, -103.0, 88.0))
+    unit = packing.unit_quaternions(gaussians.quaternions).astype(np.float32)
+    reach = 3 * scales.max(axis=1, keepdims=True)
+    extent = np.stack([(gaussians.means - reach).min(axis=0), (gaussians.means + reach).max(axis=0)])
+    vectors, floats = Vt.Vec3fArray, Vt.FloatArray
+    for name, kind, array, values in (
+        ("positions", types.Point3fArray, vectors, gaussians.means),
+        ("orientations", types.QuatfArray, Vt.QuatfArray, unit[:, [1, 2, 3, 0]]),
+        ("scales", types.Float3Array, vectors, scales),
+        ("opacities", types.FloatArray, floats, packing.opacities(gaussians.opacity_logits).astype(np.float32)),
+        (COEFFICIENTS, types.Float3Array, vectors, gaussians.sh.reshape(-1, 3)),
+        ("extent", types.Float3Array, vectors, extent.astype(np.float32)),
+    ):
+        attribute = prim.CreateAttribute(name, kind, custom=False)
+        attribute.Set(array.FromNumpy(np.ascontiguousarray(values)))
+    uniform = Sdf.VariabilityUniform
+    prim.CreateAttribute(DEGREE, types.Int, False, uniform).Set(gaussians.sh_degree)
+    prim.CreateAttribute("projectionModeHint", types.Token, False, uniform).Set("perspective")
+    prim.CreateAttribute("sortingModeHint", types.Token, False, uniform).Set("zDepth")

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a model file holds, in numbers. A PLY goes by in blocks, and may hold values that are not finite."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import NEAR
+from clsplat.files import is_file, open_input
+from clsplat.gaussians import Float32, Gaussians
+from clsplat.images.colour import recorded_space
+from clsplat.models.codec import values as packing
+from clsplat.models.formats import format_of, model_path, ply, tell_kind
+
+PERCENTILES = (0, 1, 50, 99, 100)
+_BLOCK = 1 << 16
+
+
+def model_info(path: Path) -> dict[str, Any]:
+    """What `clsplat info --json` prints. Raises InputError for a file that no format reads."""
+    path = model_path(path)
+    module = format_of(path)
+    tell_kind(path, module)
+    result: dict[str, Any] = {"path": str(path), "format": module.NAME, "bytes": size(path)}
+    if module is ply:
+        origin, blocks = _ply_blocks(path)
+    else:
+        model: Gaussians = module.read(path)
+        origin, blocks = model.origin, _blocks(model)
+    result |= module.describe(path) if hasattr(module, "describe") else {}
+    result |= _summary(blocks, origin)
+    result["colorspace"] = recorded_space(path)
+    result["loses"] = getattr(module, "LOSES", "")
+    return result
+
+
+def size(path: Path) -> int:
+    """Bytes of the file, with the pictures beside a meta.json and the .bin beside a .gltf."""
+    return sum(each.stat().st_size for each in (path, *beside(path)) if is_file(each))
+
+
+def beside(path: Path) -> list[Path]:
+    """The other files of a model: the pictures of a meta.json, the .bin of a .gltf."""
+    if path.name == "meta.json":
+        return sorted(path.parent.glob("*.webp"))
+    return [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
+
+
+def _ply_blocks(path: Path) -> tuple[NDArray[np.float64], Iterator[Gaussians]]:
+    with open_input(path, "a 3DGS PLY") as file:
+        header = ply.read_header(file, path)
+    origin = np.zeros(3) if header.origin is None else header.origin
+    return origin, ply.read_blocks(path)
+
+
+def _blocks(model: Gaussians) -> Iterator[Gaussians]:
+    """Of a whole model, in the world."""
+    for start in range(0, len(model), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        yield Gaussians(
+            packing.world_means(model, rows).astype(np.float32),
+            model.quaternions[rows],
+            model.log_scales[rows],
+            model.opacity_logits[rows],
+            model.sh[rows],
+        )
+
+
+def _summary(blocks: Iterator[Gaussians], origin: NDArray[np.float64]) -> dict[str, Any]:
+    """Everything but SH is held for the percentiles, 28 bytes a Gaussian."""
+    means: list[Float32] = []
+    scales: list[Float32] = []
+    logits: list[Float32] = []
+    not_finite = degree = used = 0
+    for block in blocks:
+        degree = block.sh_degree
+        arrays = (block.means, block.quaternions, block.log_scales, block.opacity_logits[:, None])
+        bad = ~np.isfinite(block.sh).all(axis=(1, 2))
+        for array in arrays:
+            bad |= ~np.isfinite(array).all(axis=1)
+        not_finite += int(bad.sum())
+        good = ~bad
+        used = max([used, *(band for band in range(1, degree + 1) if block.sh[:, band**2 : (band + 1) ** 2].any())])
+        means.append(block.means[good])
+        scales.append(block.log_scales[good])
+        logits.append(block.opacity_logits[good])
+    m, s, o = np.concatenate(means), np.concatenate(scales), np.concatenate(logits)
+    result: dict[str, Any] = {"gaussians": len(m) + not_finite, "not_finite": not_finite}
+    result |= {"sh_degree": degree, "sh_degree_used": used}
+    if len(m):
+        low, high = m.min(axis=0).astype(np.float64), m.max(axis=0).astype(np.float64)
+        inner = np.percentile(m, (1, 99), axis=0)
+        result["bounds"] = {"min": low.tolist(), "max": high.tolist(), "extent": float(np.linalg.norm(high - low))}
+        result["bounds"] |= {"p1": inner[0].tolist(), "p99": inner[1].tolist()}
+        with np.errstate(over="ignore"):
+            result["scale"] = _percentiles(np.exp(s.astype(np.float64)))
+        result["opacity"] = _percentiles(packing.opacities(o))
+    return result | {"origin": origin.tolist()}
+
+
+def _percentiles(values: NDArray[Any]) -> dict[str, float]:
+    found = np.percentile(values, PERCENTILES)
+    return {f"p{percent}": float(value) for percent, value in zip(PERCENTILES, found, strict=True)}
+
+
+def _listed(percentiles: dict[str, float]) -> str:
+    return ", ".join(f"{key} {value:.4g}" for key, value in percentiles.items())
+
+
+def text(info: dict[str, Any]) -> str:
+    """A line for each thing."""
+
+    def numbers(values: list[float]) -> str:
+        return " ".join(f"{value:.6g}" for value in values)
+
+    kind = ", ".join(
+        [info["format"], *(f"{key} {info[key]}" for key in ("version", "encoding", "level") if key in info)]
+    )
+    count = info["gaussians"]
+    lines = [("format", kind), ("bytes", f"{info['bytes']:,}, {info['bytes'] / max(count, 1):.1f} a Gaussian")]
+    lines.append(("Gaussians", f"{count:,}" + (f", {info['not_finite']:,} not finite" if info["not_finite"] else "")))
+    used = info["sh_degree_used"]
+    only = "" if used == info["sh_degree"] else f", zero beyond {used}"
+    lines.append(("SH degree", f"{info['sh_degree']}{only}"))
+    if "bounds" in info:
+        bounds = info["bounds"]
+        lines.append(("bounds", f"{numbers(bounds['min'])} to {numbers(bounds['max'])}, extent {bounds['extent']:.6g}"))
+        lines.append(("98 % within", f"{numbers(bounds['p1'])} to {numbers(bounds['p99'])}"))
+        lines += [(name, _listed(info[name])) for name in ("scale", "opacity")]
+    if any(info["origin"]):
+        lines.append(("origin", " ".join(map(repr, info["origin"]))))
+    if info.get("near", NEAR) != NEAR:
+        lines.append(("near plane", f"{info['near']:.6g}"))
+    lines.append(("colour space", info["colorspace"]))
+    lines += [("comment", line) for line in info.get("comments", [])]
+    if info.get("ignored"):
+        lines.append(("ignored", " ".join(info["ignored"])))
+    if info["loses"]:
+        lines.append(("loses", info["loses"]))
+    width = max(len(name) for name, _ in lines)
+    return "\n".join(f"{name.ljust(width)}  {value}" for name, value in lines)

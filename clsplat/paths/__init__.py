@@ -1,7 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Cameras in: files of cameras and generated paths, as one `Shot`. The world is never re-oriented."""
-
-from clsplat.paths.read import choose_shot, read_shot
-from clsplat.paths.shot import Frame, Shot
-
-__all__ = ["Frame", "Shot", "choose_shot", "read_shot"]

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From RasterizerConfig to the kernels' build defines. The default has none: its kernels are the plain text."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from clsplat.config.training import RasterizerConfig
+
+_HALF_LOG2E = 0.5 * math.log2(math.e)
+
+
+def kernel_defines(config: RasterizerConfig) -> dict[str, object]:
+    """The defines that make the kernels do as `config` says; only for what differs from the default."""
+    default = RasterizerConfig()
+    defines: dict[str, object] = {}
+    if config.extent == "3sigma":
+        # Within a tile whole cells are skipped, so that what is cut would depend on the kernels' shape.
+        defines.update(EXTENT_BUDGET=_literal(9 * _HALF_LOG2E), NO_ROW_SKIP=True, NO_COLUMN_SKIP=True)
+    elif config.extent == "constant":
+        defines["EXTENT_BUDGET"] = _literal(-math.log2(config.alpha_min))
+    flags = {
+        "BOX_TILE_TEST": config.tile_test != "ellipse",
+        "SQUARE_TILE_TEST": config.tile_test == "square",
+        "NO_ROW_SKIP": not config.row_skip,
+        "NO_COLUMN_SKIP": not config.column_skip,
+        "NO_VECTOR_SKIP": not config.vector_skip,
+        "NO_EARLY_STOP": not config.early_stop,
+        "NO_LAST_CONTRIBUTOR": not config.last_contributor,
+        "NO_GRADIENT_SKIP": not config.gradient_skip,
+        "NO_FRUSTUM_CULL": not config.frustum_cull,
+        "NO_OPACITY_CULL": not config.opacity_cull,
+    }
+    defines.update({name: True for name, wanted in flags.items() if wanted})
+    if config.sh_degree_limit != default.sh_degree_limit:
+        defines["SH_LIMIT"] = (config.sh_degree_limit + 1) ** 2
+    if config.alpha_min != default.alpha_min:
+        defines.update(ALPHA_MIN=_literal(config.alpha_min), LOG2_ALPHA_MIN=_literal(math.log2(config.alpha_min)))
+    if config.transmittance_min != default.transmittance_min:
+        defines["TRANSMITTANCE_MIN"] = _literal(config.transmittance_min)
+    return defines
+
+
+def _literal(value: float) -> str:
+    """A float32 as OpenCL C, without rounding."""
+    return f"{float(np.float32(value)):.9e}f"

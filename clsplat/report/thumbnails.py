@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Held-out photographs, renders and their errors, small enough to be in a page, as data URIs."""
+
+from __future__ import annotations
+
+import base64
+import os
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.errors import ClsplatError, InputError
+from clsplat.evaluation.held_out import composite, picture_names
+from clsplat.files import native_name
+from clsplat.images.colour import displayed, photos_space
+from clsplat.images.reading import downscale, error_of, read_image
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, View, detect, load_scene
+
+Float32 = NDArray[np.float32]
+
+MAX_SIDE = 640
+"""Pixels of the longer side in a page."""
+SMALL = 160
+"""Up to this side a picture is a PNG, and is shown with its pixels as squares."""
+QUALITY = 85
+WHITE_ERROR = 0.25
+"""Mean absolute error of a pixel's channels from which on the error is drawn in the last colour."""
+RAMP = np.array(
+    [(0, 0, 0), (40, 11, 84), (101, 21, 110), (159, 42, 99), (212, 72, 66), (245, 125, 21), (250, 193, 39)], np.float32
+)
+"""From no error to WHITE_ERROR and more, in even steps of lightness, as matplotlib's inferno has them."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A view's pictures as data URIs; photo and error None where there is no photograph."""
+
+    name: str
+    width: int
+    height: int
+    render: str
+    photo: str | None = None
+    error: str | None = None
+    trouble: str | None = None
+
+    @property
+    def small(self) -> bool:
+        """Whether its pixels are few."""
+        return max(self.width, self.height) <= SMALL
+
+
+def scene_of(run: Run) -> Scene | str:
+    """The run's scene, or why there is none: nothing is reconstructed for a report."""
+    source = run.scene
+    if source is None:
+        return "config.toml does not name the scene"
+    try:
+        if detect(source) == "photos":
+            source = source.resolve()
+            source = source.with_name(f"{source.name}_colmap")
+            if not source.is_dir():
+                return "the scene is a folder of photos, and what was reconstructed of it is gone"
+        return load_scene(source, resolution=run.config.resolution, test_every=run.config.test_every)
+    except (InputError, OSError) as error:
+        return f"the scene cannot be read ({str(error).replace(str(source), source.name)})"
+
+
+def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
+    """Which views to show, at most `limit`: the worst, the best, and evenly between, in the order that they have."""
+    if len(scores) <= limit:
+        return list(range(len(scores)))
+    order = sorted(range(len(scores)), key=lambda index: (scores[index] is None, scores[index] or 0.0, index))
+    places = np.linspace(0, len(order) - 1, limit).round().astype(int) if limit > 1 else np.zeros(limit, int)
+    return sorted({order[place] for place in places})
+
+
+def show(
+    run: Run, names: Sequence[str], wanted: Sequence[int], scene: Scene | None, background: ArrayLike
+) -> list[Shown]:
+    """The pictures of the views `names[index]`, for each index wanted, whose render is in the run's test/."""
+    try:
+        paths = picture_names(names)
+    except ValueError:  # a name that no file has, such as ""
+        return []
+    views = {view.name: view for view in scene.views} if scene is not None else {}
+    space = photos_space(view.path for view in views.values())
+
+    def one(index: int) -> Shown | None:
+        path = run.test_path / paths[index]
+        if not _is_within(path, run.test_path):
+            return None
+        try:
+            return _shown(names[index], path, views.get(names[index]), background, space)
+        except InputError:
+            return None
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+        return [found for found in pool.map(one, wanted) if found is not None]
+
+
+def error_colors(error: Float32) -> Float32:
+    """(H, W, 3) of the mean absolute error (H, W)."""
+    at = np.clip(error / np.float32(WHITE_ERROR), 0, 1) * (len(RAMP) - 1)
+    low = np.minimum(at.astype(int), len(RAMP) - 2)
+    part = (at - low)[..., None]
+    found: Float32 = ((1 - part) * RAMP[low] + part * RAMP[low + 1]) / np.float32(255)
+    return found
+
+
+def data_uri(image: NDArray[Any]) -> str:
+    """(H, W, 3) floats, clipped to [0, 1], as JPEG; as PNG if small. Raises ClsplatError."""
+    height, width = image.shape[:2]
+    small = max(width, height) <= SMALL
+    kind = "png" if small else "jpeg"
+    pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
+    spec = oiio.ImageSpec(width, height, 3, oiio.UINT8)
+    if not small:
+        spec.attribute("Compression", f"jpeg:{QUALITY}")
+    with tempfile.TemporaryDirectory() as folder:  # OpenImageIO's Python writes to files alone
+        path = Path(folder) / f"picture.{kind}"
+        name = native_name(path)
+        output = oiio.ImageOutput.create(name)
+        if not (output and output.open(name, spec) and output.write_image(pixels) and output.close()):
+            raise ClsplatError(f"a picture could not be encoded: {error_of(output or oiio)}")
+        data = path.read_bytes()
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _is_within(path: Path, folder: Path) -> bool:
+    """Whether the file is in the folder, wherever its name and links lead."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError):
+        return False
+
+
+def _shown(name: str, path: Path, view: View | None, background: ArrayLike, space: str) -> Shown:
+    render = read_image(path, orient=False)[:, :, :3]
+    height, width = render.shape[:2]
+    scale = min(1.0, MAX_SIDE / max(width, height))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = downscale(render, *size)
+    if view is None:
+        return Shown(name, *size, data_uri(small))
+    try:
+        photo = displayed(composite(view.load(width, height), background), space)
+    except InputError as reason:
+        trouble = str(reason).replace(str(view.path), view.path.name)
+        return Shown(name, *size, data_uri(small), trouble=trouble)
+    error = np.abs(photo - render).mean(axis=2, keepdims=True, dtype=np.float32)
+    colors = error_colors(downscale(error, *size)[:, :, 0])
+    return Shown(name, *size, data_uri(small), data_uri(downscale(photo, *size)), data_uri(colors))

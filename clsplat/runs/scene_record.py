@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run knows of its scene, scene.json: names, sizes and cameras of the views, a digest of each photograph."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import clsplat
+from clsplat.errors import InputError, examples, plain
+from clsplat.files import atomic_write, parse_json, read_document, short_digest
+
+if TYPE_CHECKING:
+    from clsplat.runs.run import Run
+    from clsplat.scenes.scene import Scene, View
+
+NAME = "scene.json"
+MAX_SCENE = 256 << 20
+"""Bytes of scene.json: of some hundred thousand views."""
+SAME = 1e-6
+"""Relative difference up to which numbers of a camera are the same: another version may round otherwise."""
+_EXPECTED = "what a run knows of its scene"
+
+
+def record_of(scene: Scene, resolution: int) -> dict[str, Any]:
+    """What scene.json holds; resolution: the setting. Reads every photograph, if that has not been done."""
+    points = hashlib.blake2b(np.ascontiguousarray(scene.points, "<f8").tobytes(), digest_size=16)
+    points.update(np.ascontiguousarray(scene.point_colors, "<f4").tobytes())
+    digests = scene.digests
+    return {
+        "clsplat": clsplat.__version__,
+        "resolution": resolution,
+        "origin": scene.origin.tolist(),
+        "points": {"count": len(scene.points), "blake2b": points.hexdigest()},
+        "views": {view.name: _view(view, digests[view.name]) for view in scene.views},
+    }
+
+
+def _view(view: View, digest: str | None) -> dict[str, Any]:
+    camera = view.camera
+    return {
+        "split": view.split,
+        "file": view.path.name,
+        "folder": view.path.parent.name,
+        "blake2b": digest,
+        "size": [camera.width, camera.height],
+        "lens": [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)],
+        "pose": [float(value) for value in (*np.ravel(camera.rotation), *camera.translation)],
+    }
+
+
+def write(run: Run, scene: Scene) -> None:
+    """Write scene.json."""
+    record = record_of(scene, run.config.resolution)
+    atomic_write(run.path / NAME, (json.dumps(record, allow_nan=False) + "\n").encode())
+
+
+def read(run: Run) -> dict[str, Any] | None:
+    """What scene.json holds; None where there is none, as in runs of earlier versions. Raises InputError."""
+    path = run.path / NAME
+    if not path.exists():
+        return None
+    advice = "remove it, and the run resumes without a comparison"
+    try:
+        record = parse_json(read_document(path, _EXPECTED, MAX_SCENE))
+        views, points = record["views"], record["points"]
+        assert isinstance(views, dict)
+        assert isinstance(points["count"], int)
+        assert len(record["origin"]) == 3
+        assert isinstance(record["resolution"], int)
+        for view in views.values():
+            assert {"split", "file", "folder", "blake2b", "size", "lens", "pose"} <= view.keys()
+            assert all(len(np.array(view[key], float)) == n for key, n in (("size", 2), ("lens", 4), ("pose", 12)))
+    except (ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
+        why = str(error) or "not of its form"
+        raise InputError(f"{path}: is damaged ({why}), expected {_EXPECTED}; {advice}") from None
+    return dict(record)
+
+
+def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """How a scene differs from the one that a run has begun with, in few words each. With another --resolution sizes
+    may differ, and files of another size stand in."""
+    was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
+    told = [
+        _listed("not there any more", [name for name in was if name not in new]),
+        _listed("new", [name for name in new if name not in was]),
+    ]
+    both = [name for name in was if name in new]
+    other: dict[str, list[str]] = {"another camera": [], "another size": [], "another photograph": [], "split": []}
+    for name in both:
+        a, b = was[name], new[name]
+        same_file = (a["file"], a["folder"]) == (b["file"], b["folder"])
+        turned = not (_close(a["pose"][:9], b["pose"][:9]) and _close(a["pose"][9:], b["pose"][9:]))
+        if turned or (a["size"] == b["size"] and not _close(a["lens"], b["lens"])):
+            other["another camera"].append(name)
+        elif a["size"] != b["size"] and not resized:
+            other["another size"].append(name)
+        if a["blake2b"] != b["blake2b"] and (same_file or not resized):
+            other["another photograph"].append(name)
+        if a["split"] != b["split"]:
+            other["split"].append(name)
+    told += [_listed(what, other[what]) for what in ("another photograph", "another camera", "another size")]
+    told.append(_listed("held out in one and not in the other", other["split"]))
+    if earlier["points"] != now["points"] and not any(told):
+        counts = f"{earlier['points']['count']:,} then, {now['points']['count']:,} now"
+        told.append(f"other points ({counts})")
+    return [each for each in told if each]
+
+
+def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool = False) -> bool:
+    """Compare a scene, read from `path`, with the one that a run has begun with; True where it differs, as `accept`ed.
+
+    Raises InputError where it differs otherwise, or where the model would not lie where its numbers say.
+    """
+    earlier = read(run)
+    if earlier is None:
+        return False
+    now = record_of(scene, resolution)
+    found = differences(earlier, now)
+    if found and not accept:
+        raise InputError(
+            plain(
+                f"{path}: is not the scene that {run.path} began with: {'; '.join(found)}; expected the same views and "
+            )
+            + "photographs; --accept-changes goes on with these"
+        )
+    if earlier["origin"] != now["origin"]:
+        raise InputError(
+            f"{path}: lies elsewhere in the world than the scene that {run.path} began with (numbers count from "
+            f"{now['origin']}, not {earlier['origin']}), expected the same place; start a new run"
+        )
+    return bool(found)
+
+
+def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
+    """Write scene.json, but for a run that goes on with what is there; a warning where nothing was."""
+    known = read(run) if resuming else None
+    if known is not None and known["resolution"] == run.config.resolution:
+        return
+    if known is None and resuming and run.checkpoints():
+        warnings.warn(
+            plain(
+                f"{run.path}: has no {NAME}, as runs of earlier versions: whether this is the scene it began with is "
+                "not known; from now on it is"
+            )
+        )
+    write(run, scene)
+
+
+def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
+    """Why scores of these views are not those of held-out photographs of the scene that the run has begun with."""
+    try:
+        record = read(run)
+    except InputError:
+        record = None
+    was = record["views"] if record is not None else {}
+    known = [view for view in views if view.name in was]
+    seen = [view.name for view in known if was[view.name]["split"] == "train"]
+    changed = [
+        view.name
+        for view in known
+        if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
+        and was[view.name]["blake2b"] != short_digest(view.path)
+    ]
+    told = []
+    if seen:
+        told.append(f"{len(seen):,} of {len(views):,} views were trained on ({examples(seen)}): they score too well")
+    if changed:
+        told.append(f"{_listed('with another photograph than at the training', changed)}")
+    if was and not known:
+        told.append(f"none of the views is of the scene that {run.path} began with")
+    return told
+
+
+def _close(a: list[float], b: list[float]) -> bool:
+    """Of vectors: relative to the largest number, as a scene may be of any size."""
+    one, other = np.array(a), np.array(b)
+    return bool(np.abs(one - other).max() <= SAME * max(np.abs(one).max(), np.abs(other).max()))
+
+
+def _listed(what: str, names: list[str]) -> str:
+    """Such as "3 views not there any more (a.png, b.png, c.png)"; empty where there are none."""
+    if not names:
+        return ""
+    more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
+    return f"{len(names):,} {'view' if len(names) == 1 else 'views'} {what} ({', '.join(names[:3])}{more})"

@@ -1,0 +1,430 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading COLMAP models: cameras, images and points3D, binary or text (https://colmap.github.io/format.html).
+
+Not through `pycolmap.Reconstruction`: on damaged files 4.2.1 fails without naming the file, asks for all memory, or
+takes a cut cameras.bin for a good one and goes on with what it did not read. Here every byte is accounted for.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import struct
+import warnings
+from array import array
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import BinaryIO, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError, plain
+from clsplat.files import is_file, open_input
+from clsplat.scenes.lens import Lens, absurd, check_lens, models
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Value = TypeVar("Value")
+
+STEMS = ("cameras", "images", "points3D")
+OBSERVATION_BYTES = 24  # x, y, id of the point
+TRACK_BYTES = 8  # ids of the image and of the observation in it
+MAX_NAME_BYTES = 4096
+MAX_LINE = 1 << 26
+"""Characters of a line of text; the observations of a picture and the track of a point are one each."""
+MAX_NUMBER = 1e30
+"""Coordinates beyond it are damage; their squares are still finite."""
+WINDOW = 1 << 20
+NEWER = 60.0
+"""Seconds by which a text file is newer than its binary one where somebody has edited it since: tools that write both,
+and programs that copy them, are done with the second sooner."""
+ANNOUNCED = re.compile(r"# *Number of (?:cameras|images|points): *(\d{1,18})\b")
+POSE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+EXPECTED = "a file of a COLMAP model"
+
+
+@dataclass(frozen=True, eq=False)
+class ModelImage:
+    """A picture of a model: its name (relative to the images' folder), lens, and `cam_from_world`.
+
+    rotation (3, 3), translation (3,), float64.
+    """
+
+    name: str
+    lens: Lens
+    rotation: Float64
+    translation: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """images by name, in order; points (N, 3) float64 in the world; colors (N, 3) float32 in [0, 1]; warnings: what a
+    user should hear, a line each."""
+
+    images: list[ModelImage]
+    points: Float64
+    colors: Float32
+    warnings: list[str] = field(default_factory=list)
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder of the model that belongs to `folder`, or None.
+
+    Looks in sparse/0, sparse, the folder itself and colmap/sparse/0. Of several models in sparse/ the one with the
+    most images counts: COLMAP's first one may be a fragment.
+    """
+    for candidate in (folder, folder / "sparse", folder / "colmap" / "sparse"):
+        numbered = [path for path in candidate.glob("[0-9]*") if _is_model(path)]
+        if len(numbered) > 1:
+            return max(sorted(numbered), key=_claimed_images)
+        if numbered:
+            return numbered[0]
+        if _is_model(candidate):
+            return candidate
+    return None
+
+
+def read_model(folder: Path) -> Model:
+    """Read the model in `folder`; each of the three files as .bin if there, else as .txt.
+
+    points3D may be missing, there are no points then. Raises InputError, naming the file, for one that is missing,
+    cut short, longer than its contents, damaged, or of a camera model that is unknown. The model's warnings tell of
+    text with less than its header announces, and of text that is newer than the binary file that is read.
+    """
+    heard = _passed_over(folder)
+    lenses = _read_cameras(folder, heard)
+    images = _read_images(folder, lenses, heard)
+    if _file(folder, "points3D") is None:
+        return Model(images, np.empty((0, 3)), np.empty((0, 3), np.float32), heard)
+    points, colors = _read_points(folder, heard)
+    return Model(images, points, colors, heard)
+
+
+def read_cameras(folder: Path) -> dict[str, Camera]:
+    """The cameras of a model by image name, sorted; points and pictures are not looked at.
+
+    folder: a model's own or a scene's, as `find_model`. Cameras with distortion become the pinhole cameras that a
+    scene is trained with (`Lens.pinhole`), at full size. Raises InputError and warns as `read_model`, and
+    warns of lenses beyond reason.
+    """
+    model = find_model(Path(folder))
+    if model is None:
+        raise InputError(f"{folder}: no COLMAP model, expected cameras and images (.bin or .txt) in it or in sparse/0")
+    pinholes: dict[Lens, Camera] = {}
+    cameras = {}
+    heard = _passed_over(model)
+    images = _read_images(model, _read_cameras(model, heard), heard)
+    for image in images:
+        if image.lens not in pinholes:
+            pinholes[image.lens] = image.lens.pinhole(np.eye(3), np.zeros(3))
+        cameras[image.name] = replace(pinholes[image.lens], rotation=image.rotation, translation=image.translation)
+    for text in (*heard, absurd([(image.name, image.lens) for image in images])):
+        if text:
+            warnings.warn(plain(text), stacklevel=2)
+    return cameras
+
+
+def safe_name(name: str) -> bool:
+    """Whether a name from a file stays inside the folder it is relative to."""
+    path, windows = PurePosixPath(name), PureWindowsPath(name)
+    inside = not path.is_absolute() and not windows.anchor and ".." not in windows.parts
+    return bool(path.parts) and inside and name.isprintable()
+
+
+class _Binary:
+    """Reads little-endian records from a file, a window of it at a time; InputError where it ends."""
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path, self.file = path, file
+        self.size = os.fstat(file.fileno()).st_size
+        self.window, self.start = b"", 0
+        self.position = 0
+        self.doing = "its header"
+
+    def _at(self, size: int) -> int:
+        """Where in the window the position is; `size` bytes from there on are in it, as far as the file has them."""
+        if not self.start <= self.position <= self.position + size <= self.start + len(self.window):
+            self.file.seek(self.position)
+            self.window, self.start = self.file.read(max(size, WINDOW)), self.position
+        return self.position - self.start
+
+    def read(self, layout: struct.Struct) -> tuple[float, ...]:
+        self._require(layout.size)
+        at = self._at(layout.size)
+        values = layout.unpack_from(self.window, at)
+        self.position += layout.size
+        return values
+
+    def skip(self, size: int) -> None:
+        self._require(size)
+        self.position += size
+
+    def _require(self, size: int) -> None:
+        if size > self.size - self.position:
+            raise InputError(
+                f"{self.path}: truncated or corrupt: its {self.size} bytes end inside {self.doing}; "
+                "copy the file again or export the model anew"
+            )
+
+    def name(self) -> str:
+        start = self._at(min(MAX_NAME_BYTES, self.size - self.position))
+        end = self.window.find(b"\0", start, start + MAX_NAME_BYTES)
+        if end < 0:
+            raise corrupt(self.path, f"{self.doing} has a name without an end")
+        raw = self.window[start:end]
+        self.position += len(raw) + 1
+        try:
+            return raw.decode("utf-8")
+        except UnicodeDecodeError:
+            raise corrupt(self.path, f"{self.doing} has the name {raw[:40]!r}, expected UTF-8") from None
+
+    def count(self, what: str, least: int) -> Iterator[int]:
+        """The records that the file says it has, each of at least `least` bytes, in turn."""
+        (count,) = self.read(struct.Struct("<Q"))
+        number = int(count)
+        if number * least > self.size:
+            self.doing = f"the {number} {what}s that its header announces"
+            self.skip(number * least)
+        for index in range(number):
+            self.doing = f"{what} {index + 1} of {number}"
+            yield index
+        if self.position != self.size:
+            extra = self.size - self.position
+            raise corrupt(self.path, f"{extra} bytes follow the last of its {number} {what}s")
+
+
+def corrupt(path: Path, found: str) -> InputError:
+    """The error for a model's file whose contents cannot be."""
+    return InputError(f"{path}: truncated or corrupt: {found}; copy the file again or export the model anew")
+
+
+def _is_model(folder: Path) -> bool:
+    return any(_file(folder, stem) for stem in ("cameras", "images"))
+
+
+def _file(folder: Path, stem: str) -> Path | None:
+    for extension in (".bin", ".txt"):
+        path = folder / (stem + extension)
+        if is_file(path):
+            return path
+    return None
+
+
+def _require(folder: Path, stem: str) -> Path:
+    path = _file(folder, stem)
+    if path is None:
+        raise InputError(f"{folder}: has no {stem}.bin or {stem}.txt, expected a COLMAP model, cameras and images")
+    return path
+
+
+def _claimed_images(folder: Path) -> int:
+    """How many images a model says it has; -1 if that cannot be read."""
+    path = _file(folder, "images")
+    if path is None:
+        return -1
+    if path.suffix == ".bin":
+        with open_input(path, EXPECTED) as file:
+            return int.from_bytes(file.read(8), "little")
+    return sum(1 for _ in _image_lines(path))
+
+
+def _passed_over(folder: Path) -> list[str]:
+    """A warning where somebody has edited text that is not read, as a binary file goes before it."""
+    edited = []
+    for stem in STEMS:
+        binary, text = folder / f"{stem}.bin", folder / f"{stem}.txt"
+        if is_file(binary) and is_file(text) and text.stat().st_mtime > binary.stat().st_mtime + NEWER:
+            edited.append(stem)
+    if not edited:
+        return []
+    read, not_read = (", ".join(stem + extension for stem in edited) for extension in (".bin", ".txt"))
+    return [f"{folder}: {read} is read and not the newer {not_read}; remove what is not meant"]
+
+
+def _check_count(path: Path, found: int, heard: list[str]) -> None:
+    """Text that is cut at the end of a line has nothing else that is wrong."""
+    if path.suffix != ".txt":
+        return
+    announced = 0
+    with open_input(path, EXPECTED) as file:
+        while (line := file.readline(MAX_NAME_BYTES)).lstrip(b"\xef\xbb\xbf").startswith(b"#"):
+            if match := ANNOUNCED.match(line.lstrip(b"\xef\xbb\xbf").decode("utf-8", "replace")):
+                announced = int(match[1])
+    if found < announced:
+        heard.append(f"{path}: its header announces {announced:,}, and it holds {found:,}; is it cut, or edited since?")
+
+
+def _read_cameras(folder: Path, heard: list[str]) -> dict[int, Lens]:
+    path = _require(folder, "cameras")
+    lenses: dict[int, Lens] = {}
+    for key, lens in _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path):
+        if key in lenses:
+            raise corrupt(path, f"camera {key} is there twice")
+        lenses[key] = check_lens(lens, f"{path}: camera {key}")
+    _check_count(path, len(lenses), heard)
+    return lenses
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    layout, known = struct.Struct("<IiQQ"), models()
+    with open_input(path, EXPECTED) as opened:
+        file = _Binary(path, opened)
+        for _ in file.count("camera", layout.size):
+            key, model, width, height = (int(value) for value in file.read(layout))
+            if model not in known:
+                raise InputError(
+                    f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
+                    f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
+                )
+            name, parameters = known[model]
+            yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    def parse(words: list[str]) -> tuple[int, Lens]:
+        return int(words[0]), Lens(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
+
+    for number, line in _lines(path):
+        yield _parsed(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse, line.split())
+
+
+def _read_images(folder: Path, lenses: dict[int, Lens], heard: list[str]) -> list[ModelImage]:
+    path = _require(folder, "images")
+    images: dict[str, ModelImage] = {}
+    for name, camera, pose in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
+        if camera not in lenses:
+            raise corrupt(path, f"image {name[:80]!r} has the camera {camera}, which is not in the model")
+        if not safe_name(name):
+            raise corrupt(path, f"an image has the name {name[:80]!r}, expected a path inside the images' folder")
+        if name in images:
+            raise corrupt(path, f"image {name} is there twice")
+        quaternion, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
+        norm = math.hypot(*pose[:4])
+        if not (0.5 < norm < 2 and (np.abs(translation) < MAX_NUMBER).all()):
+            raise corrupt(path, f"image {name} has the pose {list(pose)}, expected a unit quaternion, finite numbers")
+        images[name] = ModelImage(name, lenses[camera], rotation_from_quaternion(quaternion / norm), translation)
+    if not images:
+        raise InputError(f"{path}: holds no images, expected at least one")
+    _check_count(path, len(images), heard)
+    return [images[name] for name in sorted(images)]
+
+
+def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
+    head, count = struct.Struct("<I7dI"), struct.Struct("<Q")
+    with open_input(path, EXPECTED) as opened:
+        file = _Binary(path, opened)
+        for _ in file.count("image", head.size + 1 + count.size):
+            _, *pose, camera = file.read(head)
+            name = file.name()
+            (observations,) = file.read(count)
+            file.skip(int(observations) * OBSERVATION_BYTES)
+            yield name, int(camera), tuple(pose)
+
+
+def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
+    """Number, text and what is expected, of the first line of each pair. The second, the observations, may be empty;
+    some tools leave it out."""
+    after_pose = False
+    for number, line in _lines(path, keep_empty=True):
+        if after_pose and (not line or _are_observations(line)):
+            after_pose = False
+        elif line:
+            yield number, line, f"X Y POINT3D_ID, again and again, or as {POSE}" if after_pose else POSE
+            after_pose = True
+
+
+def _are_observations(line: str) -> bool:
+    """Whether a line is of numbers in threes; the first line of a pair ends with a name."""
+    words = line.split()
+    try:
+        float(words[-1])
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
+
+
+def _text_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
+    def parse(words: list[str]) -> tuple[str, int, tuple[float, ...]]:
+        int(words[0])
+        return words[9], int(words[8]), tuple(map(float, words[1:8]))
+
+    for number, line, expected in _image_lines(path):
+        # the name is the rest of the line, blanks and all
+        yield _parsed(path, number, expected, parse, line.split(maxsplit=9))
+
+
+def _read_points(folder: Path, heard: list[str]) -> tuple[Float64, Float32]:
+    path = _require(folder, "points3D")
+    values = array("d")  # a list of tuples would take six times the memory
+    for row in _binary_points(path) if path.suffix == ".bin" else _text_points(path):
+        values.extend(row)
+    table = np.frombuffer(values, np.float64).reshape(-1, 6) if values else np.empty((0, 6))
+    _check_count(path, len(table), heard)
+    near = (np.abs(table[:, :3]) < MAX_NUMBER).all(axis=1)
+    good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all(axis=1)
+    if not good.all():
+        index = int(np.argmin(good))
+        found = f"point {index + 1} of {len(table)} has the position and colour {table[index].tolist()}"
+        raise corrupt(path, f"{found}, expected finite numbers and colours 0 to 255")
+    return np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3:] / 255, np.float32)
+
+
+def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
+    layout = struct.Struct("<Q3d3BdQ")
+    with open_input(path, EXPECTED) as opened:
+        file = _Binary(path, opened)
+        for _ in file.count("point", layout.size):
+            _, *values, _, track = file.read(layout)
+            file.skip(int(track) * TRACK_BYTES)
+            yield tuple(values)
+
+
+def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
+    def parse(words: list[str]) -> tuple[float, ...]:
+        _, x, y, z, red, green, blue, _ = words[:8]
+        if len(words) > 8 and len(words[8].split()) % 2:
+            raise ValueError("a track is of pairs")
+        return float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue))
+
+    for number, line in _lines(path):
+        yield _parsed(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK", parse, line.split(maxsplit=8))
+
+
+def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
+    """Line numbers and lines, without comments."""
+    with open_input(path, EXPECTED) as opened:
+        file, number = io.TextIOWrapper(opened, encoding="utf-8-sig"), 0
+        try:
+            while line := file.readline(MAX_LINE):
+                number += 1
+                if len(line) == MAX_LINE:
+                    raise corrupt(path, f"line {number} has no end")
+                text = line.strip()
+                if not text.startswith("#") and (text or keep_empty):
+                    yield number, text
+        except UnicodeDecodeError:
+            raise corrupt(path, "is not text in UTF-8") from None
+
+
+def _parsed(path: Path, number: int, expected: str, parse: Callable[[list[str]], Value], words: list[str]) -> Value:
+    try:
+        return parse(words)
+    except (ValueError, IndexError, OverflowError):
+        raise InputError(f"{path}: line {number} does not read as {expected}; is the file cut or damaged?") from None
+
+
+def rotation_from_quaternion(quaternion: Float64) -> Float64:
+    """(3, 3) of a unit quaternion (4,), w x y z."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Gaussians that training starts from: one a point, isotropic, as wide as the way to its neighbours."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.camera import NEAR
+from clsplat.errors import InputError
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+INITIAL_OPACITY = 0.1
+MIN_SQUARED_DISTANCE = 1e-7
+"""The authors' floor under the mean squared distance, which keeps points that coincide alive: world units squared in
+scenes whose extent is one of ORDINARY_EXTENTS, and in others as much of the extent as at the nearer end."""
+ORDINARY_EXTENTS = (1.0, 100.0)
+LEAST_COLOUR = 1 / 512
+"""Half a step of an 8 bit image. A channel that starts at 0 is at the clamp of colours, where it has no gradient, and
+rounding may keep it there for good."""
+NEIGHBOURS = 3
+
+Float64 = NDArray[np.float64]
+
+
+def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
+    """Those of degree 0 of the scene's points, or of so many random ones where it has none."""
+    points: NDArray[Any] = scene.points
+    colors: NDArray[Any] = scene.point_colors
+    if len(points) == 0:
+        points, colors = random_points(random_count, *scene.bounds, rng)
+    return from_points(points, colors, sh_degree=0, origin=scene.origin, extent=scene.extent, near=scene.near)
+
+
+def from_points(
+    points: ArrayLike,
+    colors: ArrayLike,
+    *,
+    sh_degree: int,
+    origin: Float64 | None = None,
+    extent: float = 1.0,
+    near: float = NEAR,
+) -> Gaussians:
+    """One Gaussian a point.
+
+    points (N, 3), world units; colors (N, 3), float in [0, 1] or uint8; sh_degree 0 to 3: the higher coefficients
+    are there and 0; origin (3,): where the means count from, the world's own if not given; extent: the scene's,
+    world units; near: the model's near plane. The standard deviation is the root of the mean squared distance to the
+    three nearest other points (fewer where there are fewer; a lone point gets the floor). Opacity 0.1, quaternions
+    1 0 0 0.
+    Raises InputError for no points or points that are not finite, ValueError for wrong shapes.
+    """
+    xyz = np.asarray(points, np.float64)
+    rgb: NDArray[Any] = np.asarray(colors)
+    if rgb.dtype == np.uint8:
+        rgb = rgb / 255.0
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape:
+        raise ValueError(f"points {xyz.shape} and colors {rgb.shape}: expected (N, 3) both")
+    if not 0 <= sh_degree <= MAX_SH_DEGREE:
+        raise ValueError(f"sh_degree {sh_degree}: expected 0 to {MAX_SH_DEGREE}")
+    count = len(xyz)
+    if count == 0:
+        raise InputError("no points to start from, expected at least one")
+    if not np.isfinite(xyz).all():
+        raise InputError(f"point {int(np.argmin(np.isfinite(xyz).all(axis=1)))} is not finite")
+
+    origin = np.zeros(3) if origin is None else origin
+    log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), squared_floor(extent)))
+    quaternions = np.zeros((count, 4), np.float32)
+    quaternions[:, 0] = 1
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
+    sh[:, 0] = (np.maximum(rgb, LEAST_COLOUR) - 0.5) / SH_C0
+    return Gaussians(
+        means=np.ascontiguousarray(xyz - origin, np.float32),
+        quaternions=quaternions,
+        log_scales=np.repeat(log_scales.astype(np.float32)[:, None], 3, axis=1),
+        opacity_logits=np.full(count, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), np.float32),
+        sh=sh,
+        origin=origin,
+        near=near,
+    )
+
+
+def squared_floor(extent: float) -> float:
+    """Under the mean squared distance of a scene's points, world units squared."""
+    low, high = ORDINARY_EXTENTS
+    return MIN_SQUARED_DISTANCE * (extent / min(max(extent, low), high)) ** 2
+
+
+def mean_squared_distance(points: Float64) -> Float64:
+    """Mean squared distance to the three nearest other points, (N,); points (N, 3). 0 for a lone point.
+
+    A point that coincides with others counts them as neighbours at distance 0, as the authors' code does.
+    """
+    neighbours = min(NEIGHBOURS, len(points) - 1)
+    if neighbours == 0:
+        return np.zeros(len(points))
+    tree: Any = import_module("scipy.spatial").cKDTree(points)  # scipy has no types
+    distances, _ = tree.query(points, k=neighbours + 1)
+    # Sorted, so the first is 0: the point itself or one at the same place, which is the same distance.
+    mean: Float64 = np.mean(np.square(distances[:, 1:]), axis=1)
+    return mean
+
+
+def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """Points uniform in a box and their colours, for a scene without points.
+
+    low, high (3,): the box's corners, world units. Returns points (count, 3) and colors (count, 3): grey with the
+    authors' trace of noise.
+    """
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    points = low + rng.random((count, 3)) * (high - low)
+    colors = 0.5 + SH_C0 * rng.random((count, 3)) / 255
+    return points, colors

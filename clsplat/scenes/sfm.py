@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Structure from motion: a folder of photos to a COLMAP scene with pinhole cameras, by pycolmap on the CPU."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, Literal
+
+from clsplat.errors import ClsplatError, InputError, examples
+from clsplat.files import is_file, parse_json, read_document, replace
+from clsplat.process import apart
+from clsplat.scenes import sfm_photos
+
+Progress = Callable[[str, float | None], None]
+Matching = Literal["auto", "exhaustive", "sequential"]
+
+RECORD = "sfm.json"
+"""File in the result: which photos and settings it was made from, which photos are missing, how good it is."""
+EXHAUSTIVE_PHOTOS = 100
+"""Up to here "auto" matches every pair: the pairs grow with the square, and a CPU does some 50 a second."""
+MINIMUM_PHOTOS = 3
+CAMERA_MODELS = (
+    "auto",
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "OPENCV_FISHEYE",
+)
+
+# stage of the worker: what the user reads, and the table that grows by a row with each photo or pair
+_STAGES = {
+    "features": ("finding features", "keypoints"),
+    "matches": ("matching photos", "two_view_geometries"),
+    "cameras": ("placing cameras", None),
+    "cameras again": ("placing cameras, second try", None),
+    "undistorting": ("undistorting photos", None),
+}
+
+
+def reconstruct(
+    images: Path,
+    output: Path,
+    *,
+    matching: Matching = "auto",
+    camera_model: str = "auto",
+    shared_camera: bool | Literal["auto"] = "auto",
+    max_image_size: int = 1600,
+    max_features: int = 8192,
+    threads: int | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Recover the cameras of the photos under `images` and write a COLMAP scene to `output`, which is returned.
+
+    output gets `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. It
+    appears when all is done, or not at all; a result of the same photos and settings is reused at once.
+
+    matching: every pair, or neighbours in the order of the names; "auto" is every pair up to 100 photos.
+    camera_model: the lens model that is fitted, a COLMAP name; "auto" is OPENCV for cameras with 20 photos or more,
+    SIMPLE_RADIAL (one distortion coefficient) for others. shared_camera: see `sfm_photos.camera_groups`.
+    max_image_size: pixels, longest side for features alone, the undistorted photos keep their size. threads: all
+    cores if None. The same seed gives the same cameras, bit by bit up to 80 photos. overwrite: replace a result of
+    other photos. progress(text, fraction or None) hears of every stage.
+
+    Warns of photos that could not be placed, are of a kind that cannot be read, or lost their alpha. Raises InputError
+    for a folder without photos, a photo that does not decode, an output that is something else, and photos that no
+    cameras can be recovered from; ClsplatError where pycolmap itself fails. KeyboardInterrupt leaves nothing behind.
+    """
+    report = progress or _ignore
+    if matching not in ("auto", "exhaustive", "sequential"):
+        raise InputError(f"matching {matching!r}: expected auto, exhaustive or sequential")
+    if camera_model not in CAMERA_MODELS:
+        raise InputError(f"camera model {camera_model!r}: expected one of {', '.join(CAMERA_MODELS)}")
+    found = sfm_photos.find_photos(images, excluded=output)
+    paths = found.photos
+    settings = f"{matching} {camera_model} {shared_camera} {max_image_size} {max_features} {seed}"
+    fingerprint = sfm_photos.fingerprint(images, paths, settings)
+    if _is_finished(output, images, fingerprint, overwrite=overwrite):
+        report("using the cameras recovered before", 1.0)
+        return output
+    if len(paths) < MINIMUM_PHOTOS:
+        raise InputError(f"{images}: only {len(paths)} photo(s) found, expected at least {MINIMUM_PHOTOS}")
+    for left_out, why in (
+        (found.others, "convert to JPEG, PNG or TIFF first"),
+        (found.broken, "links that lead nowhere"),
+        (found.companions, "by their names masks, depths or the like of other photos"),
+    ):
+        if left_out:
+            warnings.warn(f"{images}: {_listed(left_out, images)} left out: {why}", stacklevel=2)
+
+    workers = threads or os.cpu_count() or 1
+    output.parent.mkdir(parents=True, exist_ok=True)
+    # beside the output, so that the last step is a rename within one file system
+    work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
+    try:
+        photos = sfm_photos.stage_photos(
+            images, paths, work / "photos", lambda fraction: report("reading photos", fraction), workers
+        )
+        task = {
+            "photos": str(work / "photos"),
+            "work": str(work),
+            "groups": sfm_photos.camera_groups(photos, shared_camera),
+            "sequential": matching == "sequential" or (matching == "auto" and len(photos) > EXHAUSTIVE_PHOTOS),
+            "camera_model": camera_model,
+            "max_image_size": max_image_size,
+            "max_features": max_features,
+            "threads": workers,
+            "seed": seed,
+        }
+        answer = _run_worker(task, work, report)
+        if "failure" in answer:
+            raise InputError(_no_model(images, len(photos), answer["failure"]))
+        result = answer["result"]
+        missing = sorted({photo.name for photo in photos} - set(result["registered"]))
+        record = {"fingerprint": fingerprint, "photos": len(photos), "unregistered": missing, **result}
+        record["files"] = _sizes(work / "result")
+        (work / "result" / RECORD).write_bytes((json.dumps(record, indent=2) + "\n").encode())
+        if missing:
+            lost = _listed([images / name for name in missing], images)
+            warnings.warn(f"{images}: {lost} could not be placed and will not be used", stacklevel=2)
+        if cut := _without_their_alpha(photos, result["registered"], work / "result" / "images"):
+            which = _listed([images / name for name in cut], images)
+            message = f"{which} lost their alpha when their lens was undone: the scene's images are opaque there"
+            warnings.warn(f"{images}: {message}", stacklevel=2)
+        _move_into_place(work, output)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return output
+
+
+def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], result: Path) -> list[str]:
+    """Names of the photos with transparent parts that the result has without alpha: pycolmap keeps it only where the
+    lens model has no distortion, and the file is copied."""
+    transparent = {photo.name for photo in photos if photo.transparent}
+    return [name for name in registered if name in transparent and not sfm_photos.has_alpha(result / name)]
+
+
+def _ignore(text: str, fraction: float | None) -> None:
+    """Where nobody listens to the progress."""
+
+
+def unregistered(output: Path) -> list[str]:
+    """Names of the photos that have no camera in a result of `reconstruct`."""
+    names = _record(output).get("unregistered")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{output / RECORD}: has no list 'unregistered', expected a result of sfm; make it anew")
+    return names
+
+
+def _record(output: Path) -> dict[str, Any]:
+    """What a result was made from. Raises InputError."""
+    path, expected = output / RECORD, "the record of a result of sfm"
+    try:
+        record = parse_json(read_document(path, expected))
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON ({error}), expected {expected}") from None
+    if not isinstance(record, dict):
+        raise InputError(f"{path}: holds no JSON object, expected {expected}")
+    return record
+
+
+def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: bool) -> bool:
+    """Whether output is the result wanted. Raises InputError where it is something that must not be replaced."""
+    if not output.exists():
+        return False
+    if not output.is_dir():
+        raise InputError(f"{output}: is a file, expected a folder for the scene or a new name")
+    try:
+        record = _record(output)
+    except InputError:
+        if any(output.iterdir()):
+            raise InputError(f"{output}: is not empty and not a result of sfm, expected a new folder") from None
+        return False
+    complete = (output / "sparse/0/images.bin").is_file() and (output / "images").is_dir()
+    files = record.get("files")
+    was = files if isinstance(files, dict) else {}  # results of before have no such list
+    now = _sizes(output)
+    changed = sorted(name for name, size in was.items() if now.get(name) != size)
+    if complete and not changed and record.get("fingerprint") == fingerprint:
+        return True
+    if changed and not overwrite:
+        raise InputError(
+            f"{output}: {examples(changed)} are gone or changed since the cameras were recovered; remove the folder, "
+            "or make it anew with clsplat sfm --overwrite"
+        )
+    if not overwrite:
+        raise InputError(
+            f"{output}: holds cameras recovered from other photos or settings than {images} now; "
+            "remove it or choose another folder"
+        )
+    return False
+
+
+def _sizes(result: Path) -> dict[str, int]:
+    """Bytes of the files of a result, by their names in it."""
+    folders = (result / "images", result / "sparse")
+    found = (path for folder in folders for path in folder.rglob("*"))
+    return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(found) if is_file(path)}
+
+
+def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:
+    """Run `clsplat.scenes.sfm_worker` to its end; returns its answer, {"result"} or {"failure"}."""
+    log_path = work / "log.txt"
+    search_path = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
+    with open(log_path, "wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "clsplat.scenes.sfm_worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            encoding="utf-8",
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, search_path))},
+            **apart(),  # Ctrl-C on the terminal is for us, and we end the worker
+        )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            process.stdin.write(json.dumps(task) + "\n")
+            process.stdin.flush()
+            answer = _follow(process.stdout, work / "database.db", report)
+            process.wait()
+        except OSError:  # the worker is gone: a broken pipe, or on Windows an invalid argument
+            answer = {}
+        finally:
+            process.kill()
+            process.wait()
+            with contextlib.suppress(OSError):  # closing writes what the worker never read
+                process.stdin.close()
+            process.stdout.close()
+    if not answer:
+        tail = [line.strip() for line in log_path.read_text("utf-8", errors="replace").splitlines() if line.strip()][
+            -3:
+        ]
+        raise ClsplatError(f"structure from motion failed (status {process.returncode}): {' | '.join(tail)}")
+    return answer
+
+
+def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
+    """Report the worker's stages until its answer; an empty answer if it ends without one."""
+    inbox: queue.Queue[str | None] = queue.Queue()
+
+    def read() -> None:
+        try:
+            for line in lines:
+                inbox.put(line)
+        except ValueError:  # closed under us, as the caller was interrupted
+            pass
+        inbox.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    text, table, total = "starting", None, None
+    counted_at = time.monotonic()
+    while True:
+        try:
+            line = inbox.get(timeout=0.25)
+        except queue.Empty:
+            if table and total and time.monotonic() - counted_at > 0.5:
+                report(text, min(_rows(database, table) / total, 1.0))
+                counted_at = time.monotonic()
+            continue
+        if line is None:
+            return {}
+        message = json.loads(line)
+        if "result" in message or "failure" in message:
+            return dict(message)
+        if "stage" in message:
+            text, table = _STAGES[message["stage"]]
+            total = message["total"]
+            report(text, 0.0 if total else None)
+        elif total:
+            report(text, message["done"] / total)
+
+
+def _rows(database: Path, table: str) -> int:
+    """Rows of a table that the worker is filling; 0 while it cannot be read."""
+    try:
+        connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.1)
+        try:
+            count: int = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]  # noqa: S608 - our names
+        finally:
+            connection.close()
+    except sqlite3.Error:
+        return 0
+    return count
+
+
+def _move_into_place(work: Path, output: Path) -> None:
+    """Make the finished result `output`; an earlier one goes only when the new one stands."""
+    earlier = work / "earlier"
+    if output.exists():
+        replace(output, earlier)
+    try:
+        replace(work / "result", output)
+    except BaseException:
+        if earlier.exists():
+            replace(earlier, output)
+        raise
+
+
+def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
+    return (
+        f"{images}: no cameras could be recovered from {count} photos: {evidence['features']} features in a typical "
+        f"photo, {evidence['matched']} of {evidence['pairs']} pairs match, {evidence['matches']} matches in the best; "
+        "expected sharp photos of one textured, still scene, each sharing half its view with others from beside it"
+    )
+
+
+def _listed(paths: list[Path], folder: Path) -> str:
+    """A line such as 3 photo(s) (a.jpg, b.jpg, c.jpg), cut where there are many."""
+    return f"{len(paths):,} photo(s) ({examples(sfm_photos.photo_name(folder, path) for path in paths)})"

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photos on their way into structure from motion: found, decoded once, stood upright, grouped by camera."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.errors import ClsplatError, InputError
+from clsplat.files import WINDOWS, is_file, native_name, require_room, room_error, write_error
+from clsplat.images.reading import cannot_be_searched, companions, error_of, jpeg_room, open_image
+
+EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+"""What pycolmap's wheel reads and writes; its OpenImageIO has no WebP, JPEG 2000 or HEIF."""
+READABLE = frozenset({"jpeg", "png", "tiff", "bmp"})
+"""OpenImageIO's names of these: what a file is, whatever it is called."""
+OTHER_IMAGES = frozenset({".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"})
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo as staged for pycolmap: its name (path below the folder, with slashes) and what tells its camera.
+
+    width, height: pixels, upright; lens: make, model and focal length from EXIF, empty strings where it has none;
+    transparent: whether any pixel is, in an alpha channel.
+    """
+
+    name: str
+    width: int
+    height: int
+    lens: tuple[str, ...]
+    transparent: bool = False
+
+
+@dataclass(frozen=True)
+class Found:
+    """photos in the order of their names, and what is left out: images of kinds that cannot be used, links that lead
+    nowhere, and masks, depths and the like that go with photos."""
+
+    photos: list[Path]
+    others: list[Path]
+    broken: list[Path]
+    companions: list[Path]
+
+
+def find_photos(folder: Path, excluded: Path | None = None) -> Found:
+    """The photos below a folder.
+
+    Hidden files and folders are skipped, as is `excluded` (the output, where it lies inside). Raises InputError
+    for a folder that does not exist, that cannot be read, or that holds no photos.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder, expected one with photos")
+    skip = excluded.resolve() if excluded is not None else None
+    photos: list[Path] = []
+    others: list[Path] = []
+    broken: list[Path] = []
+    for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
+        here = Path(parent)
+        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() != skip]
+        for name in files:
+            extension = Path(name).suffix.lower()
+            if name.startswith("."):
+                continue
+            if extension in EXTENSIONS and not name.isprintable():
+                raise InputError(f"{here / name}: has a name that a scene cannot list; rename it")
+            if extension in EXTENSIONS and (here / name).is_symlink() and not (here / name).exists():
+                broken.append(here / name)
+            elif extension in EXTENSIONS:
+                photos.append(here / name)
+            elif extension in OTHER_IMAGES:
+                others.append(here / name)
+    if not photos:
+        kinds = " ".join(sorted(EXTENSIONS))
+        found = f", only {len(others)} of a kind not supported such as {others[0].name}" if others else ""
+        found += f", only {len(broken)} link(s) that lead nowhere such as {broken[0].name}" if broken else ""
+        raise InputError(f"{folder}: no photos found{found}; expected files ending in {kinds}")
+    key = partial(photo_name, folder)
+    aside = companions(photos, photos, folder)
+    kept = [path for path in photos if path not in aside]
+    return Found(*(sorted(paths, key=key) for paths in (kept, others, broken, aside)))
+
+
+def photo_name(folder: Path, path: Path) -> str:
+    """The photo's name in the scene: its path below the folder, with forward slashes."""
+    return path.relative_to(folder).as_posix()
+
+
+def fingerprint(folder: Path, photos: Sequence[Path], settings: str) -> str:
+    """Changes when a photo is added, taken away or rewritten, or a setting changes; cheap, as it reads no pixels."""
+    digest = hashlib.sha256(settings.encode())
+    for path in photos:
+        status = path.stat()
+        digest.update(f"\n{photo_name(folder, path)}\t{status.st_size}\t{status.st_mtime_ns}".encode())
+    return digest.hexdigest()
+
+
+def stage_photos(
+    folder: Path, photos: Sequence[Path], target: Path, report: Callable[[float], None], threads: int
+) -> list[Photo]:
+    """Put every photo under target, upright and with its name, and say what it is.
+
+    pycolmap ignores the EXIF orientation and cannot read some kinds of files, so that turned photos, and those that are
+    of such a kind whatever their name says, are written anew; the others are linked (copied where the file system
+    cannot). Every photo is decoded once, as pycolmap would skip a broken one silently:
+    raises InputError with the name of the first that does not decode.
+    """
+    staged: list[Photo] = []
+    with ThreadPoolExecutor(threads) as pool:
+        work = pool.map(partial(_stage, folder, target), photos)
+        try:
+            for photo in work:
+                staged.append(photo)
+                report(len(staged) / len(photos))
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return staged
+
+
+def _stage(folder: Path, target: Path, path: Path) -> Photo:
+    if not is_file(path):
+        raise InputError(f"{path}: cannot be decoded as an image: is no regular file")
+    source = open_image(path)
+    try:
+        spec, kind = source.spec(), source.format_name()
+        pixels = source.read_image(spec.format)
+        # a truncated JPEG still gives pixels, grey at its end, and only an error text says so
+        trouble = error_of(source)
+    finally:
+        source.close()
+    if pixels is None or trouble:
+        raise InputError(f"{path}: cannot be decoded as an image: {_last_line(trouble)}")
+
+    name = photo_name(folder, path)
+    copy = target / name
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    orientation = spec.get_int_attribute("Orientation", 1)
+    width, height = spec.width, spec.height
+    if orientation in range(2, 9) or kind not in READABLE:
+        if orientation in range(5, 9):
+            width, height = height, width
+        _write_upright(path, copy, spec)
+    else:
+        try:
+            if WINDOWS and not os.access(path, os.W_OK):
+                raise PermissionError("a link to a file that is read-only cannot be removed again")
+            os.link(path.resolve(), copy)
+        except OSError:
+            shutil.copyfile(path, copy)
+    focal = spec.get_float_attribute("Exif:FocalLength", 0.0)
+    lens = (spec.get_string_attribute("Make"), spec.get_string_attribute("Model"), f"{focal:.3f}" if focal else "")
+    return Photo(name, width, height, lens, _is_transparent(pixels, spec.alpha_channel))
+
+
+def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
+    """Whether a picture (H, W, C) is not opaque everywhere; alpha_channel: -1 for none."""
+    if alpha_channel < 0:
+        return False
+    opaque = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+    return bool((pixels[:, :, alpha_channel] < opaque).any())
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether an image file has an alpha channel; reads its header alone."""
+    source = oiio.ImageInput.open(native_name(path))
+    if source is None:
+        return False
+    found: bool = source.spec().alpha_channel >= 0
+    source.close()
+    return found
+
+
+def _write_upright(path: Path, copy: Path, spec: Any) -> None:
+    """Write the photo as it is meant to be seen, of the kind that its name says. EXIF stays, for the focal length, but
+    says upright now."""
+    upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(native_name(path)))
+    upright.specmod().attribute("Orientation", 1)
+    upright.specmod().attribute("Compression", "jpeg:98" if copy.suffix.lower() in (".jpg", ".jpeg") else "lzw")
+    with require_room(copy, jpeg_room(spec)):  # libjpeg ends the process when it cannot write
+        written = not upright.has_error and upright.write(native_name(copy))
+    if not written:
+        if error := room_error(copy.parent):
+            raise write_error(copy, error)
+        raise ClsplatError(f"{copy}: cannot write the turned copy of {path}: {_last_line(upright.geterror())}")
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[-1] if lines else "unknown kind of file"
+
+
+def camera_groups(photos: Sequence[Photo], shared_camera: bool | str) -> list[list[str]]:
+    """Names of the photos by camera, each group in order; photos in a group share their intrinsics.
+
+    shared_camera: True puts all photos of one size in a group; "auto" also wants the same make, model and focal
+    length in EXIF; False gives each photo its own camera.
+    """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for photo in photos:
+        if shared_camera is False:
+            key: tuple[object, ...] = (photo.name,)
+        elif shared_camera is True:
+            key = (photo.width, photo.height)
+        else:
+            key = (photo.width, photo.height, *photo.lens)
+        groups.setdefault(key, []).append(photo.name)
+    return list(groups.values())

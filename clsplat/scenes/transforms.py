@@ -1,0 +1,469 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading transforms.json of Blender synthetic (NeRF), nerfstudio and instant-ngp data sets.
+
+Poses there are `world_from_camera` with OpenGL's camera axes (x right, y up, z backward). Here the camera's axes
+become COLMAP's; the world stays as the file has it. So instant-ngp's `scale`, `offset` and `aabb_scale`, which place
+the scene in its own unit cube, touch no pose (they only bound the volume of random points), and nerfstudio's
+`applied_transform` is not undone: its sparse points have been through it as well.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import posixpath
+import re
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError, examples, plain
+from clsplat.files import is_file, open_input, parse_json, read_document
+from clsplat.images.reading import EXTENSIONS, image_size, require_images
+from clsplat.models.formats import ply
+from clsplat.scenes.lens import Lens, absurd, check_lens
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+DRIVE = re.compile(r"\A[A-Za-z]:/")
+COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+NGP_SCALE, NGP_OFFSET = 0.33, 0.5
+"""instant-ngp's defaults: its position is scale times the file's, plus offset."""
+LAST_ROW = 1e-6
+"""Most that a pose's last row may differ from 0 0 0 1: products of float32's matrices are that exact."""
+MAX_NUMBER = 1e30
+"""Larger ones are damage; their squares are still finite."""
+PERSPECTIVE = ("", "PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYE = ("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+RGB = ("red", "green", "blue")
+AGREE = 0.02
+"""Part by which a focal length may differ from what the angle of view beside it makes of it: tools round angles, and
+some take them before they refine the lens."""
+EXPORT_AGAIN = "export the data set anew or add it"
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture of a data set: name, file, lens at the file's listed size, and `cam_from_world`.
+
+    rotation (3, 3), translation (3,), float64; split: "train", "test", or None where the data set has no own split.
+    """
+
+    name: str
+    path: Path
+    lens: Lens
+    rotation: Float64
+    translation: Float64
+    split: str | None = None
+
+
+@dataclass(eq=False)
+class Transforms:
+    """What the files say. points (N, 3) and colors (N, 3) in [0, 1] are nerfstudio's sparse points, if any.
+
+    box: instant-ngp's volume, the corners (low, high), world units, or None.
+    """
+
+    frames: list[Frame]
+    points: Float64 = field(default_factory=lambda: np.empty((0, 3)))
+    colors: Float32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    box: tuple[Float64, Float64] | None = None
+    warnings: list[str] = field(default_factory=list)
+
+
+def read_transforms(path: Path) -> Transforms:
+    """Read one transforms.json.
+
+    Intrinsics may stand in the file or in each frame: `fl_x fl_y` or `camera_angle_x camera_angle_y`, `cx cy` (the
+    middle if absent), `w h` (the picture's own size, or its proportions, if absent), `k1 k2 k3 k4 p1 p2`,
+    `camera_model` or `is_fisheye`.
+    `file_path` is relative to the file, with or without extension. nerfstudio's `ply_file_path` and its
+    `train_filenames`, `val_filenames` and `test_filenames` are honoured: what is in the last two, or not in the first,
+    is held out. The result's warnings tell of what is ignored and of what contradicts itself. Raises InputError that
+    names the file and the key for JSON that does not parse, a key that is missing or of the wrong kind, and listed
+    pictures that are missing.
+    """
+    document = load_document(path)
+    readers = _readers(path, document)
+    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
+    require_images(files, path)
+    frames, heard = _frames(path, readers, files)
+    result = Transforms(frames, warnings=heard)
+    if any("mask_path" in keys.frame for keys in readers):
+        result.warnings.append(f"{path}: 'mask_path' is ignored, masks are not supported")
+    result.box = _ngp_box(Keys(path, None, {}, document))
+    _read_points(path, document, result)
+    return result
+
+
+def read_poses(path: Path, size: tuple[int, int] | None = None) -> list[Frame]:
+    """The cameras of a transforms.json alone, in its order.
+
+    Its pictures need not be there where the file says `w h`; else, where a picture is missing, too, it counts as one of
+    `size`, (width, height). Raises InputError as `read_transforms`; warns of what contradicts itself, and of
+    lenses beyond reason.
+    """
+    readers = _readers(path, load_document(path))
+    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
+    frames, heard = _frames(path, readers, files, size)
+    for text in (*heard, absurd([(frame.name, frame.lens) for frame in frames])):
+        if text:
+            warnings.warn(plain(text), stacklevel=2)
+    return frames
+
+
+def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
+    frames = document.get("frames")
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(f"{path}: has no 'frames' (a list of pictures with their poses); {EXPORT_AGAIN}")
+    readers = [Keys(path, f"frame {index}", frame, document) for index, frame in enumerate(frames)]
+    for keys in readers:
+        _inside(path.parent, keys.text("file_path"), keys.where)
+    return readers
+
+
+def _frames(
+    path: Path, readers: list[Keys], files: list[Path], size: tuple[int, int] | None = None
+) -> tuple[list[Frame], list[str]]:
+    """The frames, and warnings of what contradicts itself."""
+    frames = []
+    for keys, file in zip(readers, files, strict=True):
+        listed = keys.text("file_path")
+        lens = _lens(keys, file, size)
+        rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
+        name = _plain(listed) + file.name[len(PurePosixPath(_plain(listed)).name) :]  # with the extension found
+        frames.append(Frame(name, file, lens, rotation, translation))
+    seen: set[str] = set()
+    for frame in frames:
+        if frame.name in seen:
+            raise InputError(f"{path}: lists {frame.name} twice, expected each picture once; remove one of the frames")
+        seen.add(frame.name)
+    heard = _contradictions(path, readers, frames)
+    return _split(path, readers, frames, heard), heard
+
+
+def _split(path: Path, readers: list[Keys], frames: list[Frame], heard: list[str]) -> list[Frame]:
+    """The frames with nerfstudio's own split, where the file has one."""
+    known = {frame.name: frame.name for frame in frames}
+    known |= {_plain(keys.text("file_path")): frame.name for keys, frame in zip(readers, frames, strict=True)}
+    listed = []
+    for key in ("train_filenames", "test_filenames", "val_filenames"):
+        names = readers[0].document.get(key) or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{path}: '{key}' is {short(names)}, expected a list of file names; correct or remove it")
+        if lost := [name for name in names if _plain(name) not in known]:
+            heard.append(f"{path}: '{key}' lists {examples(lost)}, and no frame has that as its 'file_path'")
+        listed.append({known[_plain(name)] for name in names if _plain(name) in known})
+    train, held_out = listed[0], listed[1] | listed[2]
+    if not (train or held_out):
+        return frames
+    trained = (train or set(known.values())) - held_out
+    if not trained:
+        raise InputError(
+            f"{path}: 'test_filenames' and 'val_filenames' hold out all {len(frames)} pictures, expected some to train "
+            "on; remove these keys for a split of --test-every"
+        )
+    return [replace(frame, split="train" if frame.name in trained else "test") for frame in frames]
+
+
+def _contradictions(path: Path, readers: list[Keys], frames: list[Frame]) -> list[str]:
+    heard = []
+    for axis in "xy":
+        focal, angle = f"fl_{axis}", f"camera_angle_{axis}"
+        found = []
+        for keys, frame in zip(readers, frames, strict=True):
+            used, other = keys.number(focal), keys.get(angle)
+            # one of the frame goes before one of the file, which is of other frames then
+            alike = (keys.frame.get(focal) is None) == (keys.frame.get(angle) is None)
+            if used and alike and isinstance(other, int | float) and 0 < other < math.pi:
+                size = frame.lens.width if axis == "x" else frame.lens.height
+                meant = 0.5 * size / math.tan(0.5 * other)
+                if abs(used / meant - 1) > AGREE:
+                    found.append(f"{frame.name} ({used:g}, not {meant:.4g})")
+        if found:
+            heard.append(f"{path}: '{focal}' is used, '{angle}' says otherwise of {examples(found)}")
+    if any(_shutter(keys.get("rolling_shutter")) for keys in readers):
+        heard.append(f"{path}: 'rolling_shutter' is ignored, pictures are taken as exposed at once")
+    return heard
+
+
+def _shutter(value: object) -> bool:
+    """Whether a rolling shutter does anything."""
+    return any(value) if isinstance(value, list) else bool(value)
+
+
+def read_blender(folder: Path) -> Transforms:
+    """Read transforms_train.json and, if there, transforms_test.json, the data set's own split (val is left out).
+
+    Raises InputError as `read_transforms`.
+    """
+    train = read_transforms(folder / "transforms_train.json")
+    held_out = folder / "transforms_test.json"
+    if not held_out.is_file():
+        return train
+    test = read_transforms(held_out)
+    frames = []
+    for split, part in (("train", train), ("test", test)):
+        frames += [Frame(f.name, f.path, f.lens, f.rotation, f.translation, split) for f in part.frames]
+    names = {frame.name for frame in train.frames}
+    for frame in test.frames:
+        if frame.name in names:
+            raise InputError(f"{held_out}: lists {frame.name}, which is a training picture too; remove one of them")
+    return Transforms(frames, train.points, train.colors, train.box, train.warnings + test.warnings)
+
+
+class Keys:
+    """Values of one frame, or of the file where the frame does not have them; `where` begins every error."""
+
+    def __init__(self, path: Path, part: str | None, frame: dict[str, Any], document: dict[str, Any]) -> None:
+        self.path, self.frame, self.document = path, frame, document
+        self.where = str(path) if part is None else f"{path}: {part}"
+
+    def get(self, key: str) -> Any:
+        value = self.frame.get(key)
+        return self.document.get(key) if value is None else value
+
+    def text(self, key: str) -> str:
+        value = self.get(key)
+        if not isinstance(value, str) or not value.strip():
+            found = f"has no '{key}'" if value is None else f"'{key}' is {short(value)}, expected text"
+            raise InputError(f"{self.where}: {found}; {EXPORT_AGAIN}")
+        return value
+
+    def number(self, key: str) -> float | None:
+        value = self.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
+            raise InputError(f"{self.where}: '{key}' is {short(value)}, expected a number")
+        return float(value)
+
+    def require(self, key: str) -> float:
+        """As `number`; InputError also where there is none."""
+        value = self.number(key)
+        if value is None:
+            raise InputError(f"{self.where}: has no '{key}', expected a number")
+        return value
+
+
+def short(value: object) -> str:
+    """A value for an error's line."""
+    try:
+        return repr(value)[:60]
+    except ValueError:  # an integer of thousands of digits
+        return "an endless number"
+
+
+def load_document(path: Path, expected: str = "a transforms.json", key: str = "'frames'") -> dict[str, Any]:
+    """The JSON object in a file. Raises InputError, which says that `expected`, an object with `key`, was."""
+    try:
+        document = parse_json(read_document(path, expected), once=True)
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON: {error}; expected {expected}") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: holds no JSON object, expected one with {key}")
+    return document
+
+
+def _plain(listed: str) -> str:
+    """A file_path as a name: forward slashes, nothing like "./", "../" or "C:/" before it."""
+    text = DRIVE.sub("/", posixpath.normpath(listed.replace("\\", "/")))
+    return "/".join(part for part in text.split("/") if part not in ("", ".", ".."))
+
+
+def _find_file(folder: Path, listed: str) -> Path:
+    """The picture; one that does not exist is returned as it is listed."""
+    path = Path(os.path.normpath(folder / listed.replace("\\", "/")))
+    if is_file(path) or not path.name:
+        return path
+    for extension in (*EXTENSIONS, *(extension.upper() for extension in EXTENSIONS)):
+        candidate = path.with_name(path.name + extension)
+        if is_file(candidate):
+            return candidate
+    return path
+
+
+def _inside(folder: Path, listed: str, where: str) -> None:
+    """Raise InputError for the name of a file that is not below the folder of the file that lists it."""
+    root = folder.absolute()  # not resolve: a link in the scene's folder may lead anywhere
+    path = Path(os.path.normpath(root / listed.replace("\\", "/")))
+    if not listed.isprintable() or not path.is_relative_to(os.path.normpath(root)):
+        raise InputError(
+            f"{where}: {short(listed)} is no path inside the scene's folder {folder}; move what it names into it, or "
+            "put a link there"
+        )
+
+
+def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
+    width, height = keys.number("w"), keys.number("h")
+    if width is None or height is None:
+        if not file.is_file():
+            if size is None:
+                raise InputError(
+                    f"{keys.where}: has no 'w' and 'h', nor is its picture there: {file}; give both --width and "
+                    "--height"
+                )
+            found = size
+        else:
+            found = image_size(file, orient=False)
+        if width is not None:  # the other one in the picture's proportions
+            height = width * found[1] / found[0]
+        elif height is not None:
+            width = height * found[0] / found[1]
+        else:
+            width, height = found
+    assert height is not None
+    fx = _focal(keys, "fl_x", "camera_angle_x", width)
+    fy = _focal(keys, "fl_y", "camera_angle_y", height)
+    if fx is None and fy is None:
+        raise InputError(
+            f"{keys.where}: has neither 'fl_x' nor 'camera_angle_x', expected the focal length in pixels or the "
+            "horizontal angle of view in radians; add one of them to the file"
+        )
+    cx, cy = keys.number("cx"), keys.number("cy")
+    core = [
+        fx if fx is not None else fy,
+        fy if fy is not None else fx,
+        cx if cx is not None else width / 2,
+        cy if cy is not None else height / 2,
+    ]
+    model, extra = _distortion(keys)
+    params = tuple(float(value) for value in (*core, *extra) if value is not None)
+    return check_lens(Lens(model, round(width), round(height), params), keys.where)
+
+
+def _focal(keys: Keys, focal: str, angle: str, size: float) -> float | None:
+    if (value := keys.number(focal)) is not None:
+        return value
+    if (value := keys.number(angle)) is None:
+        return None
+    if not 0 < value < math.pi:
+        raise InputError(f"{keys.where}: '{angle}' is {value}, expected an angle between 0 and pi, in radians")
+    return 0.5 * size / math.tan(0.5 * value)
+
+
+def _distortion(keys: Keys) -> tuple[str, list[float]]:
+    """COLMAP's model and its coefficients."""
+    model = keys.get("camera_model") or ""
+    k1, k2, k3, k4, k5, k6, p1, p2 = (
+        keys.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+    )
+    if model in FISHEYE or keys.get("is_fisheye") is True:
+        return "OPENCV_FISHEYE", [k1, k2, k3, k4]
+    if model not in PERSPECTIVE:
+        listed = ", ".join(name for name in (*PERSPECTIVE, *FISHEYE) if name)
+        raise InputError(f"{keys.where}: unknown 'camera_model' {short(model)}, expected one of {listed}")
+    if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
+        return "PINHOLE", []
+    if k4 and model != "FULL_OPENCV":
+        # nerfstudio means a term in r^8 by it, OpenCV one in a denominator
+        raise InputError(
+            f"{keys.where}: 'k4' is {k4} in a perspective camera, expected 0; undistort the pictures first"
+        )
+    if k3 or k4 or k5 or k6:
+        return "FULL_OPENCV", [k1, k2, p1, p2, k3, k4, k5, k6]
+    return "OPENCV", [k1, k2, p1, p2]
+
+
+def numbers(given: Any) -> Float64:
+    """An array of a list of numbers, or of lists of them; (0,) for what is none. True and false are no numbers."""
+    rows = given if isinstance(given, list) else []
+    if any(isinstance(each, bool) for row in rows for each in (row if isinstance(row, list) else [row])):
+        return np.empty(0)
+    try:
+        return np.array(given, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+
+
+def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64, float]:
+    """`cam_from_world` rotation (3, 3) and translation (3,), and the scale that was in it, of a `world_from_cam` matrix
+    (4, 4) or (3, 4) in OpenGL's axes. Raises InputError, about `what` in `where`, for what is no pose."""
+    if given is None:
+        raise InputError(f"{where}: has no {what} (the 4 x 4 pose); {EXPORT_AGAIN}")
+    matrix = numbers(given)
+    if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < MAX_NUMBER).all():
+        raise InputError(f"{where}: {what} is {short(given)}, expected 4 x 4 finite numbers")
+    # A scaled camera object leaves its scale in the matrix; a camera has none.
+    determinant = float(np.linalg.det(matrix[:3, :3]))
+    scale = float(np.cbrt(determinant))
+    axes = matrix[:3, :3] / scale if determinant > 0 else np.zeros((3, 3))
+    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-2:
+        raise InputError(
+            f"{where}: {what} has no rotation in it (determinant {determinant:.3g}), expected "
+            "world_from_camera in OpenGL's axes; check how it was exported"
+        )
+    if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > LAST_ROW:
+        columns = not matrix[:3, 3].any() and abs(matrix[3, 3] - 1) <= LAST_ROW
+        advice = "it is written column by column, so transpose it" if columns else "check how it was exported"
+        raise InputError(
+            f"{where}: {what} has the last row {short(matrix[3].tolist())}, expected 0 0 0 1, with the position in the "
+            f"last column; {advice}"
+        )
+    u, _, v = np.linalg.svd(axes)
+    cam_from_world: Float64 = (u @ v @ COLMAP_FROM_OPENGL).T
+    return cam_from_world, -cam_from_world @ matrix[:3, 3], scale
+
+
+def _ngp_box(keys: Keys) -> tuple[Float64, Float64] | None:
+    side = keys.number("aabb_scale")
+    if side is None or side <= 0:
+        return None
+    scale, offset = keys.get("scale"), keys.get("offset")
+    try:
+        shift = np.broadcast_to(np.array(NGP_OFFSET if offset is None else offset, np.float64), 3)
+        factor = float(NGP_SCALE if scale is None else scale)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{keys.where}: 'scale' or 'offset' is not of numbers, expected one and three") from None
+    if not (1 / MAX_NUMBER < factor < MAX_NUMBER and (np.abs(shift) < MAX_NUMBER).all()):
+        raise InputError(f"{keys.where}: 'scale' is {factor}, 'offset' {shift.tolist()}, expected a scale above 0")
+    return (0.5 - side / 2 - shift) / factor, (0.5 + side / 2 - shift) / factor
+
+
+def _read_points(path: Path, document: dict[str, Any], result: Transforms) -> None:
+    listed = document.get("ply_file_path")
+    if not isinstance(listed, str) or not listed:
+        return
+    _inside(path.parent, listed, f"{path}: 'ply_file_path'")
+    cloud = path.parent / listed.replace("\\", "/")
+    if is_file(cloud):
+        result.points, result.colors = read_point_cloud(cloud)
+    else:
+        result.warnings.append(f"{path}: its points 'ply_file_path' are missing: {cloud}; using random ones")
+
+
+def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
+    """Positions (N, 3) float64 and colours (N, 3) float32 in [0, 1] of a PLY, grey where it has no colours.
+
+    Raises InputError for a file that is none, cut short, without x y z, or with positions that are not finite.
+    """
+    with open_input(path, "a PLY of points") as file:
+        header = ply.read_header(file, path)
+        vertex = header.elements[0] if header.elements else None
+        if vertex is None or vertex.name != "vertex" or vertex.has_list:
+            raise InputError(f"{path}: begins with no plain vertices, expected a point cloud")
+        kinds = dict(vertex.properties)
+        if missing := [name for name in "xyz" if name not in kinds]:
+            raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
+        coloured = all(name in kinds for name in RGB)
+        parts: list[tuple[Float64, Float32]] = [(np.empty((0, 3)), np.empty((0, 3), np.float32))]
+        for block in ply.read_vertices(file, header, path, "point"):
+            points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
+            colors: Float32 = np.full(points.shape, 0.5, np.float32)
+            if coloured:
+                with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, refused below
+                    colors = np.stack([block[name] for name in RGB], axis=1).astype(np.float32)
+            parts.append((points, colors))
+    points, colors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: holds positions that are not finite")
+    if not np.isfinite(colors).all():
+        raise InputError(f"{path}: holds colours that are not finite")
+    if coloured:
+        colors = np.clip(colors / np.float32(255 if kinds["red"][0] in "iu" else 1), 0, 1)
+    return points, colors

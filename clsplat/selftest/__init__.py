@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The self-test: whether a driver is to be trusted."""

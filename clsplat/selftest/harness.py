@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the stages of the self-test share: a frozen scene on a device, errors and digests."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.context import Device
+from clsplat.device.layout import SPLAT
+from clsplat.reference import blend as reference_blend
+from clsplat.reference import project as reference_project
+from clsplat.reference.sort import depth_order
+from clsplat.selftest.scenes import Frozen
+from clsplat.stages.blend import Blended
+from clsplat.stages.duplicate import Band, Counted, Pairs
+from clsplat.stages.project import Projected, pack_camera, tiles_of, upload_gaussians
+from clsplat.stages.ranges import TileLists
+
+T = TypeVar("T")
+Array = NDArray[Any]
+Float64 = NDArray[np.float64]
+
+WHITEN = np.sqrt(0.5 * np.log2(np.e))
+MARGIN = 1e-4
+"""Pixels where alpha, or what is left of the light, is relatively nearer than this to a threshold are not compared:
+there a rounding decides. It is a hundred times what rounding moves them by."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one stage on one scene: arrays that the digest is of, errors by the name of what was compared, absolute and in
+    ulp; trouble in words; otherwise: operations that round in another way than IEEE 754's."""
+
+    arrays: Sequence[Array]
+    errors: dict[str, tuple[float, float]]
+    ms: float
+    trouble: str = ""
+    otherwise: tuple[str, ...] = ()
+
+
+def error_of(got: Array, wanted: Array) -> tuple[float, float]:
+    """(worst absolute error, worst in ulp): ulp of the wanted value, or where that is smaller of the array's root mean
+    square, as what is left of a sum that cancels has no digits of its own. Infinite where a value is not finite."""
+    if wanted.size == 0:
+        return 0.0, 0.0
+    with np.errstate(all="ignore"):
+        error = np.abs(np.asarray(got, np.float64) - wanted)
+        size = np.maximum(np.abs(wanted), np.sqrt(np.mean(np.square(wanted))))
+        ulp = error / np.spacing(np.maximum(size, 1e-30).astype(np.float32)).astype(np.float64)
+    if not np.isfinite(error).all():
+        return float("inf"), float("inf")
+    return float(error.max()), float(ulp.max())
+
+
+def worst(parts: dict[str, tuple[Array, Array]]) -> dict[str, tuple[float, float]]:
+    """`error_of` what was got and what is wanted, by name."""
+    return {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
+
+
+def wrong_counts(**counts: int) -> str:
+    """In words, what is wrong; nothing where every count is 0."""
+    return ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in counts.items() if count)
+
+
+def digest_of(arrays: Sequence[Array]) -> str:
+    """CRC-32 of the bytes one after the other."""
+    total = 0
+    for array in arrays:
+        total = zlib.crc32(np.ascontiguousarray(array).tobytes(), total)
+    return f"{total:08x}"
+
+
+class Bench:
+    """One frozen scene on one device, with what the stages have made so far."""
+
+    def __init__(self, device: Device, frozen: Frozen) -> None:
+        self.device, self.frozen = device, frozen
+        self.work = Workspace(device)
+        self.model = upload_gaussians(device, frozen.gaussians)
+        self.camera = frozen.camera
+        self.camera_array = upload(device, pack_camera(frozen.camera))
+        self.background = upload(device, frozen.background)
+        self.tiles = tiles_of(frozen.camera)
+        self.band = Band(0, self.tiles[0] * self.tiles[1])
+        self.projected: Projected
+        self.counted: Counted
+        self.pairs: Pairs
+        self.lists: TileLists
+        self.blended: Blended
+        self.features: DeviceArray
+
+    def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, list[Array], float, str]:
+        """The stage's value, its arrays on the host and ms, of a second run; trouble where that differs from the first,
+        which had the kernels to build."""
+        first = take(launch())
+        self.device.finish()
+        start = time.perf_counter()
+        value = launch()
+        self.device.finish()
+        ms = 1e3 * (time.perf_counter() - start)
+        arrays = take(value)
+        same = digest_of(first) == digest_of(arrays)
+        return value, arrays, ms, "" if same else "two runs on the same input gave different bits"
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        shown: NDArray[np.bool_] = self.projected.tile_counts.get() > 0
+        return shown
+
+    def splats(self) -> reference_project.Projected:
+        """The splats that the device made, as the reference has them."""
+        visible = self.visible
+        raw = self.projected.splats.get()
+        raw[~visible] = 1.0  # memory that nobody has written
+        splats = raw.astype(np.float64)
+        field = {name: splats[:, index] for index, name in enumerate(SPLAT)}
+        means = np.stack([field["PIXEL_X"] + field["SUB_X"], field["PIXEL_Y"] + field["SUB_Y"]], axis=1)
+        l11, l12, l22 = (field[name] / WHITEN for name in ("L11", "L12", "L22"))
+        conics = np.stack([l11 * l11, l11 * l12, l12 * l12 + l22 * l22], axis=1)
+        det = (l11 * l22) ** 2
+        return reference_project.Projected(
+            means2d=means,
+            covariances=np.stack([conics[:, 2] / det, -conics[:, 1] / det, conics[:, 0] / det], axis=1),
+            conics=conics,
+            whitening=np.stack([l11, l12, l22], axis=1),
+            half_extents=np.stack([field["HALF_W"], field["HALF_H"]], axis=1),
+            depths=field["DEPTH"],
+            opacities=np.exp2(field["LOG2O"]),
+            colors=np.stack([field["RED"], field["GREEN"], field["BLUE"]], axis=1),
+            visible=visible,
+        )
+
+    def blend_reference(self) -> reference_blend.Blended:
+        """The frame of the splats that the device made."""
+        splats = self.splats()
+        order = depth_order(splats.depths, splats.visible)
+        camera, background = self.camera, self.frozen.background.astype(np.float64)
+        return reference_blend.blend(splats, order, camera.width, camera.height, background, margins=True)

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stages of the self-test that only pictures need: channels beside colour, slices by depth, cameras without an
+image plane."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from clsplat.camera import Camera, Projection
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.layout import RAY
+from clsplat.reference import channels as reference_channels
+from clsplat.reference import deep as reference_deep
+from clsplat.reference import every_pixel
+from clsplat.reference import rays as reference_rays
+from clsplat.reference.render import parameters
+from clsplat.reference.sort import depth_order
+from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Float64, Outcome, worst, wrong_counts
+from clsplat.stages.blend import Blended, blend
+from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
+from clsplat.stages.deep import deep
+from clsplat.stages.duplicate import count, duplicate
+from clsplat.stages.project import Projected, pack_camera, project
+from clsplat.stages.ranges import tile_lists
+
+ALL = Features.of(WIDTHS)
+SIDEWAYS = 1e-4
+"""Cosine between a normal and the direction to the camera under which a rounding decides which side is seen."""
+DOUBT = 1e-5
+"""As `harness.MARGIN`, of the light that is left to one half, and of the two largest weights."""
+
+FEW = 500
+"""Gaussians whose picture around the camera the reference has in a second: it has each at every pixel."""
+
+
+def _after(camera: Camera) -> Camera:
+    """Where motion goes to: a step aside, up and back, with a longer lens."""
+    return replace(camera, translation=camera.translation + np.array([-0.0625, 0.03125, 0.125]), fx=camera.fx + 2.0)
+
+
+def _geometry(bench: Bench) -> dict[str, Float64]:
+    arrays = parameters(bench.frozen.gaussians)
+    return {name: arrays[name] for name in ("means", "quaternions", "log_scales")}
+
+
+def _features(bench: Bench) -> Outcome:
+    device, camera, visible = bench.device, bench.camera, bench.visible
+    after = upload(device, pack_camera(_after(camera)))
+    bench.features, (got,), ms, trouble = bench.twice(
+        lambda: features(device, bench.work, ALL, bench.model, bench.camera_array, after, bench.projected),
+        lambda rows: [rows.get()[visible]],
+    )
+    shown = {name: values[visible] for name, values in _geometry(bench).items()}
+    normals = reference_channels.normals(**shown, camera=camera)
+    away = shown["means"] - camera.position
+    clear = np.abs((away * normals).sum(axis=1)) > SIDEWAYS * np.linalg.norm(away, axis=1)
+    wanted = {
+        "depth": bench.splats().depths[visible, None],
+        "normal": normals,
+        "position": shown["means"],
+        "motion": reference_channels.motions(shown["means"], camera, _after(camera)),
+    }
+    parts = {
+        name: (got[:, at : at + WIDTHS[name]], np.asarray(wanted[name], np.float64)) for name, at in ALL.offsets.items()
+    }
+    parts["normal"] = (parts["normal"][0][clear], normals[clear])
+    return Outcome([got], worst(parts), ms, trouble)
+
+
+def _channels(bench: Bench) -> Outcome:
+    device, camera = bench.device, bench.camera
+    of = (bench.features, bench.lists, bench.projected, bench.blended, camera.height)
+    _, arrays, ms, trouble = bench.twice(
+        lambda: channels(device, bench.work, ALL, *of), lambda found: [found.means.get(), found.whole.get()]
+    )
+    splats, frame = bench.splats(), bench.blend_reference()
+    order = depth_order(splats.depths, splats.visible)
+    wanted = reference_channels.channels(splats, order, camera, _after(camera), **_geometry(bench))
+    means, whole = (_cropped(planes, camera) for planes in arrays)
+    assert frame.margin is not None
+    sure = (frame.margin > MARGIN) & (wanted.doubt > DOUBT)
+    # a sum that cancels, as normals may where little is opaque, has no digits of its own
+    solid = sure & (frame.transmittance < 0.5)
+    parts = {
+        name: (means[solid, at : at + WIDTHS[name]], getattr(wanted, name).reshape(*solid.shape, -1)[solid])
+        for name, at in ALL.offsets.items()
+    }
+    parts["median"] = (means[sure, -2], wanted.median[sure])
+    parts["first"] = (means[sure, -1], wanted.first[sure])
+    counts, indices = (int((whole[sure, k] != of[sure]).sum()) for k, of in enumerate((wanted.count, wanted.index)))
+    return Outcome(arrays, worst(parts), ms, trouble or wrong_counts(counts=counts, indices=indices))
+
+
+def _deep(bench: Bench) -> Outcome:
+    device, camera = bench.device, bench.camera
+    bounds = np.array([1.75, 2.5, 4.0], np.float32)
+    given = upload(device, np.append(bounds, np.float32(0)))
+    of = (bench.lists, bench.projected.splats, bench.blended, camera.height)
+    _, (planes,), ms, trouble = bench.twice(lambda: deep(device, bench.work, given, *of), lambda slices: [slices.get()])
+    splats, margin = bench.splats(), bench.blend_reference().margin
+    assert margin is not None
+    order = depth_order(splats.depths, splats.visible)
+    wanted = reference_deep.deep(splats, order, camera.width, camera.height, bounds)[:, margin > MARGIN]
+    got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, margin > MARGIN]
+    fields = {"colour": slice(0, 3), "alpha": slice(3, 4), "depths": slice(4, 6)}
+    return Outcome([planes], worst({name: (got[..., at], wanted[..., at]) for name, at in fields.items()}), ms, trouble)
+
+
+_PROJECTIONS: dict[Projection, int] = {"equirectangular": 1, "fisheye": 2}
+
+
+def _rays(bench: Bench) -> Outcome:
+    """Projection to tangent planes, and a frame with a channel of it, for both kinds of camera."""
+    outcomes = [_of_rays(bench, projection) for projection in _PROJECTIONS]
+    return Outcome(
+        [array for each in outcomes for array in each.arrays],
+        {name: error for each in outcomes for name, error in each.errors.items()},
+        sum(each.ms for each in outcomes),
+        next((each.trouble for each in outcomes if each.trouble), ""),
+    )
+
+
+def _amid(camera: Camera, projection: Projection) -> Camera:
+    """In the middle of what the frozen scenes show: all around there is something, at the poles and on the seam."""
+    middle = np.array([0.25, -0.125, 4.0])
+    rotation = camera.rotation
+    translation = -(rotation[:, 0] * middle[0] + rotation[:, 1] * middle[1] + rotation[:, 2] * middle[2])
+    focal = camera.width / (2 * np.pi) if projection == "equirectangular" else 0.25 * camera.width
+    centre = (0.5 * camera.width, 0.5 * camera.height)
+    return Camera(camera.width, camera.height, focal, focal, *centre, rotation, translation, projection=projection)
+
+
+def _of_rays(bench: Bench, projection: Projection) -> Outcome:
+    device = bench.device.with_switches({"RAYS": _PROJECTIONS[projection]})
+    # memory of its own: the next stages want what those before have made
+    work, camera, gaussians = Workspace(device), _amid(bench.camera, projection), bench.frozen.gaussians
+    camera_array = upload(device, pack_camera(camera))
+    depth = Features.of(())
+
+    def launch() -> tuple[Projected, Blended, Channels]:
+        projected = project(device, work, bench.model, camera, camera_array)
+        counted = count(device, work, projected.splats, projected.tile_counts)
+        lists = tile_lists(
+            device,
+            work,
+            duplicate(device, work, projected.splats, counted, bench.tiles, bench.band),
+            bench.band.tiles,
+        )
+        of = (projected.splats, bench.background, camera.width, camera.height)
+        blended = blend(device, work, lists, *of, record=False, camera_array=camera_array)
+        rows = features(device, work, depth, bench.model, camera_array, camera_array, projected)
+        of_channels = (rows, lists, projected, blended, camera.height)
+        return projected, blended, channels(device, work, depth, *of_channels, camera_array=camera_array)
+
+    def take(found: tuple[Projected, Blended, Channels]) -> list[Array]:
+        projected, blended, beside = found
+        counts = projected.tile_counts.get()
+        own = [projected.splats.get()[counts > 0], counts]
+        return [*own, blended.image.get(), blended.transmittance.get(), beside.means.get(), beside.whole.get()]
+
+    _, arrays, ms, trouble = bench.twice(launch, take)
+    splats, counts, image, left, means, _ = arrays
+    tangents, shown = reference_rays.tangents(gaussians, camera), counts > 0
+    parts = _tangent_parts(tangents, shown, splats)
+    if bench.model.count <= FEW:
+        picture = every_pixel.render(gaussians, camera, bench.frozen.background.astype(np.float64))
+        clear = picture.margin > 3 * MARGIN  # directions of float32 are good to 1e-7, a pixel is 0.1
+        solid = clear & (picture.alpha > 0.5)
+        parts["image"] = (_cropped(image, camera)[clear], picture.image[clear])
+        parts["transmittance"] = (_cropped(left, camera)[clear], 1 - picture.alpha[clear])
+        parts["mean depth"] = (_cropped(means, camera)[solid, 0], picture.depth[solid])
+    hidden = int((shown & ~tangents.visible).sum())
+    errors = {f"{name}, {projection}": error for name, error in worst(parts).items()}
+    return Outcome(arrays, errors, ms, trouble or wrong_counts(hidden_Gaussians=hidden))
+
+
+def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array) -> dict[str, tuple[Array, Array]]:
+    """Columns of the Gaussians that are shown, and what they are in float64."""
+
+    def column(*names: str) -> Array:
+        return splats[:, [RAY.index(name) for name in names]]
+
+    sxx, sxy, syy = (tangents.covariances[shown][:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    l11 = WHITEN * np.sqrt(syy / (sxx * syy - sxy * sxy))
+    u = l11[:, None] * (tangents.right[shown] - (sxy / syy)[:, None] * tangents.down[shown])
+    v = (WHITEN / np.sqrt(syy))[:, None] * tangents.down[shown]
+    size = np.linalg.norm(u, axis=1, keepdims=True), np.linalg.norm(v, axis=1, keepdims=True)
+    return {
+        "direction": (column("FX", "FY", "FZ"), tangents.directions[shown]),
+        "U": (column("UX", "UY", "UZ") / size[0], u / size[0]),
+        "V": (column("VX", "VY", "VZ") / size[1], v / size[1]),
+        "distance": (column("DEPTH"), tangents.depths[shown, None]),
+        "log2 of opacity": (column("LOG2O"), np.log2(tangents.opacities[shown, None])),
+        "colour": (column("RED", "GREEN", "BLUE"), tangents.colors[shown]),
+    }
+
+
+def _cropped(planes: Array, camera: Camera) -> Array:
+    """(H, W) or (H, W, fields) of planes with their padding."""
+    inside = planes[..., : camera.height, : camera.width]
+    return inside.transpose(1, 2, 0) if inside.ndim == 3 else inside
+
+
+PICTURES: dict[str, Callable[[Bench], Outcome]] = {
+    "features": _features,
+    "channels": _channels,
+    "deep": _deep,
+    "rays": _rays,
+}

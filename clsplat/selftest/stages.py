@@ -1,0 +1,438 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stages of the self-test: each on one frozen scene, by itself on what the stage before it has made, against the
+float64 reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config.training import OptimiserConfig
+from clsplat.device.buffers import DeviceArray, upload
+from clsplat.device.launch import launch_items
+from clsplat.device.layout import SLOT_PLAIN, SPLAT, TILE
+from clsplat.reference import adam as reference_adam
+from clsplat.reference import blend as reference_blend
+from clsplat.reference import loss as reference_loss
+from clsplat.reference import project as reference_project
+from clsplat.reference.render import parameters
+from clsplat.reference.sort import depth_order
+from clsplat.reference.tiles import touched_tiles
+from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Float64, Outcome, worst, wrong_counts
+from clsplat.selftest.picture_stages import PICTURES
+from clsplat.selftest.scenes import evenly, keys
+from clsplat.stages.adam import adam
+from clsplat.stages.blend import blend, blend_grad
+from clsplat.stages.density import add_statistics, new_statistics
+from clsplat.stages.duplicate import Pairs, count, duplicate
+from clsplat.stages.loss import loss
+from clsplat.stages.project import (
+    GROUPS,
+    DeviceGaussians,
+    Projected,
+    Screen,
+    Slots,
+    allocate_gaussians,
+    group_shapes,
+    project,
+    project_grad,
+)
+from clsplat.stages.ranges import tile_lists
+from clsplat.stages.sort import bitonic_sort, radix_sort
+
+
+def _arithmetic(bench: Bench) -> Outcome:
+    device, n = bench.device, 4096
+    a, b = evenly(21, (n,), 1.0, 2.0, 1 << 22), evenly(22, (n,), 1.0, 4.0, 1 << 20)
+    c = evenly(23, (n,), -4.0, 4.0, 1 << 22)
+    arrays = [upload(device, values.astype(np.float32)) for values in (a, b, c)]
+    kernel = device.kernels("arithmetic").arithmetic
+
+    def launch() -> DeviceArray:
+        out = bench.work.array("arithmetic", (4, n))
+        launch_items(device, kernel, n // device.shape.lanes, n, *arrays, out)
+        return out
+
+    _, (got,), ms, trouble = bench.twice(launch, lambda out: [out.get()])
+    exact = {"division": a / b, "square root": np.sqrt(b), "fused multiply-add": a * b + c}
+    errors = {}
+    for (name, wanted), row in zip(exact.items(), got[:3], strict=True):
+        error = np.abs(row.astype(np.float64) - wanted)
+        errors[name] = (float(error.max()), float((error / np.spacing(np.abs(wanted).astype(np.float32))).max()))
+    if (got[2] != exact["fused multiply-add"].astype(np.float32)).any():
+        trouble = trouble or "fused multiply-adds are not rounded once"
+    otherwise = [
+        name for (name, wanted), row in zip(exact.items(), got, strict=False) if (row != wanted.astype(row.dtype)).any()
+    ]
+    if (got[3] != (a * 2.0**-140).astype(np.float32)).any():
+        otherwise.append("denormal numbers")
+    return Outcome([got[:3]], errors, ms, trouble, tuple(otherwise))
+
+
+def _project(bench: Bench) -> Outcome:
+    device, camera = bench.device, bench.camera
+    columns = [index for index, name in enumerate(SPLAT) if name != "UNUSED"]
+
+    def take(projected: Projected) -> list[Array]:
+        counts = projected.tile_counts.get()
+        return [projected.splats.get()[counts > 0][:, columns], counts]
+
+    bench.projected, arrays, ms, trouble = bench.twice(
+        lambda: project(device, bench.work, bench.model, camera, bench.camera_array), take
+    )
+    gaussians = bench.frozen.gaussians
+    wanted = reference_project.project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
+    got, shown = bench.splats(), bench.visible & wanted.visible
+    log2o = bench.projected.splats.get()[shown, SPLAT.index("LOG2O")]
+    errors = worst(
+        {
+            "mean": (got.means2d[shown], wanted.means2d[shown]),
+            "whitening": (got.whitening[shown], wanted.whitening[shown]),
+            "log2 of opacity": (log2o, np.log2(wanted.opacities[shown])),
+            "depth": (got.depths[shown], wanted.depths[shown]),
+            "colour": (got.colors[shown], wanted.colors[shown]),
+            "extent": (got.half_extents[shown], wanted.half_extents[shown]),
+        }
+    )
+    touched = touched_tiles(wanted, camera.width, camera.height, TILE, reference_project.ALPHA_MIN * (1 + 1e-5))
+    too_few = sum(len(tiles) > found for tiles, found in zip(touched, arrays[1], strict=True))
+    return Outcome(
+        arrays,
+        errors,
+        ms,
+        trouble or wrong_counts(tile_counts=too_few + int((arrays[1] > _box_tiles(wanted, bench.tiles)).sum())),
+    )
+
+
+def _box_tiles(projected: reference_project.Projected, tiles: tuple[int, int]) -> NDArray[np.int64]:
+    """Tiles of each Gaussian's bounding box with half a pixel around it, which are all that may be listed; 0 where it
+    is not visible."""
+    low = np.floor((projected.means2d - projected.half_extents - 0.5) / TILE)
+    high = np.floor((projected.means2d + projected.half_extents + 0.5) / TILE) + 1
+    spans = np.clip(high, 0, tiles) - np.clip(low, 0, tiles)
+    return np.where(projected.visible, spans.prod(axis=1), 0).astype(np.int64)
+
+
+def _duplicate(bench: Bench) -> Outcome:
+    device, work, projected = bench.device, bench.work, bench.projected
+
+    def launch() -> Pairs:
+        bench.counted = count(device, work, projected.splats, projected.tile_counts)
+        return duplicate(device, work, projected.splats, bench.counted, bench.tiles, bench.band)
+
+    bench.pairs, arrays, ms, trouble = bench.twice(
+        launch, lambda pairs: [pairs.tile_keys.get(), pairs.pair_ids.get(), pairs.first_slots.get()]
+    )
+    tile_keys, ids, first_slots = arrays
+    counts, got = projected.tile_counts.get().astype(np.int64), bench.splats()
+    order = depth_order(got.depths, got.visible)
+    owners = np.repeat(order, counts[order])
+    place = np.arange(len(owners)) - np.repeat(np.cumsum(counts[order]) - counts[order], counts[order])
+    scanned = np.cumsum(counts) - counts
+    wrong = int((first_slots != scanned).sum())
+    if len(ids) != len(owners):
+        return Outcome(arrays, {}, ms, f"{len(ids)} pairs instead of {len(owners)}")
+    wrong += int((ids[:, 1] != owners).sum()) + int((ids[:, 0] != scanned[owners] + place).sum())
+    # each Gaussian's tiles ascend; all that it reaches are among them
+    wrong += int((np.diff(tile_keys.astype(np.int64))[place[1:] > 0] <= 0).sum()) + int(
+        (tile_keys >= bench.band.end).sum()
+    )
+    threshold = reference_project.ALPHA_MIN * (1 + 1e-5)
+    touched = touched_tiles(got, bench.camera.width, bench.camera.height, TILE, threshold)
+    listed = set(zip(owners.tolist(), tile_keys.tolist(), strict=True))
+    missing = sum((gaussian, tile) not in listed for gaussian, tiles in enumerate(touched) for tile in tiles.tolist())
+    return Outcome(arrays, {}, ms, trouble or wrong_counts(pairs=wrong + missing))
+
+
+def _sort(bench: Bench) -> Outcome:
+    """Both sorts, on keys of their own: whichever is quicker for a scene, the other is for another."""
+    device, work = bench.device, bench.work
+    sizes = [(400, 12, False), (3000, 20, True), (30_000 if bench.frozen.name == "crowd" else 5000, 32, True)]
+    given = [keys(51 + index, n, bits) for index, (n, bits, _) in enumerate(sizes)]
+    on_device = [upload(device, values) for values in given]
+
+    def launch() -> list[DeviceArray]:
+        found: list[DeviceArray] = []
+        for index, ((_, bits, radix), values) in enumerate(zip(sizes, on_device, strict=True)):
+            name = f"sorted{index}"
+            both = radix_sort(device, work, name, values, bits) if radix else bitonic_sort(device, work, name, values)
+            found += both
+        return found
+
+    _, arrays, ms, trouble = bench.twice(launch, lambda found: [array.get() for array in found])
+    wrong = 0
+    for values, got, positions in zip(given, arrays[::2], arrays[1::2], strict=True):
+        order = np.argsort(values, kind="stable")
+        wrong += int((got != values[order]).sum()) + int((positions != order).sum())
+    return Outcome(arrays, {}, ms, trouble or wrong_counts(sorted_keys=wrong))
+
+
+def _ranges(bench: Bench) -> Outcome:
+    bench.lists, arrays, ms, trouble = bench.twice(
+        lambda: tile_lists(bench.device, bench.work, bench.pairs, bench.band.tiles),
+        lambda lists: [lists.ranges.get(), lists.gaussian_from_sorted.get(), lists.slot_from_sorted.get()],
+    )
+    tile_keys, ids = bench.pairs.tile_keys.get(), bench.pairs.pair_ids.get()
+    order = np.argsort(tile_keys, kind="stable")
+    ends = np.searchsorted(tile_keys[order], np.arange(bench.band.tiles), side="right")
+    begins = np.searchsorted(tile_keys[order], np.arange(bench.band.tiles), side="left")
+    wanted = np.where((ends > begins)[:, None], np.stack([begins, ends], axis=1), 0)
+    wrong = int((arrays[0] != wanted).sum())
+    wrong += int((arrays[1] != ids[order, 1]).sum()) + int((arrays[2] != ids[order, 0]).sum())
+    return Outcome(arrays, {}, ms, trouble or wrong_counts(list_entries=wrong))
+
+
+def _blend(bench: Bench) -> Outcome:
+    device, camera = bench.device, bench.camera
+    bench.blended, arrays, ms, trouble = bench.twice(
+        lambda: blend(
+            device,
+            bench.work,
+            bench.lists,
+            bench.projected.splats,
+            bench.background,
+            camera.width,
+            camera.height,
+        ),
+        lambda blended: [blended.image.get(), blended.transmittance.get(), blended.stops.get()],
+    )
+    wanted = bench.blend_reference()
+    assert wanted.margin is not None
+    clear = wanted.margin > MARGIN
+    image = arrays[0][:, : camera.height, : camera.width].transpose(1, 2, 0)
+    left = arrays[1][: camera.height, : camera.width]
+    errors = worst(
+        {
+            "image": (image[clear], wanted.image[clear]),
+            "transmittance": (left[clear], wanted.transmittance[clear]),
+        }
+    )
+    return Outcome(arrays, errors, ms, trouble)
+
+
+def _loss(bench: Bench) -> Outcome:
+    device, camera = bench.device, bench.camera
+    image, photograph = bench.blended.image, upload(device, bench.frozen.photograph)
+    sides = (camera.width, camera.height)
+    found, arrays, ms, trouble = bench.twice(
+        lambda: loss(device, bench.work, image, photograph, *sides, 0.2),
+        lambda found: [found.gradient.get()[:, : camera.height]],  # nobody writes the rows below
+    )
+    x, y = (_pixels(bench, planes) for planes in (image.get(), bench.frozen.photograph))
+    value, gradient = reference_loss.l1_dssim(x, y)
+    mean_square = np.square(x - y).mean()
+    errors = worst(
+        {
+            "gradient": (_pixels(bench, arrays[0]), gradient),
+            "loss and error": (np.array(found.read()), np.array([value, mean_square])),
+        }
+    )
+    return Outcome(arrays, errors, ms, trouble)
+
+
+def _pixels(bench: Bench, planes: Array) -> Float64:
+    """(3, rows, stride) to (H, W, 3) in float64."""
+    height, width = bench.camera.height, bench.camera.width
+    return planes[:, :height, :width].transpose(1, 2, 0).astype(np.float64)
+
+
+def _blend_grad(bench: Bench) -> Outcome:
+    device, camera, splats = bench.device, bench.camera, bench.splats()
+    margin = bench.blend_reference().margin
+    assert margin is not None
+    planes = bench.frozen.image_gradient()
+    exact = planes.copy()
+    exact[:, : camera.height, : camera.width] *= margin > MARGIN
+    arguments = (bench.lists, bench.projected.splats, bench.background, bench.blended)
+
+    def launch(gradient: DeviceArray) -> DeviceArray:
+        return blend_grad(device, bench.work, *arguments, gradient)
+
+    given = upload(device, planes)
+    _, arrays, ms, trouble = bench.twice(lambda: launch(given), lambda slots: [slots.get()])
+    got = _slot_sums(bench, launch(upload(device, exact)).get())
+    order = depth_order(splats.depths, splats.visible)
+    background = bench.frozen.background.astype(np.float64)
+    wanted = reference_blend.blend_grad(splats, order, camera.width, camera.height, background, _pixels(bench, exact))
+    shown = splats.visible
+    moments = _moments(splats, wanted)
+    errors = worst(
+        {
+            "sum of g": (got[shown, :1], moments[shown, :1]),
+            "first moments": (got[shown, 1:3], moments[shown, 1:3]),
+            "second moments": (got[shown, 3:6], moments[shown, 3:6]),
+            "colour": (got[shown, 6:9], wanted.colors[shown]),
+        }
+    )
+    return Outcome(arrays, errors, ms, trouble)
+
+
+def _slot_sums(bench: Bench, slots: Array) -> Float64:
+    """(n, 9) sums of each Gaussian's slots in float64."""
+    sums = np.zeros((bench.model.count, SLOT_PLAIN))
+    np.add.at(
+        sums, bench.lists.gaussian_from_sorted.get(), slots[bench.lists.slot_from_sorted.get()].astype(np.float64)
+    )
+    return sums
+
+
+def _moments(splats: reference_project.Projected, wanted: reference_blend.BlendGradients) -> Float64:
+    """(n, 6) moments as a slot has them, docs/gradients.md (49), from the gradients of eqs. (25) to (29)."""
+    l11, l12, l22 = (WHITEN * splats.whitening).T
+    gx, gy = -(WHITEN**2) * wanted.means2d.T
+    u = gx / l11
+    v = (gy - l12 * u) / l22
+    dxx, dxy, dyy = -2 * wanted.conics[:, 0], -wanted.conics[:, 1], -2 * wanted.conics[:, 2]
+    uu = l11 * l11 * dxx + 2 * l11 * l12 * dxy + l12 * l12 * dyy
+    uv = l22 * (l11 * dxy + l12 * dyy)
+    return np.stack([wanted.opacities * splats.opacities, u, v, uu, uv, l22 * l22 * dyy], axis=1)
+
+
+def _project_grad(bench: Bench) -> Outcome:
+    """From slots that are made up, so that an error of blending's gradient is not counted here."""
+    device, n = bench.device, bench.model.count
+    coefficients = bench.model.coefficients
+    values = evenly(33, (bench.counted.pairs, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)
+    slots = Slots(upload(device, values), bench.counted.first_slots)
+    visible = bench.visible
+
+    def launch() -> tuple[DeviceGaussians, Screen]:
+        gradients = allocate_gaussians(device, n, coefficients, zero=True)
+        screen = Screen(bench.work.array("screen", (n, 2)))
+        project_grad(device, bench.model, bench.camera_array, bench.projected, slots, gradients, screen)
+        return gradients, screen
+
+    def take(found: tuple[DeviceGaussians, Screen]) -> list[Array]:
+        return [*(found[0][group].get() for group in GROUPS), found[1].gradients.get()[visible]]
+
+    _, arrays, ms, trouble = bench.twice(launch, take)
+    sums = _slot_sums(bench, values)
+    splats = bench.splats()
+    l11, l12, l22 = (WHITEN * splats.whitening).T
+    _, u, v, uu, uv, vv = sums[:, :6].T
+    d_means = -np.stack([l11 * u, l12 * u + l22 * v], axis=1) / WHITEN**2
+    half = 0.5 / WHITEN**4
+    d_covariances = half * np.stack(
+        [
+            l11 * l11 * uu,
+            l11 * (l12 * uu + l22 * uv),
+            l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv,
+        ],
+        axis=1,
+    )
+    model = parameters(bench.frozen.gaussians)
+    true = reference_project.project(**model, camera=bench.camera, sh_degree=bench.frozen.gaussians.sh_degree)
+    # conic_grad takes the derivative by sxy as one entry of the symmetric matrix, and undoes what project_grad does
+    d_conics = np.zeros_like(d_covariances)
+    d_conics[visible] = reference_project.conic_grad(true.covariances[visible], d_covariances[visible])
+    wanted = reference_project.project_grad(
+        **model,
+        camera=bench.camera,
+        sh_degree=bench.frozen.gaussians.sh_degree,
+        d_means2d=d_means,
+        d_conics=d_conics,
+        d_opacities=sums[:, 0] / np.where(visible, true.opacities, 1.0),
+        d_colors=sums[:, 6:9],
+    )
+    names = ("means", "quaternions", "log_scales", "opacity_logits")
+    parts = {name: (got[visible], wanted[name][visible]) for name, got in zip(names, arrays[:4], strict=True)}
+    parts["SH"] = (np.concatenate([arrays[4][:, None], arrays[5]], axis=1)[visible], wanted["sh"][visible])
+    parts["means on the image"] = (arrays[6], d_means[visible])
+    return Outcome(arrays, worst(parts), ms, trouble)
+
+
+_RATES = {name: 2.0**-power for power, name in enumerate(GROUPS, 3)}
+
+
+def _adam(bench: Bench) -> Outcome:
+    device, step = bench.device, 7
+    count, coefficients = bench.model.count, bench.model.coefficients
+    shapes = group_shapes(count, coefficients)
+    ends = {"parameters": (-1.0, 1.0), "gradients": (-0.5, 0.5), "first": (-0.25, 0.25), "second": (0.0625, 0.5)}
+    made = {
+        kind: {g: evenly(60 + 8 * i + j, shapes[g], *ends[kind]).astype(np.float32) for j, g in enumerate(GROUPS)}
+        for i, kind in enumerate(ends)
+    }
+    outcomes = []
+    moving = bench.projected.tile_counts
+    for sparse in (False, True):
+        config = OptimiserConfig(sparse=sparse)
+        if sparse:
+            for values in made["gradients"].values():
+                values[~bench.visible] = 0.0  # as project_grad leaves them
+
+        def launch(config: OptimiserConfig = config) -> list[DeviceGaussians]:
+            models = [
+                DeviceGaussians(
+                    count, coefficients, {group: upload(device, values) for group, values in arrays.items()}
+                )
+                for arrays in made.values()
+            ]
+            parameters, gradients, first, second = models
+            adam(device, step, _RATES, config, parameters, gradients, first, second, moving)
+            return models
+
+        def take(models: list[DeviceGaussians]) -> list[Array]:
+            return [model[group].get() for model in models for group in GROUPS]
+
+        _, arrays, ms, trouble = bench.twice(launch, take)
+        rows = bench.visible if sparse else np.ones(count, np.bool_)
+        parts: dict[str, tuple[Array, Array]] = {}
+        kept = 0
+        for index, group in enumerate(GROUPS):
+            given = [made[kind][group].astype(np.float64) for kind in ends]
+            p, g, m, v = given
+            wanted = reference_adam.adam(p, g, m, v, step, _RATES[group], config.beta1, config.beta2, config.epsilon)
+            got = [arrays[index + len(GROUPS) * kind] for kind in (0, 2, 3)]
+            for name, a, b, before in zip(
+                ("parameters", "first", "second"), got, wanted, (given[0], *given[2:]), strict=True
+            ):
+                parts[f"{name} of {group}"] = (a[rows], b[rows])
+                kept += int((a[~rows] != before[~rows]).sum())
+        outcomes.append(Outcome(arrays, worst(parts), ms, trouble or wrong_counts(hidden_rows=kept)))
+    first, second = outcomes
+    errors = {name: max(first.errors[name], second.errors[name]) for name in first.errors}
+    return Outcome([*first.arrays, *second.arrays], errors, first.ms, first.trouble or second.trouble)
+
+
+def _statistics(bench: Bench) -> Outcome:
+    device, n, camera, visible = bench.device, bench.model.count, bench.camera, bench.visible
+    values = evenly(34, (n, 2), -0.0625, 0.0625).astype(np.float32)
+    screen = Screen(upload(device, values))
+
+    def launch() -> Any:
+        statistics = new_statistics(device, n, agreement=True)
+        for _ in range(2):
+            add_statistics(device, statistics, camera, bench.projected, screen, 1.0)
+        return statistics
+
+    found, arrays, ms, trouble = bench.twice(launch, lambda s: [array.get() for array in s.named().values()])
+    got = dict(zip(found.named(), arrays, strict=True))
+    norms = np.hypot(*(0.5 * np.array([camera.width, camera.height]) * values.astype(np.float64)).T) * visible
+    sxx, sxy, syy = bench.splats().covariances.T
+    radii = np.ceil(3 * np.sqrt(0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy))) * visible
+    near = np.abs(norms - 1.0) < 1e-5
+    wrong = int((got["seen"] != 2 * visible).sum()) + int((got["agreeing"] != 2 * (norms >= 1.0))[~near].sum())
+    wrong += int((np.abs(got["radii"] - radii) > 1).sum()) + int((got["radii"] != radii).sum() > 1 + n // 100)
+    return Outcome(
+        arrays, worst({"gradient sums": (got["gradient_sums"], 2 * norms)}), ms, trouble or wrong_counts(counts=wrong)
+    )
+
+
+RUN: dict[str, Callable[[Bench], Outcome]] = {
+    "arithmetic": _arithmetic,
+    "project": _project,
+    "duplicate": _duplicate,
+    "sort": _sort,
+    "ranges": _ranges,
+    "blend": _blend,
+    **PICTURES,
+    "loss": _loss,
+    "blend_grad": _blend_grad,
+    "project_grad": _project_grad,
+    "adam": _adam,
+    "statistics": _statistics,
+}

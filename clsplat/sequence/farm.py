@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames on a Dask cluster: one that is there, or one of processes of this machine. Needs `distributed`.
+
+A frame is a task. Every worker loads the model once and keeps it; the files have to be under the same paths for all.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import clsplat
+from clsplat.config.training import RasterizerConfig
+from clsplat.errors import ClsplatError, InputError
+from clsplat.sequence.frame_renderer import RenderOptions, Shader, Task, open_shader
+from clsplat.sequence.workers import (
+    HOST_BYTES,
+    Record,
+    Result,
+    encoded,
+    frame_bytes,
+    is_complete,
+    record_of,
+    remove_temporaries,
+    stamp,
+    video_frame,
+    write_frame,
+)
+
+if TYPE_CHECKING:
+    from clsplat.images.video import VideoWriter
+
+THREADS = 2
+"""Of a local worker: one frame is encoded while the next is rendered."""
+HELD = 3
+"""Frames that a worker holds at once, whatever threads it has."""
+PATIENCE = 20
+"""Seconds in which a scheduler has to answer."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a worker has to load. model: an absolute path, with the SHA-256 of its content; version: of clsplat."""
+
+    model: str
+    digest: str
+    options: RenderOptions
+    rasterizer: RasterizerConfig
+    device: str | None = None
+    memory_limit: int | None = None
+    version: str = clsplat.__version__
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A worker's trouble; exceptions of ours do not all survive being sent."""
+
+    message: str
+    wrong_input: bool
+
+
+class _Held:
+    """The one scene that this process has open, and the right to render with it."""
+
+    def __init__(self) -> None:
+        self.turn, self.room = threading.Lock(), threading.Semaphore(HELD)
+        self.key: tuple[Any, ...] | None = None
+        self.shader: Shader | None = None
+
+    def shader_for(self, scene: Scene) -> Shader:
+        key = (scene.model, scene.digest, scene.device, scene.memory_limit, repr(scene.options), repr(scene.rasterizer))
+        if self.shader is None or key != self.key:
+            from clsplat.files import digest
+            from clsplat.gaussians import Gaussians
+
+            self.key = self.shader = None  # its memory is free before the next takes some
+            gaussians = Gaussians.load(scene.model)
+            if (found := digest(scene.model)) != scene.digest:
+                raise InputError(f"{scene.model}: has SHA-256 {found[:12]} on a worker, expected {scene.digest[:12]}")
+            self.shader = open_shader(
+                gaussians, scene.options, scene.rasterizer, device=scene.device, memory_limit=scene.memory_limit
+            )
+            self.key = key
+        return self.shader
+
+
+_HELD = _Held()
+
+
+def render_frame(task: Task, scene: Scene) -> Result | Failure:
+    """What a worker does: the frame's file, unless a worker that was lost since has finished it; of a video the frame,
+    which goes to who encodes it."""
+    try:
+        if scene.version != clsplat.__version__:
+            raise InputError(f"a worker has clsplat {clsplat.__version__}, expected {scene.version}")
+        with _HELD.room:
+            with _HELD.turn:
+                if not task.is_video and stamp(task.path) != task.before and is_complete(task, scene.options):
+                    return record_of(task, scene.options), None
+                shaded = _HELD.shader_for(scene)(task)
+            if task.is_video:
+                return video_frame(task, shaded, scene.options)
+            return write_frame(task, shaded, scene.options), None
+    except (ClsplatError, OSError, MemoryError) as error:
+        message = " ".join(str(error).split()) or type(error).__name__
+        return Failure(message, isinstance(error, InputError))
+
+
+def render_on_farm(
+    tasks: Sequence[Task],
+    scene: Scene,
+    on_done: Callable[[Record], None],
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    video: VideoWriter | None = None,
+) -> None:
+    """Render the frames on the cluster of the scheduler at that address, or on a new one of `workers` processes here.
+    Those of a video are encoded here.
+
+    on_done: as for `workers.run_tasks`. The frames of a worker that is lost are rendered again by others. Raises
+    InputError where there is no such cluster, and ClsplatError for a frame that cannot be rendered, or that has cost
+    more workers than Dask allows.
+    """
+    if not tasks:
+        return
+    if not scene.options.channels:
+        raise ValueError("no channels")
+    placed = [replace(task, path=task.path.absolute(), before=stamp(task.path)) for task in tasks]
+    names = {task.number: str(task.path) for task in tasks}
+    with _client(scheduler, workers) as client:
+        results = _results(client, placed, scene, video)
+        for record in encoded(placed, results, video):
+            on_done(replace(record, path=names[record.frame]))
+    # Whoever was killed while it wrote has left a file, and nobody writes any more.
+    remove_temporaries(tasks)
+
+
+def _results(client: Any, tasks: Sequence[Task], scene: Scene, video: VideoWriter | None = None) -> Iterator[Result]:
+    """What `render_frame` gives as the frames are done; a window of tasks is with the scheduler, and not a million. Of
+    a video the window begins with the frame that is to be encoded next, as those that come early wait here."""
+    from distributed import CancelledError, KilledWorker, as_completed
+
+    job, left = uuid.uuid4().hex[:12], iter(tasks)
+
+    def submit(count: int) -> list[Any]:
+        return [
+            client.submit(render_frame, task, scene, key=f"clsplat-{job}-{task.number}", pure=False)
+            for task in islice(left, count)
+        ]
+
+    threads = sum(client.nthreads().values())
+    window = max(64, 4 * threads)
+    if video is not None:
+        window = max(threads + 1, min(window, HOST_BYTES // frame_bytes(tasks[0], scene.options)))
+    with client.as_current():
+        pending = as_completed(submit(window))
+    sent = window
+    for done, future in enumerate(pending, 1):
+        try:
+            result = future.result()
+        except KilledWorker:
+            raise ClsplatError(
+                f"frame {future.key.rpartition('-')[2]}: every worker that took it was lost; render it alone, to "
+                "see why"
+            ) from None
+        except (CancelledError, OSError):
+            advice = "go on with --skip-existing" if video is None else "begin again"
+            raise ClsplatError(f"the scheduler was lost; {advice}") from None
+        if isinstance(result, Failure):
+            raise (InputError if result.wrong_input else ClsplatError)(result.message)
+        yield result
+        for another in submit((done if video is None else video.frames) + window - sent):
+            pending.add(another)
+            sent += 1
+
+
+def dask_setup(_: Any) -> None:
+    """Called by Dask in a local worker: Ctrl-C, which a terminal sends to it as well, is for the job to deal with."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
+    try:
+        import dask
+        import distributed
+    except ImportError:
+        flag = "--scheduler" if scheduler else "--workers"
+        raise InputError(
+            f"{flag}: needs the package distributed, install it with: pip install 'clsplat[farm]'"
+        ) from None
+    # Dask tells of every worker that it loses, in many lines; what matters is raised.
+    for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "distributed.core"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    if scheduler is not None:
+        try:
+            client = distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False)
+        except (OSError, ValueError, RuntimeError) as error:
+            reason = str(error).partition("\n")[0] or type(error).__name__
+            raise InputError(f"--scheduler {scheduler}: no scheduler answers there: {reason}") from None
+        with client:
+            yield client
+        return
+    with (
+        dask.config.set({"distributed.worker.daemon": True, "distributed.worker.multiprocessing-method": "spawn"}),
+        distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=THREADS,
+            processes=True,
+            memory_limit=None,  # Dask's own would end workers whose model is large
+            dashboard_address=None,
+            preload=[__name__],
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client

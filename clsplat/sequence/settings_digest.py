@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A digest of all that a frame's pixels and header depend on beside the model: what `--skip-existing` goes by."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import MISSING, fields, is_dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from clsplat.images.channels import Encoding
+
+SETTINGS = "clsplat:settings"
+"""The attribute of EXR and PNG files that holds it."""
+_ENCODED = {".exr": ("depth", "parts", "compression"), ".png": ("bits",)}
+"""Which of the encoding's settings a file of that extension depends on."""
+
+
+def plain(value: Any) -> Any:
+    """For JSON: of a dataclass what differs from its defaults, so that a setting that is added later changes nothing;
+    floats to 12 digits, as processors differ in the last ones."""
+    if is_dataclass(value) and not isinstance(value, type):
+        found = {}
+        for each in fields(value):
+            own = getattr(value, each.name)
+            usual = each.default_factory() if each.default_factory is not MISSING else each.default
+            if isinstance(own, np.ndarray) or usual is MISSING or own != usual:
+                found[each.name] = plain(own)
+        return found
+    if isinstance(value, float | np.floating):
+        return f"{value + 0.0:.12g}"  # + 0.0: no -0
+    if isinstance(value, np.ndarray):
+        return [plain(float(each)) for each in value.ravel()]
+    if isinstance(value, tuple | list):
+        return [plain(each) for each in value]
+    return value
+
+
+def encoding_of(encoding: Encoding, extension: str) -> dict[str, Any]:
+    """The settings that a file of that extension depends on."""
+    return {name: getattr(encoding, name) for name in _ENCODED.get(extension, ())}
+
+
+def digest_of(*parts: Any) -> str:
+    """128 bits of SHA-256, in hexadecimal, of values that `plain` takes."""
+    return hashlib.sha256(json.dumps(plain(parts), sort_keys=True).encode()).hexdigest()[:32]

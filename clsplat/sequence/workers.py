@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sequence of frames as a job: which are rendered, to which files, and the loop. No OpenCL here.
+
+Each device has a thread that renders; a few threads encode and write meanwhile. A frame is written to a temporary name
+and renamed, so a file that is there is complete, whenever the job was killed. Of a video they prepare the frames, and
+who waits for them encodes them in their order.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, SamplingConfig, VideoConfig
+from clsplat.device.child import abandon
+from clsplat.errors import InputError, reason_of
+from clsplat.files import abandoned, is_file
+from clsplat.images import channels as layers
+from clsplat.sequence.frame_renderer import RenderOptions, Shaded, Shader, Task, header, picture_camera, settings_digest
+from clsplat.sequence.settings_digest import SETTINGS
+from clsplat.shots import Shot
+from clsplat.shots.frame_numbers import output_paths
+from clsplat.shots.motion import camera_after, stretches
+
+if TYPE_CHECKING:
+    from clsplat.images.video import VideoWriter
+
+Planes = NDArray[np.uint8]
+
+HOST_BYTES = 1 << 30
+"""Main memory for frames that wait to be written, as a guide: three are held in any case."""
+MOST_WRITERS = 8
+WHAT_IT_IS = ("clsplat:model", "clsplat:colorspace")
+"""Attributes of a file that say whether it is the one that is wanted."""
+COPIES = 3
+"""Of a frame, while it is encoded: as it was rendered, put together, converted."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """What became of a frame. seconds: of rendering and writing it, without waiting; skipped: it was there; blank:
+    nothing of the model is in it, None where nobody looked; kernel_ms, transfer_ms: the device's, where that was asked
+    for."""
+
+    name: str
+    frame: int
+    path: str
+    width: int
+    height: int
+    seconds: float
+    skipped: bool = False
+    blank: bool | None = None
+    kernel_ms: float | None = None
+    transfer_ms: float | None = None
+
+    def document(self) -> dict[str, Any]:
+        """For JSON; without what was not measured."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+def make_tasks(
+    chosen: Shot,
+    whole: Shot,
+    pattern: str,
+    resize: Callable[[Camera], Camera],
+    channels: Sequence[str],
+    sampling: SamplingConfig | None = None,
+) -> list[Task]:
+    """The frames of `chosen`, which are of the shot `whole`. Raises InputError for files that would be one, unless it
+    is a video, and for cameras that these channels, or the lens, are not defined for."""
+    sampling = sampling or SamplingConfig()
+    motion, moves = "motion" in channels, sampling.moves
+    chosen.check(channels)
+    if motion:
+        whole.check(channels)
+    at = {frame.number: index for index, frame in enumerate(whole.frames)}
+    if Path(pattern).suffix.lower() == layers.VIDEO:
+        paths = [Path(pattern)] * len(chosen.frames)
+    else:
+        paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
+    stretch = stretches(whole, resize, *sampling.shutter, motion=motion) if moves else lambda number: None
+    tasks = []
+    for frame, path in zip(chosen.frames, paths, strict=True):
+        camera = resize(frame.camera)
+        if sampling.has_lens and camera.projection != "perspective":
+            raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
+        after = None
+        if motion:
+            after = resize(camera_after(whole, at[frame.number])).resized(camera.width, camera.height)
+        tasks.append(Task(frame.number, frame.name, camera, path, after, stretch(frame.number)))
+    return tasks
+
+
+def check_folders(tasks: Sequence[Task]) -> None:
+    """Raise InputError where a file's folder is none, cannot be made or cannot be written to; makes nothing."""
+    for folder in sorted({task.path.parent for task in tasks}):
+        there = next(each for each in (folder, *folder.parents) if each.exists())
+        if not there.is_dir():
+            raise InputError(f"{there}: is a file, expected a folder to write {folder} to")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise InputError(f"{there}: is not writable, expected a folder to write frames to")
+    for task in tasks:
+        if task.path.is_dir():
+            raise InputError(f"{task.path}: is a folder, expected the name of a file")
+
+
+def make_folders(tasks: Sequence[Task]) -> None:
+    """Make the files' folders. Raises InputError."""
+    for folder in sorted({task.path.parent for task in tasks}):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be made: {reason_of(error)}") from None
+
+
+def remove_temporaries(tasks: Sequence[Task]) -> None:
+    """Remove what a killed job has left of these files, and nothing that somebody still writes."""
+    for path in abandoned(task.path for task in tasks):
+        with suppress(OSError):
+            path.unlink()
+
+
+def is_complete(task: Task, options: RenderOptions) -> bool:
+    """Whether the frame's file is there: of its size, channels, model and settings, and readable to its end."""
+    told = {name: value for name, value in options.attributes.items() if name in WHAT_IT_IS}
+    told[SETTINGS] = settings_digest(task, options)
+    camera, deep = picture_camera(task, options), options.deep is not None
+    return layers.is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, told, deep=deep)
+
+
+def complete(tasks: Sequence[Task], options: RenderOptions) -> set[int]:
+    """The numbers of the frames that `--skip-existing` leaves out."""
+    with ThreadPoolExecutor(MOST_WRITERS) as pool:
+        return {
+            task.number
+            for task, whole in zip(tasks, pool.map(lambda task: is_complete(task, options), tasks), strict=True)
+            if whole
+        }
+
+
+def untold(tasks: Sequence[Task]) -> list[Path]:
+    """Those of the tasks' files that do not say with which settings they were made."""
+    with ThreadPoolExecutor(MOST_WRITERS) as pool:
+        said = pool.map(lambda task: layers.attribute(task.path, SETTINGS), tasks)
+        return [task.path for task, value in zip(tasks, said, strict=True) if value is None]
+
+
+def foreign(tasks: Sequence[Task]) -> list[Path]:
+    """Those of the tasks' files that are pictures of others than clsplat."""
+    there = [task.path for task in tasks if is_file(task.path)]
+    with ThreadPoolExecutor(MOST_WRITERS) as pool:
+        return [path for path, others in zip(there, pool.map(layers.is_foreign, there), strict=True) if others]
+
+
+def stamp(path: Path) -> tuple[int, ...] | None:
+    """What tells a file from one that takes its place; None for no file."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns, found.st_size
+
+
+def write_frame(task: Task, shaded: Shaded, options: RenderOptions) -> Record:
+    """Encode the frame and write it, atomically, unless that is done. Raises ClsplatError."""
+    start = time.monotonic()
+    if shaded.layers is not None:
+        layers.write_layers(task.path, shaded.finish(shaded.layers), options.encoding, header(task, options))
+    return _record(task, shaded, options, start)
+
+
+def video_frame(task: Task, shaded: Shaded, options: RenderOptions) -> tuple[Record, Planes]:
+    """The frame as a video takes it."""
+    from clsplat.images.video import frame_planes
+
+    start = time.monotonic()
+    assert shaded.layers is not None, "frames of a video are not written one by one"
+    planes = frame_planes(shaded.finish(shaded.layers)["rgb"])
+    return _record(task, shaded, options, start), planes
+
+
+def _record(task: Task, shaded: Shaded, options: RenderOptions, start: float) -> Record:
+    seconds = shaded.seconds + time.monotonic() - start
+    measured = {"kernel_ms": shaded.kernel_ms, "transfer_ms": shaded.transfer_ms}
+    return record_of(task, options, seconds=seconds, blank=shaded.blank, **measured)
+
+
+def record_of(task: Task, options: RenderOptions, **values: Any) -> Record:
+    """The frame's record with these values beside those of the task."""
+    camera = picture_camera(task, options)
+    return Record(task.name, task.number, str(task.path), camera.width, camera.height, **{"seconds": 0.0, **values})
+
+
+def frame_bytes(task: Task, options: RenderOptions) -> int:
+    """Main memory that a frame takes until it is written; of one in strips what a strip takes."""
+    camera, framing = picture_camera(task, options), options.pictures.framing
+    pixels, finer = camera.width * camera.height, framing.supersample**2
+    if not task.is_video:
+        pixels = min(pixels, STRIP_PIXELS // finer)
+    if options.deep is not None:
+        return COPIES * 4 * min(len(layers.DEEP) * options.deep.bins * pixels, DEEP_STRIP_FLOATS)
+    floats = sum(len(layers.LAYERS[name].names) for name in options.channels)
+    light = 4 if options.pictures.sampling.on or finer > 1 else 0
+    return 4 * pixels * (COPIES * floats + light * (finer if finer > 1 else 2))
+
+
+def frames_ahead(tasks: Sequence[Task], options: RenderOptions, devices: int) -> tuple[int, int]:
+    """(threads that write, frames that are held at once) so that main memory is bounded."""
+    largest = max((frame_bytes(task, options) for task in tasks), default=1)
+    writers = max(1, min(MOST_WRITERS, os.cpu_count() or 1))
+    held = max(devices + 2, min(HOST_BYTES // max(largest, 1), devices + writers + 1))
+    return max(1, min(writers, held - devices)), held
+
+
+def run_tasks(
+    tasks: Sequence[Task],
+    shaders: Sequence[Shader],
+    options: RenderOptions,
+    on_done: Callable[[Record], None],
+    video: VideoWriter | None = None,
+) -> None:
+    """Render the frames, each shader in a thread that takes the next frame nobody has, and write them meanwhile, or
+    add them to the video.
+
+    on_done: called in this thread for each frame when its file is complete, not always in the frames' order; of a video
+    in order, when it has been encoded. The first error of any thread is raised here, after all of them have ended.
+    """
+    if not tasks:
+        return
+    writers, held = frames_ahead(tasks, options, len(shaders))
+    line = _Line(tasks, options, held, video)
+    pool = ThreadPoolExecutor(writers, "clsplat-write")
+    threads = [threading.Thread(target=line.draw, args=(shader, pool), name="clsplat-render") for shader in shaders]
+    try:
+        for thread in threads:
+            thread.start()
+        for record in encoded(tasks, line.results(), video):
+            if video is not None:
+                line.room.release()  # frames are handed out in order, so that the next one always has room
+            on_done(record)
+    except KeyboardInterrupt:
+        abandon()  # a thread may wait for a driver that hangs
+        raise
+    finally:
+        line.stop.set()
+        for _ in threads:
+            line.room.release()
+        for thread in threads:
+            thread.join()
+        pool.shutdown()
+
+
+Result = tuple[Record, Planes | None]
+"""Of a frame; with what a video takes of it, if it is one's."""
+
+
+class _Line:
+    """What the threads of a job share. room: for so many frames at once; stop: nothing more is to be done."""
+
+    def __init__(self, tasks: Sequence[Task], options: RenderOptions, held: int, video: VideoWriter | None) -> None:
+        self.room, self.stop = threading.Semaphore(held), threading.Event()
+        self._tasks, self._options, self._video = tasks, options, video
+        self._todo, self._turn = iter(tasks), threading.Lock()
+        self._finished: queue.SimpleQueue[Result | BaseException] = queue.SimpleQueue()
+
+    def draw(self, shader: Shader, pool: ThreadPoolExecutor) -> None:
+        """Render frames until there are no more."""
+        try:
+            while True:
+                self.room.acquire()
+                with self._turn:
+                    task = None if self.stop.is_set() else next(self._todo, None)
+                if task is None:
+                    return
+                pool.submit(self._write, task, shader(task))
+        except BaseException as error:  # noqa: BLE001  # raised again by who waits for the frames
+            self._finished.put(error)
+
+    def _write(self, task: Task, shaded: Shaded) -> None:
+        try:
+            if self.stop.is_set():
+                return
+            if self._video is None:
+                self._finished.put((write_frame(task, shaded, self._options), None))
+            else:
+                self._finished.put(video_frame(task, shaded, self._options))
+        except BaseException as error:  # noqa: BLE001  # as above
+            self._finished.put(error)
+        finally:
+            if self._video is None:
+                self.room.release()
+
+    def results(self) -> Iterator[Result]:
+        """Of every frame when it is done. Raises what ended a thread."""
+        for _ in self._tasks:
+            item = self._finished.get()
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+
+
+def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter | None) -> Iterator[Record]:
+    """Records when their files are complete; of a video in the order of the tasks, when the frame is in."""
+    if video is None:
+        for record, _ in results:
+            yield record
+        return
+    waiting: dict[int, tuple[Record, Planes]] = {}
+    for task in tasks:
+        while task.number not in waiting:
+            record, planes = next(results)
+            assert planes is not None
+            waiting[record.frame] = record, planes
+        record, planes = waiting.pop(task.number)
+        start = time.monotonic()
+        video.add_planes(planes)
+        yield replace(record, seconds=record.seconds + time.monotonic() - start)
+
+
+@contextmanager
+def open_video(tasks: Sequence[Task], config: VideoConfig) -> Iterator[VideoWriter | None]:
+    """The video that the tasks are frames of, None where they have files of their own. It takes its name at the end of
+    the block, if that ends well."""
+    if not (tasks and tasks[0].is_video):
+        yield None
+        return
+    from clsplat.images.video import VideoWriter
+
+    with VideoWriter(tasks[0].path, config) as video:
+        yield video

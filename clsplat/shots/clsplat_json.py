@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""clsplat's own camera files: key frames in JSON, described in docs/cameras.md."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import LARGEST_FOCAL, Camera, Projection, focal_length
+from clsplat.errors import InputError
+from clsplat.scenes.colmap import rotation_from_quaternion
+from clsplat.scenes.transforms import Keys, numbers, short
+from clsplat.shots.keys import Key, interpolate
+from clsplat.shots.nerfstudio import image_side
+from clsplat.shots.shot import MOST_FRAMES, Frame, Shot
+
+Float64 = NDArray[np.float64]
+
+VERSION_KEY, VERSION = "clsplat_cameras", 1
+FOCAL = ("fx", "fy", "fov_x", "fov_y", "pixel_size")
+LENS = (*FOCAL, "cx", "cy", "shift", "roll")
+FILE = (VERSION_KEY, "width", "height", "projection", "fps", "first_frame", "loop_frames", "near", "far", "keys", *LENS)
+KEY = ("frame", "seconds", "position", "world_from_cam", *LENS)
+
+
+def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
+    """The whole frames from the first key to the last, or of one turn of the loop, interpolated smoothly.
+
+    Raises InputError, with the file and the key, for another version, no keys, a name that is not known, and values
+    that are missing or cannot be.
+    """
+    if document.get(VERSION_KEY) != VERSION:
+        raise InputError(
+            f"{path}: '{VERSION_KEY}' is {short(document.get(VERSION_KEY))}, expected {VERSION}; newer files need a "
+            "newer clsplat"
+        )
+    _known(str(path), document, FILE)
+    entries = document.get("keys")
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{path}: has no keys, expected 'keys' to be a list of at least one")
+    whole = Keys(path, None, {}, document)
+    fps, first, loop = whole.number("fps"), whole.number("first_frame"), whole.number("loop_frames")
+    if fps is not None and fps <= 0:
+        raise InputError(f"{path}: 'fps' is {fps:g}, expected more than 0")
+    first = 1.0 if first is None else first
+    keys = []
+    for index, entry in enumerate(entries):
+        reader = Keys(path, f"key {index}", entry, document)
+        _known(reader.where, entry, KEY)
+        keys.append(Key(_frame(reader, fps, first), _camera(reader), math.radians(reader.number("roll") or 0.0)))
+    keys.sort(key=lambda key: key.frame)
+    numbers = _numbers(path, [key.frame for key in keys], loop)
+    cameras = interpolate(keys, numbers, loop=loop)
+    return Shot(
+        tuple(
+            Frame(number, camera, f"{number:04d}", None if fps is None else (number - numbers[0]) / fps)
+            for number, camera in zip(numbers, cameras, strict=True)
+        ),
+        fps=fps,
+    )
+
+
+def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
+    for name in values:
+        if name not in names:
+            raise InputError(f"{where}: '{name}' is not known here, expected one of {', '.join(names)}")
+
+
+def _frame(keys: Keys, fps: float | None, first: float) -> float:
+    frame, seconds = keys.frame.get("frame"), keys.frame.get("seconds")
+    if (frame is None) == (seconds is None):
+        raise InputError(f"{keys.where}: expected 'frame' or 'seconds', and one of them only")
+    if frame is not None:
+        return keys.require("frame")
+    if fps is None:
+        raise InputError(f"{keys.where}: 'seconds' without 'fps' in the file, expected how many frames a second has")
+    return round(first + keys.require("seconds") * fps, 6)  # 0.1 s at 30 is frame 3
+
+
+def _numbers(path: Path, frames: list[float], loop: float | None) -> list[int]:
+    """Whole frames."""
+    for before, after in pairwise(frames):
+        if before == after:
+            raise InputError(f"{path}: has two keys at frame {after:g}, expected one")
+    begin, end = frames[0], frames[-1]
+    if loop is not None:
+        if not end - begin < loop:
+            raise InputError(
+                f"{path}: 'loop_frames' is {loop:g}, expected more than the {end - begin:g} that the keys span: "
+                "the first key comes again after so many"
+            )
+        end = math.ceil(begin + loop) - 1
+    if end - begin >= MOST_FRAMES:
+        raise InputError(f"{path}: has the frames {begin:g} to {end:g}, expected at most {MOST_FRAMES:,}")
+    numbers = list(range(math.ceil(begin), math.floor(end) + 1))
+    if not numbers:
+        raise InputError(f"{path}: has no whole frame between its keys at {begin:g} and {end:g}, expected at least one")
+    return numbers
+
+
+def _camera(keys: Keys) -> Camera:
+    projection = keys.document.get("projection", "perspective")
+    if projection not in get_args(Projection):
+        raise InputError(
+            f"{keys.path}: 'projection' is {short(projection)}, expected one of {', '.join(get_args(Projection))}"
+        )
+    whole = Keys(keys.path, None, {}, keys.document)
+    width, height = image_side(whole, "width"), image_side(whole, "height")
+    near, far = whole.number("near"), whole.number("far")
+    near, far = 0.01 if near is None else near, math.inf if far is None else far
+    if not 0 < near < far:
+        raise InputError(f"{keys.path}: 'near' is {near:g} and 'far' {far:g}, expected 0 < near < far")
+    fx, fy = _focal(keys, projection, width, height)
+    if not max(fx, fy) <= LARGEST_FOCAL:
+        raise InputError(f"{keys.where}: a focal length of {max(fx, fy):g}, expected at most {LARGEST_FOCAL:g}")
+    cx, cy = _principal(keys, width, height)
+    rotation = _rotation(keys).T
+    position = _vector(keys, "position", 3)
+    return Camera(
+        width, height, fx, fy, cx, cy, rotation, -rotation @ position, near, far, cast("Projection", projection)
+    )
+
+
+def _rotation(keys: Keys) -> Float64:
+    quaternion = _vector(keys, "world_from_cam", 4)
+    norm = float(np.linalg.norm(quaternion))
+    if not 0.5 < norm < 2:
+        raise InputError(
+            f"{keys.where}: 'world_from_cam' is {quaternion.tolist()}, expected a unit quaternion [w, x, y, z]"
+        )
+    return rotation_from_quaternion(quaternion / norm)
+
+
+def _vector(keys: Keys, name: str, size: int) -> Float64:
+    given = keys.get(name)
+    vector = numbers(given)
+    if vector.shape != (size,) or not np.isfinite(vector).all():
+        found = f"has no '{name}'" if given is None else f"'{name}' is {short(given)}"
+        raise InputError(f"{keys.where}: {found}, expected a list of {size} numbers")
+    return vector
+
+
+def _focal(keys: Keys, projection: str, width: int, height: int) -> tuple[float, float]:
+    """Pixels a unit, from what the key has of FOCAL, or the file where it has none of them."""
+    source = keys.frame if any(name in keys.frame for name in FOCAL) else keys.document
+    given = [name for name in FOCAL if name in source]
+    values = Keys(keys.path, None, source, {})
+    values.where = keys.where
+    if projection == "equirectangular":
+        across, down = values.number("fov_x"), values.number("fov_y")
+        degrees = (360.0 if across is None else across, 180.0 if down is None else down)
+        if not set(given) <= {"fov_x", "fov_y"} or not (0 < degrees[0] <= 360 and 0 < degrees[1] <= 180):
+            raise InputError(
+                f"{keys.where}: has {_listed(source, given)}, expected of an equirectangular camera at most 'fov_x' up "
+                "to 360 degrees and 'fov_y' up to 180"
+            )
+        return width / math.radians(degrees[0]), height / math.radians(degrees[1])
+    angles = ("pixel_size",) if projection == "orthographic" else ("fov_x", "fov_y")
+    if set(given) not in ({"fx"}, {"fx", "fy"}, *({angle} for angle in angles)):
+        raise InputError(
+            f"{keys.where}: has {_listed(source, given)}, expected one of 'fx' (with 'fy' if that differs), "
+            + " or ".join(f"'{angle}'" for angle in angles)
+        )
+    numbers = [values.require(name) for name in given]
+    if min(numbers) <= 0:
+        raise InputError(f"{keys.where}: has {_listed(source, given)}, expected more than 0")
+    if given[0] == "fx":
+        return numbers[0], numbers[-1]
+    if projection == "orthographic":
+        return 1 / numbers[0], 1 / numbers[0]
+    try:
+        size = width if given[0] == "fov_x" else height
+        focal = focal_length(math.radians(numbers[0]), size, cast("Projection", projection))
+    except ValueError as error:
+        raise InputError(f"{keys.where}: '{given[0]}': {error}") from None
+    return focal, focal
+
+
+def _listed(source: dict[str, Any], given: list[str]) -> str:
+    return ", ".join(f"'{name}' {short(source[name])}" for name in given) or "no focal length"
+
+
+def _principal(keys: Keys, width: int, height: int) -> tuple[float, float]:
+    cx, cy = keys.number("cx"), keys.number("cy")
+    if keys.get("shift") is None:
+        return width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    if cx is not None or cy is not None:
+        raise InputError(f"{keys.where}: has 'shift' and 'cx' or 'cy', expected one or the other")
+    right, up = _vector(keys, "shift", 2)
+    return width * (0.5 - float(right)), height * (0.5 + float(up))

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera paths made from a scene's own cameras, of any number of frames. Turntables are in
+`clsplat.shots.viewpoints`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from clsplat.camera import Camera
+from clsplat.shots.keys import Key, interpolate
+from clsplat.shots.viewpoints import WIDEST_GAP, covered_arc, focus_point, look_at, turntable, up_axis
+
+Float64 = NDArray[np.float64]
+PathName = Literal["turntable", "spiral", "through"]
+
+SPIRAL_TURNS = 2
+STEEPEST = np.deg2rad(85.0)
+"""Elevations that a spiral keeps below: straight up and down, a level camera does not know where its right is."""
+REACH = 3
+"""Neighbours on each side that a camera is smoothed with, for what a hand does between two photographs."""
+
+
+def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A closed path, two turns, that rises and sinks over the heights of the cameras, facing what they face.
+
+    In spherical coordinates about `focus_point`: at the cameras' median distance, the elevation from their 10th to
+    their 90th percentile and back. Where they leave a wide gap, the azimuth swings over the arc that they cover, once a
+    turn, a quarter of a turn behind the elevation: an ellipse before the scene, over which the distance goes from its
+    10th to its 90th percentile and back. Intrinsics of the first camera. Raises ValueError for no cameras or frames.
+    """
+    if not cameras or frames < 1:
+        raise ValueError(f"a spiral of {frames} frames from {len(cameras)} cameras: expected at least one of each")
+    up, focus = up_axis(cameras), focus_point(cameras)
+    offsets = np.stack([camera.position for camera in cameras]) - focus
+    heights = offsets @ up
+    level = offsets - heights[:, None] * up
+    aside = np.linalg.norm(level[0]) > 1e-9 * np.linalg.norm(offsets[0])
+    first = level[0] if aside else np.cross(up, cameras[0].rotation[0])
+    east = first / np.linalg.norm(first)
+    north = np.cross(up, east)
+    azimuths = np.arctan2(level @ north, level @ east)
+    elevations = np.clip(np.arctan2(heights, np.linalg.norm(level, axis=1)), -STEEPEST, STEEPEST)
+    distances = np.linalg.norm(offsets, axis=1)
+
+    turn = 2 * np.pi * np.arange(frames) / frames
+    begin, width = covered_arc(azimuths)
+    if 2 * np.pi - width <= WIDEST_GAP:
+        azimuth = SPIRAL_TURNS * turn
+        elevation = _between(elevations, -np.cos(turn))
+        distance = np.full(frames, np.median(distances))
+    else:
+        azimuth = begin + width / 2 * (1 + np.sin(SPIRAL_TURNS * turn))
+        elevation = _between(elevations, np.cos(SPIRAL_TURNS * turn))
+        distance = _between(distances, np.sin(turn))
+    path = []
+    for angle, height, radius in zip(azimuth, elevation, distance, strict=True):
+        outwards = np.cos(height) * (np.cos(angle) * east + np.sin(angle) * north) + np.sin(height) * up
+        rotation, translation = look_at(focus + radius * outwards, focus, up)
+        path.append(replace(cameras[0], rotation=rotation, translation=translation))
+    return path
+
+
+def _between(values: Float64, wave: Float64) -> Float64:
+    """From the 10th percentile of values (n,), where the wave is -1, to their 90th, where it is 1."""
+    low, high = np.percentile(values, [10, 90])
+    return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * wave)
+
+
+def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """From the first camera to the last in their order, smoothed, at an even speed, with the first one's intrinsics.
+
+    Positions and rotations are those of a parabola fitted to a camera and three neighbours on each side (fewer towards
+    the ends, which stay where they are), which keeps an arc where it is; a spline goes through these. Speed counts
+    distances and angles, each in steps of the median camera, so a camera that only turns takes its time as well. Raises
+    ValueError for no cameras or no frames.
+    """
+    if not cameras or frames < 1:
+        raise ValueError(f"a path of {frames} frames through {len(cameras)} cameras: expected at least one of each")
+    smooth = _smoothed(cameras)
+    positions = np.stack([camera.position for camera in smooth])
+    rotations = Rotation.from_matrix(np.stack([camera.rotation.T for camera in smooth]))
+    moves = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    turns = (rotations[:-1].inv() * rotations[1:]).magnitude() if len(smooth) > 1 else np.zeros(0)
+    steps = np.hypot(_in_medians(moves, 1e-12 * np.abs(positions).max()), _in_medians(turns, 1e-9))
+    keys = [Key(0.0, smooth[0])]
+    for camera, step in zip(smooth[1:], steps, strict=True):
+        if step > 1e-6:  # a camera that stands where the one before it does
+            keys.append(Key(keys[-1].frame + float(step), camera))
+    return interpolate(keys, list(np.linspace(0.0, keys[-1].frame, frames)))
+
+
+def _in_medians(lengths: Float64, rounding: float) -> Float64:
+    """lengths (n,) over the median of those that are more than rounding."""
+    there = lengths[lengths > rounding]
+    return lengths / np.median(there) if len(there) else np.zeros_like(lengths)
+
+
+def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:
+    positions = np.stack([camera.position for camera in cameras])
+    rotations = Rotation.from_matrix(np.stack([camera.rotation.T for camera in cameras]))
+    smooth = []
+    for index in range(len(cameras)):
+        reach = min(REACH, index, len(cameras) - 1 - index)
+        near, weights = slice(index - reach, index + reach + 1), parabola_weights(reach)
+        turns = (rotations[index].inv() * rotations[near]).as_rotvec()
+        rotation = (rotations[index] * Rotation.from_rotvec(weights @ turns)).inv().as_matrix()
+        smooth.append(replace(cameras[0], rotation=rotation, translation=-rotation @ (weights @ positions[near])))
+    return smooth
+
+
+def parabola_weights(reach: int) -> Float64:
+    """Weights (2 reach + 1,) of evenly spaced values in the middle of the parabola nearest to them (Savitzky and Golay
+    1964)."""
+    offsets = np.arange(-reach, reach + 1)
+    scale = 3 / ((2 * reach + 3) * (2 * reach + 1) * (2 * reach - 1))
+    return np.asarray(scale * (3 * reach * reach + 3 * reach - 1 - 5 * offsets**2))
+
+
+PATHS: dict[str, Callable[[Sequence[Camera], int], list[Camera]]] = {
+    "turntable": turntable,
+    "spiral": spiral,
+    "through": through,
+}

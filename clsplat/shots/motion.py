@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a frame sees of its shot beside its own camera: the next frame's, and those around the shutter's time."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import ceil
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.shots import Shot
+from clsplat.shots.keys import Key, interpolate
+
+AROUND = 2
+"""Keys on each side of a time that say where the camera is then: a segment's end, and what its tangent looks at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """The part of a shot that a frame's shutter looks at. keys: their frames count from the frame."""
+
+    keys: tuple[Key, ...]
+
+    def at(self, time: float) -> Camera:
+        """The camera at a time in frames from the frame; that of a key as it is."""
+        for key in self.keys:
+            if key.frame == time:
+                return key.camera
+        return interpolate(self.keys, [time])[0]
+
+
+def camera_after(shot: Shot, index: int) -> Camera:
+    """Where the shot is one frame number after its frame of this index.
+
+    After the last it goes on as it did from the one before: the same rigid motion once more, so that a turntable turns
+    on. A single frame stays where it is.
+    """
+    frame = shot.frames[index]
+    if index + 1 < len(shot.frames):
+        following = shot.frames[index + 1]
+        return following.camera if following.number == frame.number + 1 else shot.at(frame.number + 1)
+    if index == 0:
+        return frame.camera
+    before = shot.frames[index - 1]
+    earlier = before.camera if before.number == frame.number - 1 else shot.at(frame.number - 1)
+    return continued(earlier, frame.camera)
+
+
+def continued(earlier: Camera, now: Camera) -> Camera:
+    """The rigid motion from one to the other once more."""
+    turn = now.rotation @ earlier.rotation.T
+    shift = now.translation - turn @ earlier.translation
+    return replace(now, rotation=turn @ now.rotation, translation=turn @ now.translation + shift)
+
+
+def stretches(
+    shot: Shot, resize: Callable[[Camera], Camera], opens: float, closes: float, *, motion: bool = False
+) -> Callable[[int], Stretch | None]:
+    """The stretch of a frame by its number, None where nothing can move. opens, closes: frames from the frame; motion:
+    with the middle of the next frame's shutter.
+
+    Before its first frame and after its last the shot goes on as it does there, as for motion. Raises InputError where
+    the frames' pictures have several sizes or projections, which is no camera that moves.
+    """
+    closes = max(closes, 0.5 * (opens + closes) + 1) if motion else closes
+    frames = [(frame.number, resize(frame.camera)) for frame in shot.frames]
+    if len(frames) == 1:
+        return lambda number: None
+    for (number, camera), (earlier, before) in zip(frames[1:], frames, strict=False):
+        kinds = [f"{each.width}x{each.height} {each.projection}" for each in (before, camera)]
+        if kinds[0] != kinds[1]:
+            raise InputError(
+                f"an open shutter: frame {earlier} is {kinds[0]} and frame {number} {kinds[1]}, expected one camera"
+            )
+    first, second = frames[0][1], resize(camera_after(shot, 0))
+    for _ in range(ceil(max(-opens, 0)) + AROUND):
+        first, second = continued(second, first), first
+        frames.insert(0, (frames[0][0] - 1, first))
+    last, following = frames[-1][1], resize(camera_after(shot, len(shot.frames) - 1))
+    for _ in range(ceil(max(closes, 0)) + AROUND):
+        frames.append((frames[-1][0] + 1, following))
+        last, following = following, continued(last, following)
+    numbers = [number for number, _ in frames]
+
+    def of(number: int) -> Stretch:
+        begin = max(bisect_right(numbers, number + min(opens, 0)) - AROUND, 0)
+        end = bisect_left(numbers, number + max(closes, 0)) + AROUND
+        return Stretch(tuple(Key(at - number, camera) for at, camera in frames[begin:end]))
+
+    return of

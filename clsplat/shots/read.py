@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From what `clsplat render` is given to the frames it renders."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from clsplat.errors import InputError, examples
+from clsplat.shots.shot import MOST_FRAMES, Shot, named, numbered
+
+COUNT = 120
+"""Frames of a generated path: five seconds at 24 a second."""
+USD = (".usd", ".usda", ".usdc", ".usdz")
+EXPECTED = (
+    "a COLMAP model's folder, a transforms.json, a nerfstudio camera_path.json, a clsplat camera file (.json) or a USD "
+    "stage"
+)
+
+
+def read_shot(path: Path, *, size: tuple[int | None, int | None] = (None, None), usd_camera: str | None = None) -> Shot:
+    """The frames of any camera file, found out from what is in it; docs/cameras.md describes each.
+
+    size: the width and height that will be asked for, for formats that have none of their own (USD; transforms.json
+    without its pictures). usd_camera: which camera of a USD stage. Raises InputError, naming the file, for one that is
+    missing, of no known kind, damaged or without frames.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such folder or file, expected {EXPECTED}")
+    if usd_camera is not None and not _is_usd(path):
+        raise InputError(f"--usd-camera {usd_camera}: {path} is no USD stage, expected it with one only")
+    if path.is_dir():
+        return _read_folder(path, size)
+    if _is_usd(path):
+        from clsplat.shots.usd import read_usd
+
+        return read_usd(path, size, usd_camera)
+    if path.suffix.lower() == ".json":
+        return _read_json(path, size)
+    raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected {EXPECTED}")
+
+
+def choose_shot(
+    cameras: Path,
+    *,
+    path: str | None = None,
+    count: int | None = None,
+    frames: str | None = None,
+    size: tuple[int | None, int | None] = (None, None),
+    usd_camera: str | None = None,
+) -> Shot:
+    """What --cameras, --path, --count and --frames mean together.
+
+    path: turntable, spiral or through: `count` frames of that path, made from the cameras; else the cameras themselves.
+    frames: of these, the ones listed. Raises InputError.
+    """
+    if count is not None and path is None:
+        raise InputError(f"--count {count}: expected --path with it, the files of cameras have their own frames")
+    if count is not None and not 1 <= count <= MOST_FRAMES:
+        raise InputError(f"--count {count}: expected 1 to {MOST_FRAMES:,} frames")
+    shot = read_shot(cameras, size=size, usd_camera=usd_camera)
+    if path is not None:
+        from clsplat.shots.generated import PATHS
+
+        if (kind := shot.frames[0].camera.projection) not in ("perspective", "orthographic"):
+            raise InputError(f"{cameras}: its cameras are {kind}, --path needs perspective or orthographic ones")
+        made = numbered(PATHS[path](shot.cameras, COUNT if count is None else count))
+        shot = Shot(made, shot.warnings, unapplied=shot.unapplied)
+    shot = shot if frames is None else shot.only(frames)
+    far = min(frame.camera.far for frame in shot.frames)
+    unapplied = (*((f"far plane ({far:g})",) if far < math.inf else ()), *shot.unapplied)
+    if unapplied:
+        shot = replace(shot, warnings=(*shot.warnings, f"{cameras}: not applied: {', '.join(unapplied)}"))
+    return shot
+
+
+def _is_usd(path: Path) -> bool:
+    return path.suffix.lower() in USD
+
+
+def _read_folder(path: Path, size: tuple[int | None, int | None]) -> Shot:
+    from clsplat.scenes.colmap import read_cameras
+
+    listed = sorted(each.name for each in path.glob("transforms*.json"))
+    if listed:
+        from clsplat.scenes.colmap import find_model
+
+        # a model below colmap/ beside a transforms.json is nerfstudio's, in a world that is not the file's
+        model = find_model(path)
+        if model is None or "colmap" in model.relative_to(path).parts:
+            if listed != ["transforms.json"]:
+                raise InputError(f"{path}: holds {examples(listed)}, expected one of them to be named by --cameras")
+            return _read_json(path / listed[0], size)
+    cameras = read_cameras(path)
+    if not cameras:
+        raise InputError(f"{path}: has no images, expected at least one")
+    return Shot(named(cameras))
+
+
+def _read_json(path: Path, size: tuple[int | None, int | None]) -> Shot:
+    from clsplat.scenes.transforms import load_document, read_poses
+    from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
+    from clsplat.shots.nerfstudio import read_camera_path
+
+    document = load_document(path, "a file of cameras", f"'frames', 'camera_path' or '{VERSION_KEY}'")
+    if VERSION_KEY in document:
+        return read_keyed(path, document)
+    if "camera_path" in document or "keyframes" in document:
+        return read_camera_path(path, document)
+    if "frames" not in document:
+        raise InputError(
+            f"{path}: has neither '{VERSION_KEY}' (a clsplat camera file) nor 'camera_path' (nerfstudio's) nor "
+            "'frames' (a transforms.json), expected one of them"
+        )
+    width, height = size
+    both = (width, height) if width is not None and height is not None else None
+    frames = read_poses(path, both)
+    return Shot(named({frame.name: frame.lens.pinhole(frame.rotation, frame.translation) for frame in frames}))

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A shot: the frames to render, in order, each with its number, camera and name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.shots.frame_numbers import parse_frames, ranges
+from clsplat.shots.keys import Key, interpolate
+
+MOST_FRAMES = 100_000
+"""Over an hour at 24 a second. More are a slip of the keyboard, and would be gigabytes of cameras from a file of few
+lines."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """number: what `--frames` and `####` mean; name: what `{name}` means, a picture's path or the number in four
+    digits; time: seconds from the first frame, where the source has any."""
+
+    number: int
+    camera: Camera
+    name: str
+    time: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """frames: numbers rise; warnings: a line each, for the user; fps: frames a second, where the source says it;
+    unapplied: what the source has and no frame shows."""
+
+    frames: tuple[Frame, ...]
+    warnings: tuple[str, ...] = ()
+    fps: float | None = None
+    unapplied: tuple[str, ...] = ()
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The camera of every frame."""
+        return [frame.camera for frame in self.frames]
+
+    def only(self, text: str) -> Shot:
+        """The frames that `text`, such as 1-100:2, lists and the shot has; a warning where it lists others too.
+
+        Raises InputError for a text that `parse_frames` refuses, and where the shot has none of its frames.
+        """
+        wanted = parse_frames(text)
+        there = {frame.number for frame in self.frames}
+        missing = [number for number in wanted if number not in there]
+        have = f"there are the frames {ranges(sorted(there))}"
+        if len(missing) == len(wanted):
+            raise InputError(f"--frames {text}: holds none of the frames to render, expected some; {have}")
+        asked = set(wanted)
+        warnings = self.warnings
+        if missing:
+            warnings += (f"--frames {text}: {len(missing)} of these frames do not exist; {have}",)
+        return replace(self, frames=tuple(frame for frame in self.frames if frame.number in asked), warnings=warnings)
+
+    def check(self, channels: Iterable[str] = ()) -> None:
+        """Raises InputError where these channels are not defined: motion from one projection to another."""
+        if "motion" not in channels:
+            return
+        for before, frame in pairwise(self.frames):
+            kind, wanted = frame.camera.projection, before.camera.projection
+            if kind != wanted:
+                raise InputError(
+                    f"--channels motion: frame {frame.number} is {kind}, expected {wanted} as frame {before.number} is"
+                )
+
+    def at(self, frame: float) -> Camera:
+        """The camera at a frame that need not be whole, such as within a shutter's time: interpolated as keys are."""
+        return interpolate([Key(each.number, each.camera) for each in self.frames], [frame])[0]
+
+
+def numbered(cameras: Iterable[Camera], first: int = 1, fps: float | None = None) -> tuple[Frame, ...]:
+    """Frames from the number `first` on, named after their numbers."""
+    return tuple(
+        Frame(first + index, camera, f"{first + index:04d}", None if fps is None else index / fps)
+        for index, camera in enumerate(cameras)
+    )
+
+
+def named(cameras: dict[str, Camera]) -> tuple[Frame, ...]:
+    """Frames of pictures, from 1 on in their order."""
+    return tuple(Frame(index, camera, name) for index, (name, camera) in enumerate(cameras.items(), 1))

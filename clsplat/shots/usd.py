@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras of USD stages, through usd-core (an optional extra). One frame a time code.
+
+The stage's metersPerUnit and upAxis are not applied: the numbers in the stage are the model's world. Only the camera's
+own axes (x right, y up, looking along -z) become ours.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError, examples
+from clsplat.files import native_name
+from clsplat.models.formats.usd import readable, survive
+from clsplat.scenes.transforms import opengl_pose, short
+from clsplat.shots.shot import MOST_FRAMES, Frame, Shot
+
+ORTHOGRAPHIC_UNIT = 0.1
+"""USD measures apertures in tenths of a world unit; only of an orthographic camera that is more than a ratio."""
+
+PINHOLES = ("", "perspective", "orthographic", "pinhole")
+"""What a camera's projection may be called."""
+
+
+def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
+    """The frames of a stage's camera, from its start time code to its end, or the samples' where it has no range.
+
+    Its rate is the stage's timeCodesPerSecond, for which USD takes framesPerSecond where that alone is authored. What
+    is authored and not applied is in the shot's `unapplied`.
+
+    size: width and height in pixels; one follows from the other by the first frame's aperture; if neither is given
+    they are the stage's render settings'. The horizontal aperture fills the width, pixels are square. prim: path or
+    name of the camera, if the stage has several. What USD warns of becomes the shot's warnings. Raises InputError for a
+    stage that cannot be opened or has no such camera, no size, or values that cannot be; and where usd-core is not
+    installed.
+    """
+    survive(path, "clsplat.shots.usd:read_here", size=size, prim=prim)
+    return read_here(path, size, prim)
+
+
+def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
+    """`read_usd` of a file that is known not to end the process."""
+    from pxr import Tf, Usd, UsdGeom, UsdUtils
+
+    # takes what USD would print: a layer that does not resolve may have nothing to do with the camera
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        stage = Usd.Stage.Open(native_name(path))
+    except Tf.ErrorException:
+        raise InputError(
+            f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more"
+        ) from None
+    with readable(path):
+        camera = _find(path, [UsdGeom.Camera(each) for each in stage.Traverse() if each.IsA(UsdGeom.Camera)], prim)
+        where = f"{path}: {camera.GetPath()}"
+        codes = _time_codes(where, stage, camera)
+        horizontal, vertical = _aperture(where, camera, codes[0])
+        width, height = _size(path, stage, size, horizontal / vertical)
+        start, per_second = codes[0], float(stage.GetTimeCodesPerSecond())
+        frames = []
+        for code in codes:
+            time = None if len(codes) == 1 or per_second <= 0 else (code - start) / per_second
+            frames.append(Frame(code, _camera(f"{where} at {code}", camera, code, width, height), f"{code:04d}", time))
+    # without the end of the line, where USD has the stage's address in memory
+    unapplied = _unapplied(stage, camera, codes)
+    told = [each.commentary.split(" (instantiating")[0] for each in diagnostics.TakeUncoalescedDiagnostics()]
+    warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in told[:3])
+    return Shot(tuple(frames), warnings, per_second if 0 < per_second < math.inf else None, unapplied)
+
+
+def _unapplied(stage: Any, camera: Any, codes: list[int]) -> tuple[str, ...]:
+    """Attributes of the camera and of the stage's render settings that are authored, would change a frame and are not
+    applied: their names, with the first value."""
+    from pxr import UsdGeom, UsdRender
+
+    usual: dict[str, Any] = {
+        "fStop": 0.0,
+        "focusDistance": 0.0,
+        "shutter:open": 0.0,
+        "shutter:close": 0.0,
+        "exposure": 0.0,
+    }
+    usual |= {"clippingPlanes": (), "stereoRole": UsdGeom.Tokens.mono}
+    found = [_authored(camera.GetPrim(), name, value, codes) for name, value in usual.items()]
+    if settings := UsdRender.Settings.GetStageRenderSettings(stage):
+        usual = {"pixelAspectRatio": 1.0, "aspectRatioConformPolicy": None, "dataWindowNDC": (0, 0, 1, 1)}
+        found += [_authored(settings.GetPrim(), name, value, codes) for name, value in usual.items()]
+    return tuple(filter(None, found))
+
+
+def _authored(prim: Any, name: str, usual: Any, codes: list[int]) -> str:
+    """Name and value of the attribute where another than the usual one is authored, else ''."""
+    attribute = prim.GetAttribute(name)
+    if not attribute or not attribute.HasAuthoredValue():
+        return ""
+    for code in (codes[0], codes[-1], *attribute.GetTimeSamples()):
+        value = attribute.Get(code)
+        if isinstance(usual, tuple) and value is not None and tuple(value) != usual:
+            return name
+        if not isinstance(usual, tuple) and value not in (None, usual):
+            return f"{name} ({value:g})" if isinstance(value, float) else f"{name} ({value})"
+    return ""
+
+
+def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:
+    paths = [str(camera.GetPath()) for camera in cameras]
+    if not cameras:
+        raise InputError(f"{path}: has no camera in it, expected at least one")
+    matching = [
+        camera for camera, name in zip(cameras, paths, strict=True) if prim in (name, camera.GetPrim().GetName())
+    ]
+    if prim is None:
+        matching = cameras
+    if len(matching) != 1:
+        found = "has no such camera" if not matching else f"has {len(matching)} cameras"
+        asked = "" if prim is None else f"--usd-camera {prim}: "
+        raise InputError(f"{path}: {asked}{found}, expected --usd-camera with one of {examples(paths)}")
+    return matching[0]
+
+
+def _samples(camera: Any) -> list[float]:
+    """The time codes at which the camera, or something that moves it, has values."""
+    from pxr import UsdGeom
+
+    times: set[float] = set()
+    for attribute in camera.GetPrim().GetAttributes():
+        times.update(attribute.GetTimeSamples())
+    prim = camera.GetPrim()
+    while prim and not prim.IsPseudoRoot():
+        if prim.IsA(UsdGeom.Xformable):
+            times.update(UsdGeom.Xformable(prim).GetTimeSamples())
+        prim = prim.GetParent()
+    return sorted(times)
+
+
+def _time_codes(where: str, stage: Any, camera: Any) -> list[int]:
+    samples = _samples(camera)
+    if stage.HasAuthoredTimeCodeRange():
+        begin, end = float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())
+    elif samples:
+        begin, end = samples[0], samples[-1]
+    else:
+        begin = end = 1.0
+    if not (math.isfinite(begin) and math.isfinite(end) and end - begin < MOST_FRAMES):
+        raise InputError(f"{where}: time codes {begin:g} to {end:g}, expected at most {MOST_FRAMES:,}")
+    codes = list(range(math.ceil(begin), math.floor(end) + 1))
+    if not codes:
+        raise InputError(f"{where}: no whole time code from {begin:g} to {end:g}, expected at least one frame")
+    return codes
+
+
+def _number(where: str, attribute: Any, code: int) -> float:
+    value = attribute.Get(code)
+    if value is None or not math.isfinite(value):
+        raise InputError(f"{where}: {attribute.GetName()} is {value}, expected a number")
+    return float(value)
+
+
+def _aperture(where: str, camera: Any, code: int) -> tuple[float, float]:
+    """Its width and height."""
+    horizontal = _number(where, camera.GetHorizontalApertureAttr(), code)
+    vertical = _number(where, camera.GetVerticalApertureAttr(), code)
+    if not (horizontal > 0 and vertical > 0):
+        raise InputError(f"{where}: aperture {horizontal:g} x {vertical:g}, expected both above 0")
+    return horizontal, vertical
+
+
+def _size(path: Path, stage: Any, size: tuple[int | None, int | None], aspect: float) -> tuple[int, int]:
+    from pxr import UsdRender
+
+    width, height = size
+    if width is None and height is None:
+        settings = UsdRender.Settings.GetStageRenderSettings(stage)
+        attribute = settings.GetResolutionAttr() if settings else None
+        if attribute is None or not attribute.HasAuthoredValue():
+            raise InputError(f"{path}: a USD camera has no size in pixels, expected --width or --height")
+        width, height = (int(side) for side in attribute.Get())
+    if width is None:
+        width = max(1, round((height or 0) * aspect))
+    if height is None:
+        height = max(1, round(width / aspect))
+    if not (width > 0 and height > 0):
+        raise InputError(f"{path}: size {width} x {height} pixels, expected both above 0")
+    return width, height
+
+
+def _check_projection(where: str, camera: Any, code: int) -> None:
+    """Raise InputError for a lens that is neither pinhole nor orthographic, in USD's words or in Omniverse's."""
+    for name in ("projection", "cameraProjectionType", "omni:lensdistortion:model"):
+        attribute = camera.GetPrim().GetAttribute(name)
+        value = attribute.Get(code) if attribute else None
+        if value is not None and str(value) not in PINHOLES:
+            raise InputError(
+                f"{where}: {name} is {short(str(value))}, expected perspective or orthographic; of other lenses "
+                "write a clsplat camera file"
+            )
+
+
+def _check_turns(where: str, camera: Any, code: int) -> None:
+    """Raise InputError for a quaternion without a length, of the camera or of what it is in: USD takes it for none."""
+    from pxr import UsdGeom
+
+    prim = camera.GetPrim()
+    while prim and not prim.IsPseudoRoot():
+        for op in UsdGeom.Xformable(prim).GetOrderedXformOps() if prim.IsA(UsdGeom.Xformable) else ():
+            turn = op.Get(code) if op.GetOpType() == UsdGeom.XformOp.TypeOrient else None
+            if turn is not None and not 1e-6 < turn.GetLength() < math.inf:
+                raise InputError(f"{where}: {op.GetOpName()} of {prim.GetPath()} is {turn}, expected a unit quaternion")
+        prim = prim.GetParent()
+
+
+def _camera(where: str, camera: Any, code: int, width: int, height: int) -> Camera:
+    from pxr import UsdGeom
+
+    _check_projection(where, camera, code)
+    _check_turns(where, camera, code)
+    # USD's vectors are rows, so its matrices are the transposes of ours
+    matrix = np.array(camera.ComputeLocalToWorldTransform(code), np.float64).T
+    rotation, translation, scale = opengl_pose(matrix, where, "transform")
+    aperture, _ = _aperture(where, camera, code)
+    focal = _number(where, camera.GetFocalLengthAttr(), code)
+    right = _number(where, camera.GetHorizontalApertureOffsetAttr(), code)
+    up = _number(where, camera.GetVerticalApertureOffsetAttr(), code)
+    pixels = width / aperture  # a unit of the aperture
+    near, far = 0.01, math.inf
+    clipping = camera.GetClippingRangeAttr()
+    if clipping.HasAuthoredValue():
+        near, far = (scale * float(value) for value in clipping.Get(code))
+    if not 0 < near < far:
+        raise InputError(f"{where}: clippingRange {near:g} to {far:g}, expected 0 < near < far")
+    cx, cy = width / 2 - right * pixels, height / 2 + up * pixels
+    if camera.GetProjectionAttr().Get(code) == UsdGeom.Tokens.orthographic:
+        # the camera's own unit is `scale` of the world's
+        fx = pixels / (ORTHOGRAPHIC_UNIT * scale)
+        return Camera(width, height, fx, fx, cx, cy, rotation, translation, near, far, "orthographic")
+    if not focal > 0:
+        raise InputError(f"{where}: focalLength is {focal:g}, expected more than 0")
+    fx = focal * pixels
+    return Camera(width, height, fx, fx, cx, cy, rotation, translation, near, far)

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptive density control (Kerbl et al. 2023, section 5): what to clone, split and prune. Policy only: no device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config.training import DensityConfig
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The Gaussians after density control.
+
+    rows (m,) uint32: which Gaussian each comes from, kept ones first and in order; fresh (m,) bool: clones and halves
+    of splits, whose moments start at zero; split (m,) bool: halves, to be moved and shrunk.
+    """
+
+    rows: NDArray[np.uint32]
+    fresh: NDArray[np.bool_]
+    split: NDArray[np.bool_]
+
+
+def is_due(config: DensityConfig, step: int) -> bool:
+    """Whether Gaussians are cloned, split and pruned after this step."""
+    return config.every > 0 and config.start < step < config.stop and step % config.every == 0
+
+
+def is_pruning_due(config: DensityConfig, step: int) -> bool:
+    """Whether Gaussians are pruned by opacity and contribution after this step, densified or not."""
+    regular = config.prune_every > 0 and step > config.start and step % config.prune_every == 0
+    return regular or step in config.prune_at
+
+
+def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
+    """Whether opacities are reset after this step; once early before a white background, as the authors' code."""
+    if config.every <= 0 or step >= config.stop:
+        return False
+    return (config.opacity_reset_every > 0 and step % config.opacity_reset_every == 0) or (
+        white and step == config.start
+    )
+
+
+def wants_contributions(config: DensityConfig, step: int = 0) -> bool:
+    """Whether what Gaussians contribute is to be known in this step: some pruning at its end or later goes by it."""
+    last_fraction = max(config.prune_at) if config.prune_fraction > 0 and config.prune_at else -1
+    if step <= last_fraction:
+        return True
+    return config.min_contribution > 0 and (config.prune_every > 0 or (config.every > 0 and step < config.stop))
+
+
+def wants_agreement(config: DensityConfig) -> bool:
+    """Whether the views over the threshold are to be counted."""
+    return config.every > 0 and config.views_agree > 1
+
+
+@dataclass(frozen=True, eq=False)
+class Contributions:
+    """What each Gaussian added to the pictures, in pixels; (n,), infinite where it is not known yet.
+
+    totals: over the views of the last whole epoch; largest: of any view in that epoch and the one under way.
+    """
+
+    totals: Float32
+    largest: Float32
+
+
+def plan(
+    config: DensityConfig,
+    step: int,
+    extent: float,
+    *,
+    gradient_sums: Float32,
+    seen: Float32,
+    radii: Float32,
+    log_scales: Float32,
+    opacity_logits: Float32,
+    agreeing: Float32 | None = None,
+    contributions: Contributions | None = None,
+) -> Plan:
+    """Clone the small and split the large among those with a large mean gradient; prune the transparent, the oversized
+    and what hardly contributes.
+
+    gradient_sums, seen, radii, opacity_logits (n,); log_scales (n, 3); extent: the scene's, in world units; agreeing
+    (n,): views over the threshold, where the settings ask for it; contributions: likewise.
+    """
+    n = len(seen)
+    useless = _useless(config, step, contributions, n)
+    with np.errstate(invalid="ignore"):
+        gradients = np.asarray(gradient_sums / np.maximum(seen, 1), np.float32)
+    gradients[~np.isfinite(gradients)] = 0  # statistics that something has spoilt ask for nothing
+    wanted = _wanted(config, step, gradients, agreeing, useless)
+    sizes = np.exp(log_scales.max(axis=1))
+    large = sizes > config.dense_fraction * extent
+    to_clone, to_split = np.flatnonzero(wanted & ~large), np.flatnonzero(wanted & large)
+    kept = np.flatnonzero(~(wanted & large))
+
+    rows = np.concatenate([kept, to_clone, to_split, to_split])
+    origin = np.repeat([0, 1, 2], [len(kept), len(to_clone), 2 * len(to_split)])
+    sizes_after = np.where(origin == 2, sizes[rows] / config.split_factor, sizes[rows])
+    prune = _transparent(config, opacity_logits)[rows] | useless[rows]
+    if config.opacity_reset_every > 0 and step > config.opacity_reset_every:
+        prune |= sizes_after > config.max_world_fraction * extent
+        if config.max_screen_radius > 0:
+            prune |= (radii[rows] > config.max_screen_radius) & (origin == 0)
+    rows, origin = rows[~prune], origin[~prune]
+    return Plan(rows.astype(np.uint32), origin > 0, origin == 2)
+
+
+def plan_pruning(
+    config: DensityConfig, step: int, *, opacity_logits: Float32, contributions: Contributions | None = None
+) -> Plan:
+    """Prune the transparent and what hardly contributes, and nothing else; arguments as of `plan`."""
+    gone = _transparent(config, opacity_logits) | _useless(config, step, contributions, len(opacity_logits))
+    rows = np.flatnonzero(~gone).astype(np.uint32)
+    none = np.zeros(len(rows), bool)
+    return Plan(rows, none, none)
+
+
+def _transparent(config: DensityConfig, opacity_logits: Float32) -> NDArray[np.bool_]:
+    transparent: NDArray[np.bool_] = opacity_logits < np.log(config.min_opacity / (1 - config.min_opacity))
+    return transparent
+
+
+def _useless(config: DensityConfig, step: int, contributions: Contributions | None, count: int) -> NDArray[np.bool_]:
+    """Those that no view needs, and at the steps of `prune_at` a fraction of those whose use is known."""
+    useless = np.zeros(count, bool)
+    if contributions is None:
+        return useless
+    if config.min_contribution > 0:
+        useless |= contributions.largest < config.min_contribution
+    if step in config.prune_at:
+        known = np.flatnonzero(np.isfinite(contributions.totals))
+        least = np.argsort(contributions.totals[known], kind="stable")[: int(config.prune_fraction * len(known))]
+        useless[known[least]] = True
+    return useless
+
+
+def _wanted(
+    config: DensityConfig,
+    step: int,
+    gradients: Float32,
+    agreeing: Float32 | None,
+    useless: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Whom to clone or split, by mean gradients (n,)."""
+    n = len(gradients)
+    room = config.max_gaussians - n
+    if config.growth == "budget":
+        wanted = (gradients > 0) & ~useless
+        room = budget(config, step, n) - n
+    else:
+        wanted = (gradients >= config.gradient_threshold) & ~useless
+    if config.views_agree > 1 and agreeing is not None:
+        wanted &= agreeing >= config.views_agree
+    if wanted.sum() > room:
+        strongest = np.argsort(-np.where(wanted, gradients, -1), kind="stable")[: max(room, 0)]
+        allowed = np.zeros(n, bool)
+        allowed[strongest] = True
+        wanted &= allowed
+    return wanted
+
+
+def budget(config: DensityConfig, step: int, count: int) -> int:
+    """How many Gaussians there are to be after this step's densification, when there are `count` before it.
+
+    Taming 3DGS (Mallick et al. 2024): A(x) = (B - S - k N)/N^2 x^2 + k x + S with k = 2 (B - S)/N, from S to B in N
+    densifications. That is B - (B - S)(1 - x/N)^2, so that each brings what is still missing down by a known ratio:
+    what was pruned in between is made up for on the way. The last densification reaches B.
+    """
+    last = (config.stop - 1) // config.every * config.every
+    before = max(step - config.every, config.start)
+    left = ((last - step) / (last - before)) ** 2 if step < last else 0.0
+    return config.max_gaussians - round((config.max_gaussians - count) * left)
+
+
+def split_halves(
+    config: DensityConfig, *, means: Float32, quaternions: Float32, log_scales: Float32, rng: np.random.Generator
+) -> tuple[Float32, Float32]:
+    """Means and log scales of halves: drawn from the Gaussian they come from, and smaller. (m, 3), (m, 4), (m, 3)."""
+    offsets = rng.standard_normal(means.shape) * np.exp(log_scales.astype(np.float64))
+    q = quaternions.astype(np.float64)
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # of length 0, which is not drawn: no rotation
+    w, axis = q[:, :1], q[:, 1:]
+    twice = 2 * np.cross(axis, offsets)
+    rotated = offsets + w * twice + np.cross(axis, twice)
+    smaller = log_scales - np.float32(np.log(config.split_factor))
+    return (means + rotated).astype(np.float32), smaller.astype(np.float32)
+
+
+def reset_opacities(config: DensityConfig, opacity_logits: Float32) -> Float32:
+    """At most `opacity_reset_to`."""
+    ceiling = np.log(config.opacity_reset_to / (1 - config.opacity_reset_to))
+    return np.minimum(opacity_logits, np.float32(ceiling))

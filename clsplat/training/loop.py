@@ -1,0 +1,445 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training from start to end: the loop around the trainer's step, and what it leaves in a run's folder."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device import cl
+from clsplat.device.child import TrialInterrupted
+from clsplat.device.context import Device, open_device
+from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
+from clsplat.evaluation.held_out import background_colour, evaluate
+from clsplat.gaussians import Gaussians
+from clsplat.images.colour import photos_space
+from clsplat.process import Interrupted, endings
+from clsplat.rendering.memory_plan import Plan, parse_bytes
+from clsplat.rendering.rasterizer import Renderer
+from clsplat.report import write_last
+from clsplat.runs import scene_record
+from clsplat.runs.locks import locked
+from clsplat.runs.run import Run, check_resumed
+from clsplat.scenes import doubts
+from clsplat.scenes.point_colours import is_colourless, photographed
+from clsplat.stages.loss import Loss
+from clsplat.training import telemetry
+from clsplat.training.health import RETURNS, WINDOW
+from clsplat.training.repro import write_bundle
+from clsplat.training.trainer import Trainer, unusable
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene, View
+
+REPORT_EVERY = 10
+"""Steps between readings of the loss, which make host and device wait for each other."""
+
+
+Between = Callable[[Trainer, Callable[[], bool]], None]
+"""What is called before each step, with the trainer and whether Ctrl-C was pressed, after which it should return."""
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """step: number of steps done; loss and psnr of that step's view; seconds of training alone, so far."""
+
+    step: int
+    loss: float
+    psnr: float
+    gaussians: int
+    seconds: float
+
+
+class _Interruption:
+    """Inside, the first Ctrl-C, or another signal to end, is noted, and the loop stops between two steps; after it a
+    Ctrl-C is Python's own, and the others do what they did before."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._previous: dict[int, Any] = {}
+
+    def __call__(self) -> bool:
+        if not self.number:  # again, as compilers of kernels install handlers of their own
+            for each in self._previous:
+                signal.signal(each, self._ask)
+        return self.number != 0
+
+    def __enter__(self) -> _Interruption:  # noqa: PYI034  # Self came with 3.11
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {each: signal.signal(each, self._ask) for each in (signal.SIGINT, *endings())}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number: int, _frame: FrameType | None) -> None:
+        self.number = number
+        for each in self._previous:
+            signal.signal(each, signal.default_int_handler if each == signal.SIGINT else self._previous[each])
+
+
+class _Session:
+    """One call of `train`: a trainer, the run that it writes to, and the seconds that it has trained."""
+
+    def __init__(self, trainer: Trainer, run: Run | None, on_plan: Callable[[Plan], None] | None = None) -> None:
+        self.trainer, self.run, self.on_plan = trainer, run, on_plan
+        self.told: Plan | None = None
+        self.renderer = Renderer(trainer.device, trainer.rasterizer)
+        self.seconds = 0.0
+        self.began = time.perf_counter()
+        self.noted, self.first_step = False, 0
+        self.saved = 0
+        self.told_stages: set[str] = set()
+        self.untold = 0
+
+    def resume(self) -> None:
+        """Go on from the latest checkpoint, if there is one."""
+        if self.run is not None and (checkpoint := self.run.load_latest_checkpoint()) is not None:
+            self.trainer.restore(checkpoint)
+            seconds = checkpoint.state.get("seconds")
+            if not isinstance(seconds, float | int):
+                raise unusable(checkpoint, f"its state is not as this version writes it (seconds: {seconds!r})")
+            self.seconds = float(seconds)
+            self.saved = checkpoint.step
+
+    def save(self) -> None:
+        """Write a checkpoint, unless this step has one, or the model is not one to go back to."""
+        if self.run is not None and self.trainer.step > self.saved:
+            arrays, state = self.trainer.checkpoint()
+            if not self.trainer.watch.patience.lost:
+                self.run.save_checkpoint(self.trainer.step, arrays, {**state, "seconds": self.seconds})
+                self.saved = self.trainer.step
+
+    def rescue(self) -> str:
+        """After a trial that failed or was interrupted: a checkpoint of the state that the step began with, if that is
+        whole. What was written, for the end of a sentence, or nothing."""
+        if self.run is None or not self.trainer.step_back():
+            return ""
+        try:
+            self.save()
+        except (ClsplatError, OSError, cl.Error) as error:
+            return f"; its checkpoint could not be written ({error})"
+        if not 0 < self.trainer.step <= self.saved:
+            return ""
+        resume = f"clsplat train -o {self.run.path} --resume"
+        return f"; the checkpoint of step {self.trainer.step} is written: {resume} goes on from it"
+
+    def go_back(self) -> bool:
+        """Tell what trouble there was; after too much of it go back to the last checkpoint, with smaller steps, and
+        after too much of that raise ClsplatError. Whether it went back."""
+        trainer, patience = self.trainer, self.trainer.watch.patience
+        self.tell_trouble()
+        if not patience.over:
+            return False
+        if patience.spent:
+            self.give_up()
+        checkpoint = self.run.load_latest_checkpoint() if self.run is not None else None
+        stopped = trainer.step
+        if checkpoint is not None:
+            trainer.restore(checkpoint)
+        else:
+            trainer.restart()
+        trainer.watch.patience = patience.after_return()
+        if self.run is not None:
+            self.run.truncate_metrics(trainer.step)
+            self.saved = -1
+            self.save()  # how small the steps are now must outlast a crash
+        warnings.warn(
+            f"step {stopped}: {len(patience.troubled)} of the last {WINDOW} steps had trouble: back to step "
+            f"{trainer.step}, with learning rates of {trainer.watch.patience.rate_factor:g} of what they would be"
+        )
+        return True
+
+    def tell_trouble(self) -> None:
+        """A warning for the first trouble of each stage; the rest is counted."""
+        for incident in self.trainer.watch.incidents:
+            if incident.stage in self.told_stages:
+                self.untold += 1
+            else:
+                warnings.warn(f"{incident} (more of this kind will be counted only)")
+            self.told_stages.add(incident.stage)
+        self.trainer.watch.incidents.clear()
+
+    def tell_the_rest(self) -> None:
+        """How much trouble was counted only."""
+        self.trainer.mend()
+        self.tell_trouble()
+        if self.untold:
+            warnings.warn(f"{self.untold} more steps had something that was not finite")
+
+    def give_up(self) -> None:
+        """Raise ClsplatError, with what reproduces the trouble in the run's folder."""
+        incident = self.trainer.watch.latest
+        assert incident is not None, "patience is over only after trouble"
+        told = f"{incident}, and {RETURNS} returns with smaller steps did not help"
+        if self.run is None:
+            raise ClsplatError(f"{told}: give a run, and what reproduces it is written there")
+        path = write_bundle(self.run.path, self.trainer, incident)
+        raise ClsplatError(f"{told}: {path} reproduces it (python -m clsplat.training.repro)")
+
+    def tell_plan(self) -> None:
+        """Tell how the device's memory is used, at first and when more is done in pieces, or less."""
+        plan, told = self.trainer.plan, self.told
+        if self.on_plan is not None and (told is None or plan.pieces != told.pieces):
+            self.on_plan(plan)
+        self.told = plan
+
+    def report(self, result: Loss) -> StepReport | None:
+        """Read the loss of the step just made; None where it is not finite."""
+        start = time.perf_counter()
+        value, squared = result.read()
+        self.seconds += time.perf_counter() - start
+        if not np.isfinite(value):
+            self.trainer.watch.loss_failed()
+            return None
+        psnr = float(-10 * np.log10(max(squared, 1e-12)))
+        return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
+
+    def evaluate(self, *, keep: bool) -> dict[str, Any]:
+        """The held-out views; their renders are kept in the run's test/ if asked for."""
+        trainer, background = self.trainer, background_colour(self.trainer.config.background)
+
+        def render(view: View) -> NDArray[Any]:
+            return self.renderer.render(trainer.parameters, trainer.local(view.camera), background).image
+
+        return evaluate(
+            render,
+            trainer.scene.test_views,
+            background,
+            self.run.test_path if keep and self.run is not None else None,
+            step=trainer.step,
+            gaussians=trainer.parameters.count,
+            seconds=self.seconds,
+            space=photos_space(view.path for view in trainer.scene.views),
+        )
+
+    def record(
+        self,
+        report: StepReport,
+        on_step: Callable[[StepReport], None] | None,
+        *,
+        evaluating: bool,
+        stages: dict[str, float] | None,
+    ) -> None:
+        """Hand the report on, and write it down with what clsplat.report asks for."""
+        if on_step is not None:
+            on_step(report)
+        record = asdict(report)
+        if evaluating:
+            record["eval"] = self.evaluate(keep=False)
+        if self.run is None:
+            return
+        trainer = self.trainer
+        if stages is not None:
+            record["stages"] = stages
+        if not self.noted:
+            record["session"] = telemetry.session(trainer.device, self.first_step)
+            self.noted = True
+        last = trainer.step == trainer.config.iterations
+        if last and trainer.config.report and (found := telemetry.contributions(trainer)) is not None:
+            record["contributions"] = found
+        self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
+
+    def doubt(self) -> None:
+        """A warning where the pictures are none. Nothing where the memory is too little for a look."""
+        trainer, renderer = self.trainer, self.renderer
+        background = background_colour(trainer.config.background)
+
+        def draw(camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+            drawn = renderer.render(trainer.parameters, trainer.local(camera), background)
+            return drawn.image, drawn.alpha
+
+        with suppress(CapacityError):
+            if text := doubts.of_pictures(draw, trainer.views):
+                warnings.warn(f"step {trainer.step}: {text}")
+
+    def times_stages(self, step: int) -> bool:
+        """Whether it is measured what each stage of the step takes: only where that is written down."""
+        config = self.trainer.config
+        if config.stages_every == 0:
+            return False
+        return step == config.iterations or (step % config.stages_every == 0 and step % REPORT_EVERY == 0)
+
+    def step(self, on_step: Callable[[StepReport], None] | None) -> None:
+        """One step, and what is due after it."""
+        trainer, config = self.trainer, self.trainer.config
+        start, stages = time.perf_counter(), None
+        if self.run is not None and self.times_stages(trainer.step + 1):
+            result, stages = telemetry.timed(trainer.device, trainer.train_step)
+        else:
+            result = trainer.train_step()
+        self.seconds += time.perf_counter() - start
+        self.tell_plan()
+        if trainer.step == config.iterations:
+            trainer.mend(look=True)
+        if self.go_back():
+            return
+        step = trainer.step
+        if step == doubts.LOOK_AT and step < config.iterations:
+            self.doubt()
+        evaluating = step in config.eval_at and bool(trainer.scene.test_views)
+        if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
+            report = self.report(result)
+            if report is not None:
+                self.record(report, on_step, evaluating=evaluating, stages=stages)
+        if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
+            self.save()
+
+
+@contextmanager
+def _rescued(session: _Session) -> Iterator[None]:
+    """Nothing is lost of what was trained where a driver's trial ends it."""
+    try:
+        yield
+    except DriverError as error:
+        if written := session.rescue():
+            raise DriverError(f"{error}{written}") from error
+        raise
+    except TrialInterrupted:
+        session.rescue()
+        raise
+
+
+def train(
+    scene: Scene,
+    config: TrainConfig | None = None,
+    *,
+    device: Device | str | None = None,
+    max_device_mem: str | int | None = None,
+    run: Run | None = None,
+    resume: bool = False,
+    on_step: Callable[[StepReport], None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
+    between: Between | None = None,
+) -> Gaussians:
+    """Train on a scene; the model.
+
+    config: the run's, or the defaults, where it is not given; a run is told of another one. device: open, or as
+    `clsplat devices` names it; max_device_mem: at most so much of its memory, such as "256MiB". run: a folder for
+    metrics, checkpoints, held-out renders and the model, or None for none of them; resume: go on from the run's latest
+    checkpoint, without which a run that has been trained is refused; on_step: called every
+    REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes;
+    between: called before each step; it may render what the trainer has, and take its time, which is not counted.
+    Raises InputError for a scene without views, one that is not the resumed run's, and a run that another process
+    writes, ClsplatError where numbers are not finite again and again (docs/decisions/0016-never-a-nan.md; a warning
+    tells of what could be mended), and Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP after a
+    checkpoint has been written.
+    """
+    config = _checked(scene, config, run, resume=resume)
+    limit = parse_bytes(max_device_mem)
+    opened = device if isinstance(device, Device) else open_device(device, limit)
+    if isinstance(device, Device) and limit is not None:
+        opened = device.with_memory_limit(limit)
+    if run is None:
+        return _train(scene, config, opened, None, on_step=on_step, on_plan=on_plan, between=between)
+    with locked(run.path, "train"):
+        if not resume and (run.checkpoints() or run.read_metrics()):
+            raise InputError(
+                f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
+                "starts again"
+            )
+        run.keep_config(config)
+        if resume:
+            scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
+        scene_record.keep(run, scene, resuming=resume)
+        return _train(scene, config, opened, run, resume=resume, on_step=on_step, on_plan=on_plan, between=between)
+
+
+def _checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
+    """The settings. Raises InputError where the arguments of `train` make no sense."""
+    from clsplat.scenes.scene import Scene
+
+    for name, value, kind in (
+        ("scene", scene, Scene),
+        ("config", config, TrainConfig | None),
+        ("run", run, Run | None),
+    ):
+        if not isinstance(value, kind):
+            meant = {"scene": "clsplat.load_scene(...)", "config": "TrainConfig(...)", "run": "Run.create(...)"}[name]
+            raise InputError(f"{name} is {value!r:.100}, expected {meant}")
+    if resume and run is None:
+        raise InputError("resume=True: expected run=..., the run to go on with")
+    if config is None:
+        config = run.config if run is not None else TrainConfig()
+    config.check()
+    if resume and run is not None:
+        check_resumed(run, config)
+        if (done := max((step for step, _ in run.checkpoints()), default=0)) > config.iterations:
+            raise InputError(f"iterations {config.iterations}: {run.path} is at step {done} already, expected more")
+    scene.require_training_views()
+    return config
+
+
+def _tell_idle_settings(trainer: Trainer) -> None:
+    """A warning for each setting that comes to nothing with this scene."""
+    config, count = trainer.config, trainer.parameters.count
+    if config.eval_at and not trainer.scene.test_views:
+        steps = ",".join(map(str, config.eval_at))
+        warnings.warn(f"--eval-at {steps}: no view is held out, so that nothing is evaluated; see --test-every")
+    if trainer.step == 0 and config.density.every and count > config.density.max_gaussians:
+        warnings.warn(
+            f"training begins with {count:,} Gaussians, more than --density.max-gaussians "
+            f"{config.density.max_gaussians:,}, which stops new ones only: give the scene fewer points"
+        )
+
+
+def _train(
+    scene: Scene,
+    config: TrainConfig,
+    opened: Device,
+    run: Run | None,
+    *,
+    resume: bool = False,
+    on_step: Callable[[StepReport], None] | None,
+    on_plan: Callable[[Plan], None] | None,
+    between: Between | None,
+) -> Gaussians:
+    """As `train`, alone in the run's folder."""
+    if not (resume and run is not None and run.checkpoints()):
+        for text in doubts.of_scene(scene, config.background):
+            warnings.warn(text)
+        if is_colourless(scene):
+            warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
+            scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
+    session = _Session(Trainer(scene, config, opened), run, on_plan)
+    trainer = session.trainer
+    if resume:
+        session.resume()
+    session.first_step = trainer.step
+    _tell_idle_settings(trainer)
+    session.tell_plan()
+    with _rescued(session), _Interruption() as interrupted:
+        while True:
+            while trainer.step < config.iterations and not interrupted():
+                if between is not None:
+                    between(trainer, interrupted)
+                session.step(on_step)
+            session.save()
+            if trainer.step < config.iterations or not session.go_back():
+                break
+        session.tell_the_rest()
+        if trainer.step < config.iterations:
+            raise Interrupted(interrupted.number)
+        session.doubt()
+    model = trainer.gaussians()
+    if run is not None:
+        run.save_model(model, photos_space(view.path for view in scene.views))
+        if scene.test_views:
+            run.write_eval(session.evaluate(keep=True))
+        if config.report:
+            write_last(run, scene, model)
+    return model

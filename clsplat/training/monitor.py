@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Watches over a training: notices that `adam` has refused steps, finds out why, and says what is to be done."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray
+from clsplat.stages.adam import REFUSED
+from clsplat.stages.project import GROUPS, AnyGaussians
+from clsplat.training import health
+from clsplat.training.health import Incident, Patience
+
+
+@dataclass(frozen=True, eq=False)
+class _Last:
+    """What is asked of a step that turns out to have had trouble: its number, view and background; the sums of its
+    loss, which are there until the next step has one."""
+
+    step: int
+    view: int
+    background: NDArray[np.float32]
+    sums: DeviceArray
+
+
+@dataclass(frozen=True, eq=False)
+class Remedy:
+    """rows: those to keep, or None for all; moments: what to put in place of those there are, by "first" and "second"
+    and by group, or None."""
+
+    rows: NDArray[np.uint32] | None
+    moments: Mapping[str, Mapping[str, NDArray[np.float32]]] | None
+
+
+class Watch:
+    """found: what a pass reads back, in the last four what `adam` counts (`Rasterizer.found`); names: of the views.
+
+    incidents: those not told yet; patience: how much trouble there was.
+    """
+
+    def __init__(self, found: DeviceArray, names: Sequence[str]) -> None:
+        self.found, self.names = found, names
+        self.patience = Patience()
+        self.incidents: list[Incident] = []
+        self.latest: Incident | None = None
+        self._last: _Last | None = None
+        self._noticed: tuple[_Last, str, int] | None = None
+
+    def forget(self) -> None:
+        """Nothing has happened yet to the model that there is now."""
+        self._last = self._noticed = None
+        self.found.fill(0)
+
+    def follow(self, step: int, view: int, background: NDArray[np.float32], sums: DeviceArray) -> None:
+        """A step is under way, and has its loss."""
+        self._last = _Last(step, view, background, sums)
+
+    def notice(self, refused: Sequence[int]) -> None:
+        """Take what `adam` counted (`REFUSED`) in the last step, whose loss must still be there."""
+        if not any(refused) or self._noticed is not None or self._last is None:
+            return
+        counts = dict(zip(REFUSED, refused, strict=True))
+        stage = "parameters" if counts["parameters"] else ("project_grad" if counts["gradients"] else "adam")
+        if not np.isfinite(self._last.sums.get()).all():
+            stage = "loss"
+        self._noticed = (self._last, stage, sum(refused))
+
+    def look(self) -> None:
+        """Read what there is to notice, rather than wait for the next pass."""
+        self.notice([int(value) for value in self.found.get()[-len(REFUSED) :]])
+
+    def loss_failed(self) -> None:
+        """A loss was read that is not finite; where no Gaussian is, `adam` has nothing to refuse."""
+        if self._last is not None and self._noticed is None:
+            self._noticed = (self._last, "loss", 0)
+
+    def examine(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> Remedy | None:
+        """What to do about what was noticed, if anything was."""
+        if self._noticed is None:
+            return None
+        (last, stage, elements), self._noticed = self._noticed, None
+        self.found.fill(0)
+        models = {"parameters": parameters, "first": first, "second": second}
+        return self._judge(last, stage, elements, {k: {g: m[g].get() for g in GROUPS} for k, m in models.items()})
+
+    def examine_all(self, arrays: Mapping[str, NDArray[np.float32]]) -> Remedy | None:
+        """As `examine`, of every number, whether `adam` has met it or not; arrays by "parameters/means" and so on."""
+        host = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in ("parameters", "first", "second")}
+        if self._last is None or self.patience.lost or not health.examine(**host).any:
+            return None
+        return self._judge(self._last, "parameters", 0, host)
+
+    def _judge(
+        self, last: _Last, stage: str, elements: int, host: Mapping[str, Mapping[str, NDArray[np.float32]]]
+    ) -> Remedy | None:
+        found = health.examine(**host)
+        lost = found.lost(stage)
+        concerned = np.flatnonzero(found.broken | found.refused)
+        hopeless = bool(np.mean(lost) > health.MOST_LOST)
+        self.latest = Incident(
+            step=last.step,
+            view=last.view,
+            name=self.names[last.view],
+            stage=stage,
+            count=len(concerned) or elements,
+            done=_done(stage, int(lost.sum()), len(lost), hopeless=hopeless),
+            background=last.background,
+            gaussians={f"{k}/{g}": host[k][g][concerned[: health.KEPT]] for k in host for g in GROUPS},
+        )
+        self.incidents.append(self.latest)
+        self.patience.note(last.step, lost=hopeless)
+        if hopeless:
+            return None
+        moments = {k: {g: health.finite_or_zero(v) for g, v in host[k].items()} for k in ("first", "second")}
+        rows = np.flatnonzero(~lost).astype(np.uint32)
+        return Remedy(rows if lost.any() else None, moments if found.refused.any() else None)
+
+
+def _done(stage: str, lost: int, count: int, *, hopeless: bool) -> str:
+    if hopeless:
+        return f"{lost:,} of {count:,} are too many to remove"
+    if lost:
+        return f"{lost:,} removed"
+    return "nothing is learnt where it shows" if stage == "loss" else "moments begin again from zero"

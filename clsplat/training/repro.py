@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bundle that a training leaves when it gives up on numbers that are not finite, and the one step that it repeats.
+
+    python -m clsplat.training.repro RUN/trouble-step-0001234.npz [--device DEVICE] [--json]
+
+prints how many numbers are not finite after each stage of that step. Exit status 0 where some are, 1 where all is well.
+A bundle has a photograph, a camera, settings, versions and the Gaussians concerned; all of them only where those alone
+do not show it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import clsplat
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device import cl
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device, open_device
+from clsplat.device.layout import SPLAT, SlotFields
+from clsplat.errors import ClsplatError, InputError
+from clsplat.files import atomic_writer, parse_json
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.runs.run import config_text, parse_config, read_arrays
+from clsplat.stages.adam import REFUSED, adam
+from clsplat.stages.loss import loss
+from clsplat.stages.project import GROUPS, DeviceGaussians, allocate_gaussians, group_shapes
+from clsplat.stages.target import target
+from clsplat.training.density import adaptive
+from clsplat.training.health import Incident, finite_or_zero
+
+if TYPE_CHECKING:
+    from clsplat.training.trainer import Trainer
+
+RECORD = "bundle.json"
+"""The member of a bundle with everything that is no array."""
+_KINDS = ("parameters", "first", "second")
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """One training step. record: step, stage, name of the view, rates, size, versions, device; config: the settings;
+    camera: at the size of photograph (H, W, 3 or 4); background (3,); models: parameters and moments by group."""
+
+    record: dict[str, Any]
+    config: TrainConfig
+    camera: Camera
+    photograph: NDArray[Any]
+    background: NDArray[np.float32]
+    models: dict[str, dict[str, NDArray[np.float32]]]
+
+
+def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
+    """Write `folder`/trouble-step-STEP.npz of what happened; the path."""
+    photograph = trainer.photographs.load(incident.view, trainer.sizes.factor(incident.step))
+    camera = trainer.views[incident.view].camera.resized(photograph.shape[1], photograph.shape[0]).before(trainer.near)
+    device = trainer.device
+    record: dict[str, Any] = {
+        "step": incident.step,
+        "view": incident.name,
+        "stage": incident.stage,
+        "message": str(incident),
+        "rates": trainer.rates(),
+        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "near")},
+        "settings": config_text(trainer.config, None),
+        "versions": {
+            "clsplat": clsplat.__version__,
+            "numpy": np.__version__,
+            "pyopencl": cl.VERSION_TEXT,
+            "python": platform.python_version(),
+            "system": platform.platform(),
+        },
+        "device": {"name": device.name, "driver": device.driver, "shape": str(device.shape)},
+    }
+    pixels = {"photograph": photograph, "background": incident.background}
+    pose = {"rotation": camera.rotation, "translation": camera.translation}
+    models = {kind: {g: incident.gaussians[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS if incident.gaussians}
+
+    def bundle() -> Bundle:
+        return Bundle(record, trainer.config, camera, photograph, incident.background, models)
+
+    alone = bool(models) and len(models["parameters"]["means"]) > 0
+    if alone:
+        _forget_marks(models)
+        alone = bool(first_trouble(replay(bundle(), device)))
+    if not alone:
+        whole = {"parameters": trainer.parameters, "first": trainer.first, "second": trainer.second}
+        models = {kind: {g: model[g].get() for g in GROUPS} for kind, model in whole.items()}
+        _forget_marks(models)
+    record["of"] = len(models["parameters"]["means"]), trainer.parameters.count
+    record["reproduced"] = alone or bool(first_trouble(replay(bundle(), device)))
+    arrays = {f"{kind}/{g}": values for kind, groups in models.items() for g, values in groups.items()}
+    path = folder / f"trouble-step-{incident.step:07d}.npz"
+    text = np.frombuffer(json.dumps(record).encode(), np.uint8)
+    members = {RECORD: text, **pixels, **pose, **arrays}
+    with atomic_writer(path, sum(array.nbytes + 512 for array in members.values())) as file:
+        np.savez(file, allow_pickle=False, **members)
+    return path
+
+
+def _forget_marks(models: dict[str, dict[str, NDArray[np.float32]]]) -> None:
+    """Moments as they were before `adam` refused a step, as far as they are known."""
+    for kind in ("first", "second"):
+        models[kind] = {group: finite_or_zero(values) for group, values in models[kind].items()}
+
+
+def read_bundle(path: Path) -> Bundle:
+    """Raises InputError for what is no bundle."""
+    try:
+        return _checked(_bundle_of(read_arrays(path, "a bundle"), path))
+    except Exception as error:  # as of a checkpoint: zipfile raises nearly anything for a flipped bit
+        if isinstance(error, InputError) and str(path) in str(error):
+            raise
+        why = f"{type(error).__name__}: {error}"[:300]
+        raise InputError(f"{path}: not a bundle of a training that gave up ({why})") from None
+
+
+def _bundle_of(arrays: dict[str, NDArray[Any]], path: Path) -> Bundle:
+    record = parse_json(arrays[RECORD].tobytes())
+    size = record["camera"]
+    lens = (size["width"], size["height"], size["fx"], size["fy"], size["cx"], size["cy"])
+    config, _ = parse_config(record["settings"], path, tell=False)
+    camera = Camera(*lens, arrays["rotation"], arrays["translation"], near=size["near"])
+    models = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS}
+    return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
+
+
+def _checked(bundle: Bundle) -> Bundle:
+    """The bundle. Raises ValueError where its arrays do not belong together, or it lacks what a step needs."""
+    camera, record = bundle.camera, bundle.record
+    sides = camera.height, camera.width
+    if not all(type(side) is int for side in sides):
+        raise ValueError(f"a camera of {sides} pixels")
+    if bundle.photograph.shape not in ((*sides, 3), (*sides, 4)) or bundle.photograph.dtype not in (
+        np.uint8,
+        np.float32,
+    ):
+        raise ValueError(f"a photograph {bundle.photograph.shape} of {bundle.photograph.dtype} for a camera of {sides}")
+    numbers = (camera.rotation, camera.translation, [camera.fx, camera.fy, camera.cx, camera.cy, camera.near])
+    if not all(np.isfinite(values).all() for values in numbers) or bundle.background.shape != (3,):
+        raise ValueError("a camera that is none")
+    rates = record["rates"]
+    if type(record["step"]) is not int or not np.isfinite([float(rates[group]) for group in GROUPS]).all():
+        raise ValueError("no step and no learning rates")
+    for arrays in bundle.models.values():
+        count, coefficients = len(arrays["means"]), arrays["sh_rest"].shape[1] + 1
+        for group, shape in group_shapes(count, coefficients).items():
+            if arrays[group].shape != shape or arrays[group].dtype != np.float32:
+                raise ValueError(f"{group} are {arrays[group].shape} of {arrays[group].dtype}, expected {shape}")
+    return bundle
+
+
+def replay(bundle: Bundle, device: Device) -> dict[str, int]:
+    """Make the step once more: after each stage how many numbers are not finite, and how many steps `adam` refuses."""
+    config, camera = bundle.config, bundle.camera
+    rasterizer = Rasterizer(device, config.rasterizer)
+    parameters, first, second = (_upload(device, bundle.models[kind]) for kind in _KINDS)
+    count, coefficients = parameters.count, parameters.coefficients
+    gradients = allocate_gaussians(device, count, coefficients, zero=True)
+    background = upload(device, bundle.background)
+    planes = target(device, rasterizer.work, bundle.photograph, background)
+    fields = SlotFields(config.density.absolute_gradients, adaptive.wants_contributions(config.density))
+    result = {"parameters": _wrong(parameters)}
+    frame = rasterizer.forward(parameters, camera, background)
+    drawn = frame.projected.tile_counts.get() > 0
+    written = [column for column, name in enumerate(SPLAT) if name != "UNUSED"]
+    result["project"] = int(np.count_nonzero(~np.isfinite(frame.projected.splats.get()[drawn][:, written])))
+    image = frame.blended.image.get()[:, : camera.height, : camera.width]
+    result["blend"] = int(np.count_nonzero(~np.isfinite(image)))
+    lost = loss(device, rasterizer.work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight)
+    image_gradient = lost.gradient.get()[:, : camera.height, : camera.width]
+    result["loss"] = int(np.count_nonzero(~np.isfinite(image_gradient)))
+    slots = rasterizer.pair_gradients(frame, lost.gradient, fields=fields)
+    result["blend_grad"] = int(np.count_nonzero(~np.isfinite(slots.values.get())))
+    rasterizer.row_gradients(parameters, frame, frame.projected, slots, gradients, fields=fields)
+    result["project_grad"] = _wrong(gradients)
+    step, rates = bundle.record["step"], bundle.record["rates"]
+    moved = (parameters, gradients, first, second)
+    adam(device, step, rates, config.optimiser, *moved, frame.projected.tile_counts, rasterizer.found)
+    result["adam"] = int(rasterizer.found.get()[-len(REFUSED) :].sum())
+    return result
+
+
+def first_trouble(counts: dict[str, int]) -> str | None:
+    """The first stage after which something is not finite."""
+    return next((stage for stage, count in counts.items() if count), None)
+
+
+def _upload(device: Device, arrays: dict[str, NDArray[np.float32]]) -> DeviceGaussians:
+    count, coefficients = len(arrays["means"]), arrays["sh_rest"].shape[1] + 1
+    return DeviceGaussians(count, coefficients, {group: upload(device, arrays[group]) for group in GROUPS})
+
+
+def _wrong(gaussians: DeviceGaussians) -> int:
+    return sum(int(np.count_nonzero(~np.isfinite(gaussians[group].get()))) for group in GROUPS)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line above."""
+    parser = argparse.ArgumentParser(
+        prog="python -m clsplat.training.repro", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("bundle", type=Path)
+    parser.add_argument("--device")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    try:
+        bundle = read_bundle(options.bundle)
+        counts = replay(bundle, open_device(options.device))
+    except ClsplatError as error:
+        print(f"clsplat.training.repro: error: {error}", file=sys.stderr)
+        return error.exit_status
+    stage = first_trouble(counts)
+    if options.json:
+        print(json.dumps({"counts": counts, "stage": stage, **bundle.record}, indent=2))
+        return 0 if stage else 1
+    print(bundle.record["message"])
+    kept, of = bundle.record["of"]
+    print(f"{kept:,} of {of:,} Gaussians, {bundle.camera.width}x{bundle.camera.height}; not finite after")
+    for name, count in counts.items():
+        print(f"  {name:13}{count:>12,}")
+    print(f"first in {stage}" if stage else "all is well on this device")
+    return 0 if stage else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a model is looked at: what of it is left out or changed, which channel, in which colours. No OpenCL, no viser."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians import Gaussians
+from clsplat.images.reading import steps_of
+
+Float32 = NDArray[np.float32]
+Image = NDArray[np.uint8]
+Mode = Literal["colour", "depth", "alpha", "count"]
+MODES: tuple[Mode, ...] = get_args(Mode)
+Box = tuple[float, float, float, float, float, float]
+"""The least x, y, z in the world, and the largest."""
+
+LARGEST_OPACITY = 0.999
+"""What a raised opacity goes up to: the logit of 1 is not finite."""
+SIZES = (0.05, 2.0)
+OPACITIES = (0.0, 3.0)
+SCALE = np.array(
+    [(68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129), (92, 200, 99),
+     (170, 220, 50), (253, 231, 37)],
+    np.float64,
+)  # fmt: skip
+"""Dark to bright, 8-bit: every eighth part of viridis (Smith and van der Walt 2015, CC0,
+https://bids.github.io/colormap/)."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """mode: what is shown; degree: SH bands up to this one; size, opacity: factors; crop: nothing outside is shown."""
+
+    mode: Mode = "colour"
+    degree: int = 3
+    size: float = 1.0
+    opacity: float = 1.0
+    crop: Box | None = None
+
+    def changes(self, degree: int) -> Look | None:
+        """What it changes of a model of this SH degree, whatever the mode; None for nothing."""
+        asked = replace(self, mode="colour", degree=min(self.degree, degree))
+        return None if asked == Look(degree=degree) else asked
+
+
+def read_look(mode: Any, degree: Any, size: Any, opacity: Any, crop: Any = None) -> Look:
+    """What a page's controls say; numbers that no slider has are brought into its range."""
+    box = None
+    if crop is not None:
+        corners = np.asarray(crop, np.float64).reshape(2, 3)
+        if np.isfinite(corners).all():
+            box = tuple(float(value) for value in np.concatenate([corners.min(axis=0), corners.max(axis=0)]))
+    return Look(
+        mode if mode in MODES else "colour",
+        int(_within(degree, 0, 3, 3)),
+        _within(size, *SIZES, 1.0),
+        _within(opacity, *OPACITIES, 1.0),
+        box,  # type: ignore[arg-type]  # six of them
+    )
+
+
+def _within(value: Any, low: float, high: float, usual: float) -> float:
+    number = float(value)
+    return min(max(number, low), high) if math.isfinite(number) else usual
+
+
+def edited(gaussians: Gaussians, look: Look) -> Gaussians:
+    """The model as it is looked at. What does not change is shared with the one given."""
+    found = replace(gaussians)
+    if look.degree < gaussians.sh_degree:
+        found.sh = np.ascontiguousarray(gaussians.sh[:, : (look.degree + 1) ** 2])
+    if look.size != 1:
+        found.log_scales = gaussians.log_scales + np.float32(math.log(look.size))
+    if look.opacity != 1:
+        opacity = look.opacity / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+        opacity = np.clip(opacity, 1e-6, LARGEST_OPACITY)
+        found.opacity_logits = np.log(opacity / (1 - opacity)).astype(np.float32)
+    if look.crop is not None:
+        low, high = (np.array(corner) - gaussians.origin for corner in (look.crop[:3], look.crop[3:]))
+        inside = np.flatnonzero(((gaussians.means >= low) & (gaussians.means <= high)).all(axis=1))
+        for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+            setattr(found, name, getattr(found, name)[inside])
+    return found
+
+
+def colour_picture(image: Float32) -> Image:
+    """(H, W, 3) uint8 of a frame, with the bits that `clsplat render` writes to a PNG."""
+    return steps_of([image], 8)
+
+
+def alpha_picture(alpha: Float32) -> Image:
+    """(H, W, 3) uint8: black where nothing is."""
+    return colour_picture(np.broadcast_to(alpha[:, :, None], (*alpha.shape, 3)))
+
+
+def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
+    """(H, W, 3) uint8, near is bright, nothing is black; and between which depths, in words."""
+    seen = alpha > 0.5
+    if not seen.any():
+        return np.zeros((*depth.shape, 3), np.uint8), "nothing is seen"
+    near, far = (float(value) for value in np.quantile(depth[seen], [0.02, 0.98]))
+    shade = (far - depth.astype(np.float64)) / ((far - near) or 1.0)
+    return _shaded(shade, alpha), f"depth {near:.3g} (bright) to {far:.3g}"
+
+
+def count_picture(count: NDArray[np.int32]) -> tuple[Image, str]:
+    """(H, W, 3) uint8, many are bright; and how many, in words."""
+    most = max(float(np.quantile(count, 0.995)), 1.0)
+    return _shaded(count / most, None), f"0 to {most:,.0f} Gaussians a pixel (bright), {int(count.max()):,} at most"
+
+
+def _shaded(shade: NDArray[np.float64], alpha: Float32 | None) -> Image:
+    """0 to 1 in the colours of SCALE."""
+    at = np.clip(np.nan_to_num(shade), 0, 1)
+    stops = np.linspace(0, 1, len(SCALE))
+    table = np.stack([np.interp(np.linspace(0, 1, 256), stops, column) for column in SCALE.T], axis=1)
+    colours = table[np.rint(255 * at).astype(np.intp)]
+    if alpha is not None:
+        colours = colours * np.clip(alpha, 0, 1)[:, :, None]
+    shaded: Image = np.rint(colours).astype(np.uint8)
+    return shaded
