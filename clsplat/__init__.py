@@ -17,12 +17,12 @@ TYPE_CHECKING = False  # typing's own would be an import, in which Ctrl-C is a t
 if TYPE_CHECKING:
     from typing import Any
 
+    from clsplat.api import train as train
     from clsplat.camera import Camera as Camera
     from clsplat.config.training import TrainConfig as TrainConfig
     from clsplat.gaussians import Gaussians as Gaussians
-    from clsplat.rendering.rasterizer import render as render
+    from clsplat.rendering.renderer import render as render
     from clsplat.scenes.scene import load_scene as load_scene
-    from clsplat.training.loop import train as train
 
     __version__: str
 
@@ -33,8 +33,8 @@ _MODULES = {
     "Gaussians": "clsplat.gaussians",
     "TrainConfig": "clsplat.config.training",
     "load_scene": "clsplat.scenes.scene",
-    "render": "clsplat.rendering.rasterizer",
-    "train": "clsplat.training.loop",
+    "render": "clsplat.rendering.renderer",
+    "train": "clsplat.api",
 }
 
 

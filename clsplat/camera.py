@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.errors import InputError
 
-Float64 = NDArray[np.float64]
 Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
 
 FRAME_CLAMP = 0.3

@@ -8,12 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, Camera
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 MAX_SH_DEGREE = 3
 
@@ -91,3 +88,30 @@ class Gaussians:
         from clsplat.models.formats import save
 
         save(path, self, sh_degree=sh_degree, comments=comments)
+
+
+SH_LIMIT = 1e7
+"""No SH coefficient may be larger: a colour that project.cl does not draw for its size has one that is."""
+LIMIT = 1e19
+"""No parameter may be larger: its square is to be a float32."""
+
+
+def limit_of(group: str) -> float:
+    """What the magnitudes of a group's parameters have to be under."""
+    return SH_LIMIT if group.startswith("sh_") else LIMIT
+
+
+GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
+"""The parameter groups on the device: as in `Gaussians`, with SH split into its constant and the rest."""
+
+
+def group_shapes(count: int, coefficients: int) -> dict[str, tuple[int, ...]]:
+    """The arrays of `count` Gaussians with `coefficients` SH coefficients a channel."""
+    return {
+        "means": (count, 3),
+        "quaternions": (count, 4),
+        "log_scales": (count, 3),
+        "opacity_logits": (count,),
+        "sh_dc": (count, 3),
+        "sh_rest": (count, coefficients - 1, 3),
+    }

@@ -129,7 +129,7 @@ class StageProgress:
 
 
 class FrameRecord(Protocol):
-    """What is shown of a frame, `clsplat.sequence.workers.Record` for one; seconds that it took."""
+    """What is shown of a frame, `clsplat.sequence.task.Record` for one; seconds that it took."""
 
     @property
     def name(self) -> str: ...

@@ -14,12 +14,15 @@ from models import random_gaussians
 
 from clsplat.camera import Camera
 from clsplat.cli import render as verb_render  # noqa: F401  # imported before fakes take their modules' places
-from clsplat.config.training import RasterizerConfig, TrainConfig
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import TrainConfig
 from clsplat.errors import DeviceError, InputError
+from clsplat.evaluation import held_out
 from clsplat.gaussians import Gaussians
 from clsplat.images import channels as layers
 from clsplat.runs.run import Run
-from clsplat.scenes import colmap
+from clsplat.sequence import frame_renderer
+from clsplat.shots import read
 
 
 def camera(width: int = 32, height: int = 24) -> Camera:
@@ -57,6 +60,17 @@ class Pipeline:
         """In place of the real one."""
         planes = [plane if plane.ndim == 3 else plane[:, :, None] for plane in made.values()]
         self.written[str(path)] = np.concatenate(planes, axis=2)
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, fakes: dict[str, dict[str, Any]]) -> None:
+    """Put members of modules in the places of the real ones, and where those have been imported to already."""
+    for name, members in fakes.items():
+        module = ModuleType(f"clsplat.{name}")
+        vars(module).update(members)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        for user in (frame_renderer, held_out):
+            for member in members.keys() & vars(user).keys():
+                monkeypatch.setattr(user, member, members[member])
 
 
 @pytest.fixture
@@ -147,20 +161,17 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         assert image.shape[2] == 3 or alpha == "associated"
         pipe.written[str(path)] = image
 
-    monkeypatch.setattr(colmap, "read_cameras", lambda _: pipe.cameras)
+    monkeypatch.setattr(read, "read_cameras", lambda _: pipe.cameras)
     monkeypatch.setattr(layers, "write_layers", pipe.write_layers)
     fakes: dict[str, dict[str, Any]] = {
         "scenes.scene": {"load_scene": load_scene},
-        "training.loop": {"train": train},
-        "rendering.rasterizer": {"Renderer": Renderer},
+        "api": {"train": train},
+        "rendering.renderer": {"Renderer": Renderer},
         "device.context": {"open_device": open_device},
         "selftest.trust": {"require": lambda device, *_: device},
-        "images.reading": {"write_image": write_image},
+        "images.writing": {"write_image": write_image},
     }
-    for name, members in fakes.items():
-        module = ModuleType(f"clsplat.{name}")
-        vars(module).update(members)
-        monkeypatch.setitem(sys.modules, module.__name__, module)
+    stand_in(monkeypatch, fakes)
     return pipe
 
 

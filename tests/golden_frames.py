@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from pipeline import Pipeline, shaped
 from tiny import short, write_scene
 
+from clsplat.api import train
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
-from clsplat.sequence.frame_renderer import FrameShader, RenderOptions, Task
-from clsplat.training.loop import train
+from clsplat.sequence.frame_renderer import FrameShader
+from clsplat.sequence.task import RenderOptions, Task
 
 Array = NDArray[np.float32]
 

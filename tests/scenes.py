@@ -6,13 +6,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 
 Scene = tuple[Gaussians, Camera]
-Float64 = NDArray[np.float64]
 
 
 def make_gaussians(

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.reference.sh import sh_basis
+from clsplat.spherical_harmonics import sh_basis
 
 
 def lopsided(count: int = 500, degree: int = 3, seed: int = 0) -> Gaussians:

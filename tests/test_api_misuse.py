@@ -12,13 +12,14 @@ import pytest
 from tiny import hidden_model, short
 
 import clsplat
-from clsplat.config.training import DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
+from clsplat.api import train
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.training.loop import train
 
 FEW = short(iterations=2, report=False, density={"every": 0})
 

@@ -20,9 +20,11 @@ from tiny import write_scene
 
 from clsplat.bench import plots
 from clsplat.bench import settings as tradeoff
-from clsplat.bench import stages as measure
+from clsplat.bench import stages as bench_stages
+from clsplat.bench import subject as bench_subject
 from clsplat.cli.main import main
-from clsplat.config.training import PRESETS, RasterizerConfig
+from clsplat.config.presets import PRESETS
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT, TILE
 from clsplat.errors import InputError
@@ -42,7 +44,7 @@ quick_limits = partial(measure_limits, seconds=1e-3, repeat=1, copy_bytes=2**16)
 
 @pytest.fixture
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measure, "measure_limits", quick_limits)
+    monkeypatch.setattr(bench_stages, "measure_limits", quick_limits)
 
 
 @pytest.fixture(scope="session")
@@ -177,7 +179,9 @@ def test_limits_are_finite_in_every_shape(shaped_device: Device) -> None:
 @pytest.mark.parametrize("shape", [None, (1, 64)], ids=str)
 def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
     device = profiled.with_shape(lanes=shape[0], items=shape[1]) if shape else profiled
-    result = measure.bench(measure.synthetic(300, 50, 40), device, repeat=2, limits=Limits(1e9, 5e8, 1e10, 8, 1))
+    result = bench_stages.bench(
+        bench_subject.synthetic(300, 50, 40), device, repeat=2, limits=Limits(1e9, 5e8, 1e10, 8, 1)
+    )
     assert set(result["stages"]) >= FRAME | STEP
     assert result["timer"] == "events"
     for name in FRAME | STEP:
@@ -198,8 +202,8 @@ def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
 
 
 def test_wall_time_where_events_have_none(default_device: Device) -> None:
-    result = measure.bench(
-        measure.synthetic(200, 40, 30), default_device, repeat=1, limits=Limits(1e9, 5e8, 1e10, 8, 1)
+    result = bench_stages.bench(
+        bench_subject.synthetic(200, 40, 30), default_device, repeat=1, limits=Limits(1e9, 5e8, 1e10, 8, 1)
     )
     assert result["timer"] == "wall"
     assert all(result["stages"][name]["ms"] == result["stages"][name]["wall_ms"] for name in FRAME | STEP)
@@ -214,8 +218,8 @@ def test_nothing_is_recorded_unless_asked(profiled: Device) -> None:
 
 
 def test_measuring_leaves_the_model_as_it_is(profiled: Device) -> None:
-    subject = measure.synthetic(200, 40, 30)
-    trainer = measure.trainer_of(subject, profiled, RasterizerConfig())
+    subject = bench_subject.synthetic(200, 40, 30)
+    trainer = bench_stages.trainer_of(subject, profiled, RasterizerConfig())
     for _ in range(3):
         trainer.train_step()
     after = trainer.gaussians()
@@ -225,7 +229,7 @@ def test_measuring_leaves_the_model_as_it_is(profiled: Device) -> None:
 
 
 def test_synthetic_scene_is_the_same_every_time() -> None:
-    first, second = measure.synthetic(50, 40, 30), measure.synthetic(50, 40, 30)
+    first, second = bench_subject.synthetic(50, 40, 30), bench_subject.synthetic(50, 40, 30)
     np.testing.assert_array_equal(first.gaussians.means, second.gaussians.means)
     first.gaussians.check()
 
@@ -272,8 +276,8 @@ def test_scene_run_and_model(tmp_path: Path, capsys: Capture) -> None:
 
 
 def test_facing_camera_sees_the_model() -> None:
-    gaussians = measure.synthetic(500, 64, 48).gaussians
-    _, camera = measure.facing(gaussians, 80, 60)
+    gaussians = bench_subject.synthetic(500, 64, 48).gaussians
+    _, camera = bench_subject.facing(gaussians, 80, 60)
     p = gaussians.means @ camera.rotation.T + camera.translation
     pixels = p[:, :2] / p[:, 2:] * camera.fx + (camera.cx, camera.cy)
     seen = (p[:, 2] > camera.near) & (pixels > 0).all(axis=1) & (pixels < (80, 60)).all(axis=1)
@@ -305,7 +309,7 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
         "no row-skip": RasterizerConfig(row_skip=False),
         "coarse": RasterizerConfig(alpha_min=8 / 255),
     }
-    result = tradeoff.compare(measure.synthetic(300, 70, 50), profiled, candidates, repeat=1)
+    result = tradeoff.compare(bench_subject.synthetic(300, 70, 50), profiled, candidates, repeat=1)
     exact, rows, coarse = result["points"]
     assert result["error_is_against"] == "the exact preset's frame"
     assert result["crop"] == [11, 1, 48, 48]
@@ -330,7 +334,7 @@ def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPat
     times = iter([50.0, 100.0, 150.0, 210.0])  # of a frame and of a step, on and off
     monkeypatch.setattr(tradeoff, "wall_ms", lambda _device, work: (work(), next(times))[1])
     candidates = {"preset exact = default": PRESETS["exact"], tradeoff.ALL_OFF: off}
-    result = tradeoff.compare(measure.synthetic(300, 70, 50), profiled, candidates, repeat=1)
+    result = tradeoff.compare(bench_subject.synthetic(300, 70, 50), profiled, candidates, repeat=1)
     assert [(point["frame_ms"], point["iteration_ms"]) for point in result["points"]] == [(50, 100), (150, 210)]
     assert result["points"][1]["max_abs"] == 0.0
     assert result["exact_switches_faster"] == {"frame": 3.0, "iteration": 2.1}
@@ -341,18 +345,18 @@ def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.usefixtures("_quick")
 def test_a_held_model_is_what_frames_are_measured_of(profiled: Device) -> None:
-    subject = measure.synthetic(300, 50, 40)
+    subject = bench_subject.synthetic(300, 50, 40)
     limits = Limits(1e9, 5e8, 1e10, 8, 1)
     sizes = []
     for storage in ("float", "half"):
         config = RasterizerConfig(sh_storage=storage)
-        result = measure.bench(subject, profiled, config, repeat=1, limits=limits)
+        result = bench_stages.bench(subject, profiled, config, repeat=1, limits=limits)
         sizes.append(result["stages"]["project"]["bytes"])
     assert sizes[0] - sizes[1] == 300 * 90
 
 
 def test_small_frames_are_compared_with_float64(profiled: Device) -> None:
-    result = tradeoff.compare(measure.synthetic(200, 40, 30), profiled, {"exact": PRESETS["exact"]}, repeat=1)
+    result = tradeoff.compare(bench_subject.synthetic(200, 40, 30), profiled, {"exact": PRESETS["exact"]}, repeat=1)
     assert result["error_is_against"] == "the float64 reference"
     assert result["crop"] == [0, 0, 40, 30]
     assert 90 < result["points"][0]["psnr"] < tradeoff.PSNR_MAX

@@ -13,14 +13,17 @@ import scenes
 from compare import assert_same_bits
 
 from clsplat.camera import Camera, Window
-from clsplat.config.pictures import FramingConfig, SamplingConfig
+from clsplat.config.pictures import Encoding, FramingConfig, SamplingConfig
 from clsplat.device.context import open_device
 from clsplat.errors import InputError
+from clsplat.frame.draw import drawn_by
 from clsplat.frame.shutter_and_lens import sample_cameras, sampled
 from clsplat.frame.strips import in_strips, strip_rows, strips, write_in_strips
-from clsplat.frame.window import crop, drawn_by, framed, supersampled
-from clsplat.images.channels import LAYERS, Encoding, Header, write_layers
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.frame.supersample import supersampled
+from clsplat.frame.window import crop, framed
+from clsplat.images.channels import LAYERS, write_layers
+from clsplat.images.exr_header import Header
+from clsplat.rendering.renderer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(3000, 8, 150, 200)
 EVERYTHING = tuple(LAYERS)

@@ -16,7 +16,7 @@ from clsplat.device.buffers import allocate
 from clsplat.device.context import Device, all_devices
 from clsplat.device.launch import launch_groups
 from clsplat.device.program import Kernels, Variant, build, variant_of
-from clsplat.device.shapes import wants_cache
+from clsplat.device.quirks import wants_cache
 
 VARIANT = variant_of("probe", {"LANES": 4, "ITEMS": 1, "FMA_BY_CONTRACTION": True}, "-cl-std=CL1.2")
 

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from clsplat.errors import InputError
-from clsplat.images.reading import write_image
+from clsplat.images.writing import write_image
 from clsplat.reference.cameras import cam_from_pixel
 from clsplat.shots import choose_shot, read_shot
 from clsplat.shots.clsplat_json import FILE, KEY
 from clsplat.shots.shot import Shot
-from clsplat.stages.project import pack_camera
+from clsplat.stages.device_camera import pack_camera
 
 # A camera at (1, 2, 3) that looks along the world's +x, the world's +z up, in OpenGL's axes: columns right, up, back.
 POSE = [[0.0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]

@@ -19,7 +19,8 @@ from clsplat import files
 from clsplat.cli.main import main
 from clsplat.errors import InputError
 from clsplat.files import TEMPORARY_SUFFIX
-from clsplat.runs.run import STATE_KEY, Checkpoint, Run
+from clsplat.runs.checkpoints import STATE_KEY, Checkpoint
+from clsplat.runs.run import Run
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 

@@ -16,7 +16,8 @@ from fakes import Pipeline
 
 from clsplat.cli import verbs
 from clsplat.cli.main import Eval, Train, main, parse
-from clsplat.config.training import DEMO_ITERATIONS, TrainConfig
+from clsplat.config.training import TrainConfig
+from clsplat.config.verbs import DEMO_ITERATIONS
 from clsplat.errors import ClsplatError, InputError
 from clsplat.runs.run import Run
 

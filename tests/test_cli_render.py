@@ -13,7 +13,9 @@ from fakes import Pipeline, camera
 
 from clsplat.cli.main import Render, main, parse
 from clsplat.cli.render_request import resizer
-from clsplat.config.training import PRESETS, RasterizerConfig, TrainConfig
+from clsplat.config.presets import PRESETS
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import TrainConfig
 from clsplat.runs.run import Run
 
 

@@ -10,10 +10,10 @@ import OpenImageIO as oiio
 import pytest
 from scenes import one
 
-from clsplat.config.pictures import ColourConfig
+from clsplat.config.pictures import ColourConfig, Encoding
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.images.channels import Encoding, write_layers
+from clsplat.images.channels import write_layers
 from clsplat.images.colour import (
     LINEAR,
     SRGB,

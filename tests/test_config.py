@@ -10,7 +10,8 @@ import pytest
 from tiny import write_scene
 
 from clsplat.cli.main import main
-from clsplat.config.training import PRESETS, DensityConfig, OptimiserConfig, TrainConfig, bundled, scheduled
+from clsplat.config.presets import PRESETS, bundled, scheduled
+from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.runs.run import Run
 
 Capture = pytest.CaptureFixture[str]
@@ -137,7 +138,7 @@ def test_a_setting_that_two_places_have_has_one_default() -> None:
 
     from clsplat.cli.main import Render, Train
     from clsplat.cli.options import Convert, View
-    from clsplat.images.channels import Encoding
+    from clsplat.config.pictures import Encoding
     from clsplat.scenes.scene import load_scene
     from clsplat.viewer.server import Address
 

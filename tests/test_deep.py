@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from pipeline import EVERY_SHAPE, shaped, shapes_of
 
 from clsplat.camera import Camera, Window
-from clsplat.config.pictures import ColourConfig, DeepConfig
+from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.frame.deep_exr import bin_bounds, depths_in_view, flattened, render_deep, write_deep
 from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
-from clsplat.images.channels import Encoding, Header, camera_matrices
 from clsplat.images.colour import LINEAR, Colours
+from clsplat.images.exr_header import Header, camera_matrices
 from clsplat.reference import deep as twin
 from clsplat.reference import render as reference
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 
 SCENES = {
     "overlap": scenes.NAMED["overlap"],

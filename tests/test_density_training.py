@@ -15,15 +15,16 @@ from quick import quick
 from test_trainer import host, model_bytes
 from tiny import short, write_scene
 
+from clsplat.api import train
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
+from clsplat.gaussians import GROUPS
 from clsplat.reference.render import render_grad
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.stages.project import GROUPS, HostGaussians
+from clsplat.stages.device_gaussians import HostGaussians
 from clsplat.training.density import adaptive
 from clsplat.training.density.adaptive import Plan
-from clsplat.training.loop import train
 from clsplat.training.trainer import Trainer
 
 EVERYTHING = short(

@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 from test_scene import make_colmap
 from tiny import short, write_scene
 
+from clsplat.api import train
 from clsplat.camera import Camera
 from clsplat.device.context import Device
-from clsplat.images.reading import read_image, write_image
+from clsplat.images.reading import read_image
+from clsplat.images.writing import write_image
 from clsplat.reference.cameras import pixel_from_world
 from clsplat.scenes import doubts
-from clsplat.scenes.initialise import LEAST_COLOUR, SH_C0, from_points
+from clsplat.scenes.initialise import LEAST_COLOUR, from_points
 from clsplat.scenes.point_colours import is_colourless, photographed, pixels_of
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.training.loop import train
+from clsplat.spherical_harmonics import C0
 
 
 def told(scene: Scene, device: Device, **changes: object) -> list[str]:
@@ -148,7 +150,7 @@ def test_pictures_with_alpha_take_any_background(tmp_path: Path) -> None:
 def test_a_black_point_can_learn(default_device: Device) -> None:
     # at a colour of 0 it is at the clamp, where rounding decides for good whether there is a gradient
     model = from_points([[0, 0, 2.0]], [[0.0, 0.5, 1.0]], sh_degree=0)
-    np.testing.assert_allclose(0.5 + SH_C0 * model.sh[0, 0], [LEAST_COLOUR, 0.5, 1.0], atol=1e-7)
+    np.testing.assert_allclose(0.5 + C0 * model.sh[0, 0], [LEAST_COLOUR, 0.5, 1.0], atol=1e-7)
 
 
 def test_black_points_become_bright(scene: Path, default_device: Device) -> None:
@@ -158,7 +160,7 @@ def test_black_points_become_bright(scene: Path, default_device: Device) -> None
     model = train(
         replace(loaded, point_colors=colors), short(iterations=30, density={"start": 100}), device=default_device
     )
-    assert (0.5 + SH_C0 * model.sh[::2, 0] > 3 * LEAST_COLOUR).mean() > 0.5
+    assert (0.5 + C0 * model.sh[::2, 0] > 3 * LEAST_COLOUR).mean() > 0.5
 
 
 def test_pixels_of_points_are_the_reference_s(scene: Path) -> None:

@@ -17,9 +17,9 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.reference.render import render as reference
-from clsplat.reference.sh import sh_basis
 from clsplat.rendering.contributions import largest_contributions
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
+from clsplat.spherical_harmonics import sh_basis
 
 TURN = Rotation.from_euler("xyz", (0.7, -1.9, 2.6)).as_matrix()
 MIRROR = TURN @ np.diag([1.0, -1.0, 1.0])

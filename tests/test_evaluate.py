@@ -10,7 +10,8 @@ import pytest
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation import metrics
-from clsplat.evaluation.held_out import background_colour, composite, evaluate, picture_names
+from clsplat.evaluation.held_out import evaluate, picture_names
+from clsplat.images.alpha import background_colour, composite
 
 
 @dataclass(frozen=True)

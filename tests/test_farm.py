@@ -23,12 +23,13 @@ from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
 from clsplat.cli.main import main
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError
 from clsplat.files import digest
 from clsplat.sequence import farm
-from clsplat.sequence.frame_renderer import RenderOptions
-from clsplat.sequence.workers import make_tasks, stamp
+from clsplat.sequence.existing import stamp
+from clsplat.sequence.task import RenderOptions
+from clsplat.sequence.task_list import make_tasks
 from clsplat.shots.shot import Shot, numbered
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -23,7 +23,7 @@ from clsplat.errors import InputError
 from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
 from clsplat.models import difference, edit, formats
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 
 FORMATS = formats.formats()
 WRITTEN = {name: module for name, module in FORMATS.items() if hasattr(module, "write")}

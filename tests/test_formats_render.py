@@ -19,7 +19,7 @@ from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
 from clsplat.models.codec import axes
 from clsplat.models.formats import gltf, sog, spz, usd
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 
 FILES = {
     "model.glb": (gltf, 60.0),

@@ -15,11 +15,13 @@ from clsplat.camera import Camera, Projection, Window
 from clsplat.config.pictures import FramingConfig, parse_overscan
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.frame.window import Draw, Layers, crop, drawn_by, filter_taps, framed, reframed, supersampled
+from clsplat.frame.draw import Draw, Layers, drawn_by
+from clsplat.frame.supersample import filter_taps, supersampled
+from clsplat.frame.window import crop, framed, reframed
 from clsplat.images.channels import LAYERS
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 
 WIDTH, HEIGHT = 150, 100
 EVERYTHING = tuple(LAYERS)

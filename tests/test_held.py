@@ -12,16 +12,15 @@ from compare import assert_same_bits
 from numpy.typing import NDArray
 from quick import quick
 
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.rendering.rasterizer import Renderer, held_sh
+from clsplat.rendering.renderer import Renderer, held_sh
 from clsplat.rendering.sh_storage import needed_degrees
-from clsplat.stages.project import DeviceGaussians, HostGaussians, upload_gaussians
-
-Float32 = NDArray[np.float32]
+from clsplat.stages.device_gaussians import DeviceGaussians, HostGaussians, upload_gaussians
 
 
 def cloud(count: int = 1000) -> scenes.Scene:

@@ -39,7 +39,7 @@ from systems import links, posix
 
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
-from clsplat.images import reading
+from clsplat.images import reading, writing
 from clsplat.images.reading import find_images, image_size, read_image
 from clsplat.models.formats import ply
 from clsplat.runs import run as runs
@@ -481,7 +481,7 @@ def test_an_exr_shown_as_100_000_by_100_000_pixels(tmp_path: Path) -> None:
 def test_large_flat_pictures_are_pictures(tmp_path: Path) -> None:
     """What compresses best of what there is."""
     path = tmp_path / "a.png"
-    reading.write_image(path, np.zeros((3000, 4000), np.uint8))
+    writing.write_image(path, np.zeros((3000, 4000), np.uint8))
     assert path.stat().st_size < 40_000
     assert read_image(path).shape == (3000, 4000, 3)
 

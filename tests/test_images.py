@@ -10,8 +10,9 @@ from PIL import Image as Pillow
 from PIL import ImageOps
 
 from clsplat.errors import ClsplatError, InputError
-from clsplat.images import reading
-from clsplat.images.reading import downscale, image_size, read_image, write_image
+from clsplat.images import writing
+from clsplat.images.reading import downscale, image_size, read_image
+from clsplat.images.writing import write_image
 
 RNG = np.random.default_rng(1)
 PHOTO = RNG.integers(0, 256, (37, 53, 4), dtype=np.uint8)
@@ -123,7 +124,7 @@ def test_write_and_read_again(tmp_path: Path, channels: int) -> None:
     np.testing.assert_allclose(read_image(tmp_path / "h.exr"), expected, rtol=2e-3, atol=1e-4)
     spec = oiio.ImageInput.open(str(tmp_path / "a.exr")).spec()
     assert spec.get_int_attribute("clsplat:step") == 7
-    assert spec.channelnames == reading.CHANNEL_NAMES[channels]
+    assert spec.channelnames == writing.CHANNEL_NAMES[channels]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.exr", "a.png", "h.exr"]
 
 

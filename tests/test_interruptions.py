@@ -18,6 +18,7 @@ from calls import Capture, error_line
 from tiny import short, write_scene
 
 from clsplat import process
+from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
@@ -25,7 +26,6 @@ from clsplat.errors import InputError
 from clsplat.runs import locks
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.training.loop import train
 from clsplat.training.trainer import Trainer
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]

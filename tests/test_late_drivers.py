@@ -11,6 +11,7 @@ import pytest
 from calls import Capture, train
 from dying import ALWAYS, LATE, Standing, call, error_of, forget, number_of
 
+from clsplat.api import train as train_on
 from clsplat.cli.main import main
 from clsplat.device import known, launch
 from clsplat.device.child import TIMEOUT, TrialInterrupted
@@ -20,7 +21,6 @@ from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import load_scene
 from clsplat.training import loop as training
-from clsplat.training.loop import train as train_on
 
 WITHOUT = replace(LATE, checkpoint_every=0, optimiser=replace(LATE.optimiser, sparse=True), report=False)
 """Adam has a kernel for each number of floats in a row: that of SH is built in step 12, behind the others."""

@@ -15,17 +15,11 @@ from headers import exr_attributes
 from numpy.typing import NDArray
 from scenes import tilted_camera
 
+from clsplat.camera import Window
+from clsplat.config.pictures import Encoding
 from clsplat.errors import ClsplatError, InputError
-from clsplat.images.channels import (
-    LAYERS,
-    Encoding,
-    Header,
-    Window,
-    camera_matrices,
-    check_format,
-    parse_channels,
-    write_layers,
-)
+from clsplat.images.channels import LAYERS, check_format, parse_channels, write_layers
+from clsplat.images.exr_header import Header, camera_matrices
 from clsplat.reference.cameras import pixel_from_world
 
 WIDTH, HEIGHT = 21, 13

@@ -12,7 +12,7 @@ import scenes
 
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 
 
 @pytest.mark.parametrize(

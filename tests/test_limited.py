@@ -14,16 +14,17 @@ from scenes import random_cloud
 from tiny import CONFIG, short, write_scene
 
 import clsplat
+from clsplat.api import train
 from clsplat.cli.main import main
-from clsplat.config.training import RasterizerConfig, TrainConfig
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
 from clsplat.rendering.memory_plan import Need, plan
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.stages.project import HostGaussians
-from clsplat.training.loop import train
+from clsplat.stages.device_gaussians import HostGaussians
 from clsplat.training.trainer import Trainer
 
 KIB = 1024

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from clsplat.cli.main import main
+from clsplat.config.memory import parse_bytes
 from clsplat.device.buffers import Workspace, allocate
 from clsplat.device.context import Device, open_device
 from clsplat.errors import CapacityError, InputError
-from clsplat.rendering.memory_plan import parse_bytes
 
 
 @pytest.mark.parametrize(

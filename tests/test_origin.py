@@ -14,6 +14,7 @@ from models import assert_equal, random_gaussians
 from scipy.spatial.transform import Rotation
 from tiny import CONFIG, cameras, write_scene
 
+from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.errors import InputError
@@ -21,10 +22,9 @@ from clsplat.gaussians import Gaussians
 from clsplat.images.reading import read_image
 from clsplat.models.formats import ply
 from clsplat.reference import render as reference
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import FAR, load_scene
-from clsplat.training.loop import train
 
 OFFSET = np.array([5e5, -4.2e6, 333.3])
 """As UTM coordinates are: metres, far from their zero."""

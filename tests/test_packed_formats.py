@@ -15,7 +15,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.models import edit, formats
 from clsplat.models.codec import values as packing
 from clsplat.models.formats import compressed_ply, ply
-from clsplat.reference.sh import C0
+from clsplat.spherical_harmonics import C0
 
 CHUNK = [
     *(f"{end}_{name}" for end in ("min", "max") for name in "xyz"),

@@ -13,12 +13,11 @@ import scenes
 from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import ColourConfig, FramingConfig, PictureConfig, SamplingConfig
+from clsplat.config.pictures import ColourConfig, Encoding, FramingConfig, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.frame.pipeline import Pictures
-from clsplat.images.channels import Encoding
 from clsplat.images.colour import LINEAR, linear_to_srgb, srgb_to_linear
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(1500, 8, 100, 70)
 

@@ -27,7 +27,8 @@ from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, short, write_scene
 import clsplat
 from clsplat.cli.main import main
 from clsplat.images.colour import srgb_to_linear
-from clsplat.images.reading import read_image, write_image
+from clsplat.images.reading import read_image
+from clsplat.images.writing import write_image
 from clsplat.report.thumbnails import data_uri
 from clsplat.runs.run import Run
 

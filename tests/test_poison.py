@@ -19,8 +19,9 @@ from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
 from clsplat.errors import InputError
+from clsplat.gaussians import GROUPS
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.stages.project import GROUPS, DeviceGaussians
+from clsplat.stages.device_gaussians import DeviceGaussians
 from clsplat.training import trainer as trainer_module
 from clsplat.training.trainer import Trainer
 

@@ -11,12 +11,13 @@ from compare import assert_same_bits
 from pipeline import BACKGROUND, Pipeline
 from scenes import make_gaussians, overlap, straight_camera
 
-from clsplat.config.training import DensityConfig, RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import DensityConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.reference.render import render
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.training.density.adaptive import split_halves
 
 FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")

@@ -25,7 +25,8 @@ from clsplat.device.advice import driver_advice
 from clsplat.errors import InputError
 from clsplat.evaluation.held_out import picture_names
 from clsplat.files import identity, name_trouble
-from clsplat.images.reading import read_image, write_image
+from clsplat.images.reading import read_image
+from clsplat.images.writing import write_image
 from clsplat.scenes import sfm_photos, transforms
 from clsplat.shots import frame_numbers
 
@@ -370,8 +371,8 @@ def test_paths_of_any_letters_in_any_locale(locale: str, tmp_path: Path) -> None
 def test_a_picture_in_a_folder_of_any_letters_where_the_locale_is_ascii(tmp_path: Path) -> None:
     folder = tmp_path / LETTERS
     folder.mkdir()
-    code = "import sys, numpy as np; from pathlib import Path; from clsplat.images.reading import read_image, "
-    code += "write_image; "
+    code = "import sys, numpy as np; from pathlib import Path; from clsplat.images.reading import read_image; "
+    code += "from clsplat.images.writing import write_image; "
     code += "write_image(Path(sys.argv[1]), np.ones((2, 3, 3), np.float32)); assert read_image(Path(sys.argv[1])).all()"
     environment = {**os.environ, **ASCII, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", code, "日ü.png"]

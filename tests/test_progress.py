@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from clsplat.progress import FrameProgress, StageProgress, TrainProgress, duration
-from clsplat.sequence.workers import Record
+from clsplat.sequence.task import Record
 
 
 @dataclass

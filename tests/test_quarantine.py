@@ -20,17 +20,17 @@ from compare import assert_same_bits
 from quick import quick
 from tiny import CONFIG, short, write_scene
 
+from clsplat.api import train
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.source import kernel_source
 from clsplat.errors import ClsplatError, InputError
-from clsplat.reference.sh import sh_basis
+from clsplat.gaussians import GROUPS, SH_LIMIT, group_shapes
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.stages.project import GROUPS, group_shapes
+from clsplat.spherical_harmonics import sh_basis
 from clsplat.training import repro
-from clsplat.training.health import PATIENCE, RETURNS, SH_LIMIT, SMALLER, WINDOW, Patience, examine, finite_or_zero
-from clsplat.training.loop import train
+from clsplat.training.health import PATIENCE, RETURNS, SMALLER, WINDOW, Patience, examine, finite_or_zero
 from clsplat.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))

@@ -12,15 +12,15 @@ import scenes
 from compare import assert_close_images
 from models import real_file
 
+from clsplat.api import train
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.reference.render import render as reference
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.training.loop import train
 
 BACKGROUND = (0.1, 0.2, 0.3)
 CAMERAS = {

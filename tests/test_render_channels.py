@@ -10,7 +10,7 @@ import scenes
 from compare import assert_same_bits
 
 from clsplat.device.context import open_device
-from clsplat.rendering.rasterizer import ChannelResult, Renderer, RenderResult
+from clsplat.rendering.renderer import ChannelResult, Renderer, RenderResult
 
 SCENE = scenes.random_cloud(20_000, 4, 300, 200, degree=1)
 EVERYTHING = ("normal", "position", "motion")

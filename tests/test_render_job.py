@@ -19,14 +19,17 @@ from calls import left_behind
 from scenes import tilted_camera
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import ColourConfig, PictureConfig
+from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import temporary_name
-from clsplat.frame.window import Layers
-from clsplat.images.channels import LAYERS, Encoding
-from clsplat.sequence import workers
-from clsplat.sequence.frame_renderer import FrameShader, RenderOptions, Shaded, Task, settings_digest
-from clsplat.sequence.workers import Record, is_complete, make_tasks, run_tasks, write_frame
+from clsplat.frame.draw import Layers
+from clsplat.images.channels import LAYERS
+from clsplat.sequence import existing, workers
+from clsplat.sequence.existing import is_complete
+from clsplat.sequence.frame_renderer import FrameShader, Shaded
+from clsplat.sequence.task import Record, RenderOptions, Task, settings_digest
+from clsplat.sequence.task_list import make_tasks
+from clsplat.sequence.workers import run_tasks, write_frame
 from clsplat.shots.motion import camera_after, stretches
 from clsplat.shots.shot import Frame, Shot, numbered
 
@@ -311,26 +314,26 @@ def test_stale_temporaries_of_the_shot_alone_go(tmp_path: Path) -> None:
     left_behind(tmp_path / "a.0002.exr")
     left_behind(tmp_path / "a.0003.exr")
     others.append(left_behind(tmp_path / "a.0004.exr"))
-    workers.remove_temporaries(tasks)
+    existing.remove_temporaries(tasks)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
-    workers.remove_temporaries(tasks_in(tmp_path / "none", 3))
+    existing.remove_temporaries(tasks_in(tmp_path / "none", 3))
 
 
 def test_folders_are_looked_at_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"")
     (tmp_path / "a.0002.exr").mkdir()
     with pytest.raises(InputError, match=r"file: is a file, expected a folder"):
-        workers.check_folders(tasks_in(tmp_path / "file" / "shot"))
+        existing.check_folders(tasks_in(tmp_path / "file" / "shot"))
     with pytest.raises(InputError, match=r"a\.0002\.exr: is a folder, expected the name of a file"):
-        workers.check_folders(tasks_in(tmp_path))
-    workers.check_folders(tasks_in(tmp_path / "new" / "shot"))
+        existing.check_folders(tasks_in(tmp_path))
+    existing.check_folders(tasks_in(tmp_path / "new" / "shot"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
     with pytest.raises(InputError, match="is not writable"):
-        workers.check_folders(tasks_in(tmp_path / "new" / "shot"))
+        existing.check_folders(tasks_in(tmp_path / "new" / "shot"))
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system")))
     with pytest.raises(InputError, match="cannot be made: the disk is read-only"):
-        workers.make_folders(tasks_in(tmp_path / "new" / "shot"))
+        existing.make_folders(tasks_in(tmp_path / "new" / "shot"))
 
 
 def test_the_digest_goes_by_what_a_colour_configuration_says(tmp_path: Path) -> None:

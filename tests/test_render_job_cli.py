@@ -23,7 +23,7 @@ from tiny import HEIGHT, WIDTH, cameras, hidden_model
 from clsplat.cli.main import main
 from clsplat.device.context import list_devices
 from clsplat.gaussians import Gaussians
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.shots import choose_shot
 from clsplat.shots.motion import camera_after
 
@@ -261,11 +261,11 @@ def test_a_reader_that_has_gone(shot: list[str], tmp_path: Path) -> None:
 
 
 def test_a_full_disk_ends_the_job(shot: list[str], tmp_path: Path, capsys: Capture, monkeypatch: Any) -> None:
-    from clsplat.images import reading
+    from clsplat import errors
 
     def full(path: Path, *_: Any) -> None:
         if "0003" in str(path):
-            raise reading.ClsplatError(f"{path}: cannot be written: No space left on device")
+            raise errors.ClsplatError(f"{path}: cannot be written: No space left on device")
 
     monkeypatch.setattr("clsplat.images.channels.write_spec", full)
     assert render(shot, tmp_path, "--progress", "none") == 1

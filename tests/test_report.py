@@ -21,7 +21,7 @@ from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.errors import ClsplatError
 from clsplat.gaussians import Gaussians
-from clsplat.images.reading import write_image
+from clsplat.images.writing import write_image
 from clsplat.reference.render import render_grad
 from clsplat.report import page, thumbnails
 from clsplat.runs.run import Run

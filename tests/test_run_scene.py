@@ -18,7 +18,8 @@ from tiny import short, write_scene
 from clsplat.cli.main import Train, main, parse
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
-from clsplat.images.reading import read_image, write_image
+from clsplat.images.reading import read_image
+from clsplat.images.writing import write_image
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene

@@ -15,7 +15,8 @@ from clsplat.cli.main import Train, main, parse
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import TEMPORARY_SUFFIX
-from clsplat.runs.run import Run, is_run, parse_config, read_config
+from clsplat.runs.run import Run, is_run
+from clsplat.runs.settings import parse_config, read_config
 
 CONFIG = TrainConfig(
     iterations=7,

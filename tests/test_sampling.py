@@ -13,10 +13,11 @@ from compare import assert_close, assert_same_bits
 from clsplat.camera import Camera
 from clsplat.config.pictures import FramingConfig, SamplingConfig
 from clsplat.errors import InputError
+from clsplat.frame.draw import drawn_by
 from clsplat.frame.shutter_and_lens import lens_points, lens_radius, sample_cameras, sample_times, sampled, through_lens
-from clsplat.frame.window import crop, drawn_by, framed
+from clsplat.frame.window import crop, framed
 from clsplat.reference import render as reference
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.shots.shot import Shot, numbered
 
 CLOUD, CAMERA = scenes.random_cloud(1000, 8, 100, 70)

@@ -17,7 +17,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.reference import render as reference
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.initialise import MIN_SQUARED_DISTANCE, squared_floor
 from clsplat.scenes.scene import Scene, load_scene
 

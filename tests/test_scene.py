@@ -8,7 +8,6 @@ import os
 import shutil
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -20,7 +19,8 @@ from systems import links
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.images.reading import companions, read_image, write_image
+from clsplat.images.reading import companions, read_image
+from clsplat.images.writing import write_image
 from clsplat.scenes.scene import camera_bounds, detect, load_scene
 
 RNG = np.random.default_rng(2)
@@ -357,7 +357,7 @@ def test_photos_go_through_sfm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         warnings.warn("b.png could not be placed", stacklevel=1)
         return make_colmap(output)
 
-    monkeypatch.setitem(__import__("sys").modules, "clsplat.scenes.sfm", SimpleNamespace(reconstruct=reconstruct))
+    monkeypatch.setattr("clsplat.scenes.scene.reconstruct", reconstruct)
     scene = load_scene(photos)
     assert calls == [(photos, tmp_path / "photos_colmap", None)]
     assert len(scene.views) == 9

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.errors import InputError
-from clsplat.reference.sh import sh_basis
 from clsplat.rendering.sh_storage import change_bounds, check_half, coefficients_in_use, needed_degrees
-
-Float64 = NDArray[np.float64]
+from clsplat.spherical_harmonics import sh_basis
 
 
 def directions(count: int, seed: int = 0) -> Float64:

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from tiny import CONFIG, HEIGHT, WIDTH, short, write_scene
 
+from clsplat.api import train
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 from clsplat.scenes.initialise import from_points
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.stages.project import download_gaussians
-from clsplat.training.loop import train
+from clsplat.stages.device_gaussians import download_gaussians
 from clsplat.training.trainer import Trainer
 
 ALL = replace(short(frequency_steps=20), optimiser=replace(CONFIG.optimiser, sparse=True, sh_rest_every=3))

@@ -20,14 +20,15 @@ from calls import train as command_train
 from tiny import short, write_scene
 
 import clsplat
+from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.images.reading import read_image, write_image
+from clsplat.images.reading import read_image
+from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
 from clsplat.scenes import doubts
 from clsplat.scenes.scene import load_scene
-from clsplat.training.loop import train
 
 FEW = short(iterations=3, sh_degree_every=1, report=False, density={"every": 0})
 

@@ -20,9 +20,11 @@ from stress_frames import compare as compare_frame
 from stress_projection import compare
 from stress_stages import stages
 
+from clsplat import camera as clsplat_camera
+from clsplat.device import layout
 from clsplat.device.context import Device
 from clsplat.reference.loss import l1_dssim
-from clsplat.stages import project as stage
+from clsplat.stages import device_camera, project
 
 ROOT = Path(__file__).resolve().parents[1]
 SEEDS = st.integers(0, 2**32 - 1)
@@ -87,27 +89,27 @@ def test_equal_scales_have_no_gradient_of_rotation(default_device: Device) -> No
 def test_a_wrong_camera_is_found(
     field: str, by: float, error: str, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    good = stage.pack_camera
+    good = device_camera.pack_camera
 
-    def wrong(camera: stage.Camera) -> stage.NDArray[np.float32]:
+    def wrong(camera: clsplat_camera.Camera) -> project.NDArray[np.float32]:
         packed = good(camera)
-        packed[stage.CAMERA.index(field)] += np.float32(by * max(1.0, abs(packed[stage.CAMERA.index(field)])))
+        packed[layout.CAMERA.index(field)] += np.float32(by * max(1.0, abs(packed[layout.CAMERA.index(field)])))
         return packed
 
-    monkeypatch.setattr(stage, "pack_camera", wrong)
+    monkeypatch.setattr(device_camera, "pack_camera", wrong)
     row = stress_kernels.judged("ordinary", stress_kernels.projections(default_device, "ordinary", 500, seed=0))
     assert any(fault.startswith(error) for fault in row["faults"])
 
 
 def test_a_culled_gaussian_is_found(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    good = stage.pack_camera
+    good = device_camera.pack_camera
 
-    def near(camera: stage.Camera) -> stage.NDArray[np.float32]:
+    def near(camera: clsplat_camera.Camera) -> project.NDArray[np.float32]:
         packed = good(camera)
-        packed[stage.CAMERA.index("NEAR")] = 3.0
+        packed[layout.CAMERA.index("NEAR")] = 3.0
         return packed
 
-    monkeypatch.setattr(stage, "pack_camera", near)
+    monkeypatch.setattr(device_camera, "pack_camera", near)
     row = stress_kernels.judged("ordinary", stress_kernels.projections(default_device, "ordinary", 500, seed=0))
     assert any("culled, visible" in fault for fault in row["faults"])
 

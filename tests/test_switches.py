@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
 
-from clsplat.config.training import PRESETS, RasterizerConfig
+from clsplat.config.presets import PRESETS
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT, TILE
@@ -25,7 +26,7 @@ from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import InputError
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.stages.project import upload_gaussians
+from clsplat.stages.device_gaussians import upload_gaussians
 
 EXACT_OFF = {
     "constant extent": RasterizerConfig(extent="constant"),

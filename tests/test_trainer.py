@@ -13,16 +13,18 @@ import pytest
 from compare import assert_close, assert_same_bits
 from tiny import CONFIG, EVENTS, HEIGHT, WIDTH, hidden_model, short, write_scene
 
+from clsplat.api import train
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import ClsplatError, InputError
+from clsplat.gaussians import GROUPS
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
+from clsplat.stages.device_gaussians import DeviceGaussians, upload_gaussians
 from clsplat.stages.loss import Loss
-from clsplat.stages.project import GROUPS, DeviceGaussians, upload_gaussians
 from clsplat.training.density import adaptive
 from clsplat.training.density.adaptive import Plan
-from clsplat.training.loop import StepReport, train
+from clsplat.training.loop import StepReport
 from clsplat.training.trainer import Trainer
 
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from clsplat.camera import Camera
-from clsplat.shots.viewpoints import covered_arc, focus_point, look_at, turntable, up_axis
+from clsplat.shots.generated import turntable
+from clsplat.shots.viewpoints import covered_arc, focus_point, look_at, up_axis
 
 
 def rotated_world(seed):

@@ -11,7 +11,7 @@ import pytest
 from needs import SCENES
 
 from clsplat.errors import InputError
-from clsplat.images.reading import write_image
+from clsplat.images.writing import write_image
 from clsplat.scenes.transforms import read_blender, read_point_cloud, read_poses, read_transforms
 
 POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]

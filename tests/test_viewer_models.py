@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 from tiny import CONFIG, cameras, hidden_model, write_scene
 
-from clsplat.config.training import RasterizerConfig
+from clsplat.api import train
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
 from clsplat.gaussians import Gaussians
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.training.loop import train
 from clsplat.training.trainer import Trainer
 from clsplat.viewer.appearance import Look, alpha_picture, colour_picture, count_picture, depth_picture, edited
 from clsplat.viewer.models import HeldModel, LiveModel, draft
-from clsplat.viewer.refinement import Level, Pose, Share
+from clsplat.viewer.pose import Pose
+from clsplat.viewer.refinement import Level, Share
 from clsplat.viewer.scheduler import Viewing
 
 BLACK = (0.0, 0.0, 0.0)

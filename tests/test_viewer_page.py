@@ -21,7 +21,7 @@ from clsplat.cli.main import main
 from clsplat.device.context import open_device
 from clsplat.gaussians import Gaussians
 from clsplat.images.reading import read_image
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.shots import choose_shot
 
 PAGE = {"width": 900, "height": 600}

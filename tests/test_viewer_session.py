@@ -16,7 +16,8 @@ from systems import links
 from tiny import cameras
 
 from clsplat.errors import InputError
-from clsplat.images.reading import steps_of
+from clsplat.images.writing import steps_of
+from clsplat.rotations import quaternion_of
 from clsplat.shots import choose_shot
 from clsplat.viewer.appearance import (
     LARGEST_OPACITY,
@@ -30,24 +31,8 @@ from clsplat.viewer.appearance import (
     read_look,
 )
 from clsplat.viewer.path_recorder import MOST_KEYS, Recorder, save_path
-from clsplat.viewer.refinement import (
-    PATIENCE,
-    SETTLE,
-    SMALLEST,
-    START,
-    TARGET,
-    Level,
-    Pace,
-    Pose,
-    Refinement,
-    Share,
-    extent_of,
-    fitted,
-    looking,
-    quaternion_of,
-    read_pose,
-    start_of,
-)
+from clsplat.viewer.pose import Pose, extent_of, fitted, looking, read_pose, start_of
+from clsplat.viewer.refinement import PATIENCE, SETTLE, SMALLEST, START, TARGET, Level, Pace, Refinement, Share
 from clsplat.viewer.scheduler import Viewing
 
 ZERO = np.zeros(3)

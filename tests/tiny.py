@@ -15,10 +15,10 @@ from clsplat.camera import Camera
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
-from clsplat.images.reading import write_image
+from clsplat.images.writing import write_image
 from clsplat.reference.render import render
 from clsplat.scenes.scene import Scene
-from clsplat.stages.project import upload_gaussians
+from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.training.trainer import Trainer
 
 WIDTH, HEIGHT, FOCAL = 48, 40, 50.0

@@ -23,11 +23,12 @@ import numpy as np
 from measuring import Result, machine, number, options_parser, reporting, require, show, sizes
 
 from clsplat.bench.plots import Panel, check_plot, plot_growth
-from clsplat.bench.stages import columns, synthetic, wall_ms
+from clsplat.bench.stages import columns, wall_ms
+from clsplat.bench.subject import synthetic
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
 from clsplat.rendering.rasterizer import Frame, Rasterizer
-from clsplat.stages.project import upload_gaussians
+from clsplat.stages.device_gaussians import upload_gaussians
 
 GAUSSIANS, WIDTH, HEIGHT = 200_000, 1024, 768
 """What stays as it is while the other grows."""

@@ -22,8 +22,9 @@ from pathlib import Path
 
 from measuring import Result, machine, reporting, require, show
 
-from clsplat.bench.stages import load_subject, synthetic, trainer_of
-from clsplat.config.training import RasterizerConfig
+from clsplat.bench.stages import trainer_of
+from clsplat.bench.subject import load_subject, synthetic
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device, open_device
 from clsplat.training.trainer import Trainer
 

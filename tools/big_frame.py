@@ -15,12 +15,12 @@ import sys
 import time
 from pathlib import Path
 
-from clsplat.bench.stages import synthetic
+from clsplat.bench.subject import synthetic
+from clsplat.config.memory import parse_bytes
 from clsplat.device.context import open_device
 from clsplat.frame.pipeline import Pictures
 from clsplat.frame.strips import strip_rows
-from clsplat.rendering.memory_plan import parse_bytes
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 
 
 def main(arguments: list[str]) -> int:

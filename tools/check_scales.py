@@ -20,13 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat import load_scene
+from clsplat.api import train
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
-from clsplat.evaluation.held_out import background_colour, evaluate
+from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import Gaussians
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.images.alpha import background_colour
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
-from clsplat.training.loop import train
 
 FACTORS = (1.0, 1e-7, 1e-4, 1e4, 1e7)
 OFFSET = 1e6

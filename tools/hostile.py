@@ -18,16 +18,17 @@ import numpy as np
 from spoilers import MOST_BYTES, SPOILERS, spoil_place
 
 from clsplat.config.training import TrainConfig
-from clsplat.gaussians import Gaussians
-from clsplat.images.reading import image_size, read_image, write_image
+from clsplat.gaussians import Gaussians, group_shapes
+from clsplat.images.reading import image_size, read_image
+from clsplat.images.writing import write_image
 from clsplat.models import formats
 from clsplat.models.formats import ply
 from clsplat.models.info import model_info
-from clsplat.runs import run as runs
+from clsplat.runs import run as runs_run
+from clsplat.runs import settings as runs_settings
 from clsplat.scenes import colmap, sfm, sfm_photos, transforms
 from clsplat.scenes.scene import load_scene
 from clsplat.shots.read import choose_shot
-from clsplat.stages.project import group_shapes
 from clsplat.training import repro
 
 
@@ -247,7 +248,7 @@ def make_image(folder: Path, extension: str) -> None:
 
 def make_run(folder: Path) -> None:
     """A run with metrics, an evaluation, two checkpoints and no model."""
-    run = runs.Run.create(folder / "run", TrainConfig(iterations=10))
+    run = runs_run.Run.create(folder / "run", TrainConfig(iterations=10))
     for step in (1, 2):
         run.append_metrics({"step": step, "loss": 0.1, "seconds": 0.5 * step})
         arrays = {"parameters/means": np.ones((4, 3), np.float32), "statistics/seen": np.zeros(4, np.float32)}
@@ -268,7 +269,7 @@ def make_bundle(folder: Path) -> None:
         "stage": "adam",
         "rates": dict.fromkeys(shapes, 0.001),
         "camera": {"width": 12, "height": 9, "fx": 11.5, "fy": 11.0, "cx": 6.0, "cy": 4.5, "near": 0.01},
-        "settings": runs.config_text(TrainConfig(), None),
+        "settings": runs_settings.config_text(TrainConfig(), None),
     }
     np.savez(
         folder / "trouble-step-0000007.npz",
@@ -348,7 +349,7 @@ def read_picture(folder: Path, extension: str) -> None:
 
 def read_run(folder: Path) -> None:
     """Settings, metrics and evaluation."""
-    run = runs.Run.open(folder / "run")
+    run = runs_run.Run.open(folder / "run")
     run.config.check()
     run.read_metrics()
     run.model_record()
@@ -358,7 +359,7 @@ def read_run(folder: Path) -> None:
 def read_checkpoint(folder: Path) -> None:
     """The checkpoint that training goes on from."""
     path = folder / "run"
-    checkpoint = runs.Run(path, TrainConfig(), None, resuming=True).load_latest_checkpoint()
+    checkpoint = runs_run.Run(path, TrainConfig(), None, resuming=True).load_latest_checkpoint()
     if checkpoint is not None:
         total = sum(array.nbytes for array in checkpoint.arrays.values())
         if total > MOST_BYTES:

@@ -22,19 +22,21 @@ from numpy.typing import NDArray
 
 from clsplat.bench.stages import _Picture
 from clsplat.camera import Camera
-from clsplat.config.training import DensityConfig, OptimiserConfig, RasterizerConfig, TrainConfig
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device import buffers, launch, program
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device, all_devices
 from clsplat.device.layout import WIDEST_SLOTS
 from clsplat.device.shapes import Shape
-from clsplat.gaussians import Gaussians
-from clsplat.rendering.rasterizer import Rasterizer, Renderer
+from clsplat.gaussians import GROUPS, Gaussians
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.lens import Lens
 from clsplat.scenes.scene import Scene
 from clsplat.stages.blend import count_pairs, tile_items
+from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.stages.limit import _splats
-from clsplat.stages.project import GROUPS, allocate_gaussians, upload_gaussians
 from clsplat.stages.sort import bitonic_sort, radix_sort
 from clsplat.training.trainer import Trainer
 

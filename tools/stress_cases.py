@@ -7,12 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 
-Float64 = NDArray[np.float64]
 WIDTH, HEIGHT, FOCAL = 640, 360, 600.0
 DEGREE = 1
 """Of the SH: enough for the gradient by the direction; the bands themselves are tested apart."""

@@ -21,7 +21,7 @@ from clsplat.reference.blend import blend
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
 from clsplat.rendering.rasterizer import Frame, Rasterizer
-from clsplat.stages.project import allocate_gaussians, download_gaussians, upload_gaussians
+from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
 
 Array = NDArray[Any]
 Scene = tuple[Gaussians, Camera]

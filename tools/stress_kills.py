@@ -56,7 +56,7 @@ class Figures:
 
 def write_scene(folder: Path) -> Path:
     """Pictures of coloured blobs, drawn as discs, in a COLMAP folder of text files."""
-    from clsplat.images.reading import write_image
+    from clsplat.images.writing import write_image
 
     rng = np.random.default_rng(3)
     points = rng.uniform(-0.8, 0.8, (POINTS, 3))

@@ -19,8 +19,9 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference.blend import footprint
 from clsplat.reference.project import ALPHA_MIN, Projected, project, project_grad_covariances, view_directions
 from clsplat.reference.render import parameters
-from clsplat.reference.sh import sh_basis
-from clsplat.stages import project as stage
+from clsplat.spherical_harmonics import sh_basis
+from clsplat.stages import device_camera, device_gaussians
+from clsplat.stages import project as stages_project
 
 Array = NDArray[Any]
 WHITEN2 = np.log2(np.e) / 2
@@ -55,20 +56,20 @@ def random_sums(rng: np.random.Generator, count: int) -> Array:
 def on_device(device: Device, cases: Cases, sums: Array) -> tuple[Array, Array, Gaussians, Array]:
     """splats (n, SPLAT), tile counts (n,), the gradients and the screen's (n, 2); NaN where nothing was written."""
     work = Workspace(device)
-    gaussians = stage.upload_gaussians(device, cases.gaussians)
-    camera = upload(device, stage.pack_camera(cases.camera))
+    gaussians = device_gaussians.upload_gaussians(device, cases.gaussians)
+    camera = upload(device, device_camera.pack_camera(cases.camera))
     count = len(cases.gaussians)
     work.array("splats", (count, len(SPLAT))).fill(np.nan)
-    projected = stage.project(device, work, gaussians, cases.camera, camera)
-    gradients = stage.allocate_gaussians(device, count, gaussians.coefficients)
+    projected = stages_project.project(device, work, gaussians, cases.camera, camera)
+    gradients = device_gaussians.allocate_gaussians(device, count, gaussians.coefficients)
     for array in gradients.arrays.values():
         array.fill(np.nan)
-    screen = stage.Screen(work.array("screen", (count, 2)))
+    screen = stages_project.Screen(work.array("screen", (count, 2)))
     screen.gradients.fill(np.nan)
-    slots = stage.Slots(upload(device, sums))
+    slots = stages_project.Slots(upload(device, sums))
     assert sums.shape[1] == PLAIN_SLOTS.floats
-    stage.project_grad(device, gaussians, camera, projected, slots, gradients, screen)
-    back = stage.download_gaussians(gradients)
+    stages_project.project_grad(device, gaussians, camera, projected, slots, gradients, screen)
+    back = device_gaussians.download_gaussians(gradients)
     return projected.splats.get(), projected.tile_counts.get(), back, screen.gradients.get()
 
 

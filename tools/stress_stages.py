@@ -15,11 +15,12 @@ from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
 from clsplat.device.layout import TILE
+from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference.adam import adam as exact_adam
 from clsplat.reference.loss import l1_dssim
 from clsplat.stages.adam import adam
+from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.stages.loss import loss
-from clsplat.stages.project import GROUPS, allocate_gaussians, group_shapes
 
 Array = NDArray[Any]
 

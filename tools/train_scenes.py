@@ -21,13 +21,14 @@ from typing import Any
 import numpy as np
 
 from clsplat import load_scene
+from clsplat.api import train
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
-from clsplat.evaluation.held_out import background_colour, evaluate
-from clsplat.rendering.rasterizer import Renderer
-from clsplat.scenes.initialise import SH_C0
+from clsplat.evaluation.held_out import evaluate
+from clsplat.images.alpha import background_colour
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
-from clsplat.training.loop import train
+from clsplat.spherical_harmonics import C0
 
 BOUND, FEW_BOUND, FEW = 0.1, 0.3, 4
 
@@ -86,7 +87,7 @@ def measured(scene: Scene, config: TrainConfig, device: Device) -> dict[str, flo
         gaussians=len(model),
         seconds=None,
     )
-    floor = 0.5 + SH_C0 * model.sh[:, 0].astype(np.float64) <= 1e-6
+    floor = 0.5 + C0 * model.sh[:, 0].astype(np.float64) <= 1e-6
     return {
         "psnr": result["mean"]["psnr"],
         "gaussians": float(len(model)),

@@ -12,26 +12,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.bench.stages import (
-    Float32,
-    Float64,
-    Progress,
-    Subject,
-    columns,
-    held_kind,
-    picture_of,
-    trainer_of,
-    wall_ms,
-)
+from clsplat.arrays import Float32, Float64
+from clsplat.bench.stages import columns, held_kind, picture_of, trainer_of, wall_ms
+from clsplat.bench.subject import Progress, Subject
 from clsplat.camera import Camera
-from clsplat.config.training import PRESETS, RasterizerConfig
+from clsplat.config.presets import PRESETS
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.gaussians import Gaussians
+from clsplat.reference.blend import blend
+from clsplat.reference.project import project
+from clsplat.reference.render import parameters
+from clsplat.reference.sort import depth_order
 from clsplat.rendering.memory_needs import plan_step
-from clsplat.rendering.rasterizer import Frame, Rasterizer, held_sh
-from clsplat.stages.project import AnyGaussians, upload_gaussians
+from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.rendering.renderer import held_sh
+from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
 
 if TYPE_CHECKING:
     from clsplat.reference.project import Projected
@@ -205,11 +203,6 @@ def _crop(camera: Camera) -> tuple[int, int, int, int]:
 
 def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, int, int]) -> Float64:
     """A part of the frame in float64, over black, (height, width, 3): the twin, but for Gaussians that cannot reach."""
-    from clsplat.reference.blend import blend
-    from clsplat.reference.project import project
-    from clsplat.reference.render import parameters
-    from clsplat.reference.sort import depth_order
-
     x, y, width, height = crop
     projected: Projected = project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
     means = projected.means2d - (x, y)

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.bench.stages import synthetic, wall_ms
+from clsplat.bench.stages import wall_ms
+from clsplat.bench.subject import synthetic
 from clsplat.device import cl
 from clsplat.device.buffers import upload
 from clsplat.device.child import Child, end_with_parent, patience, python_module, tell
@@ -23,7 +24,7 @@ from clsplat.device.context import Device, all_devices
 from clsplat.device.shapes import Shape, candidates, default_shape, save_shape
 from clsplat.errors import DriverError
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.stages.project import allocate_gaussians, upload_gaussians
+from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 
 WORKLOAD = (50_000, 640, 480)
 """Gaussians, width and height of what is drawn."""

@@ -12,21 +12,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from clsplat.arrays import Float32, Float64
 from clsplat.cli.options import Convert, Info
-from clsplat.config.training import TEST_EVERY
+from clsplat.config.memory import parse_bytes
+from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
 from clsplat.files import check_new, is_file, read_document
-from clsplat.gaussians import MAX_SH_DEGREE, Float32, Float64, Gaussians
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images import colour
 from clsplat.models import difference, edit
 from clsplat.models.formats import format_of, format_of_name, load, model_path, save, sog
 from clsplat.models.info import beside, model_info, size, text
 from clsplat.progress import StageProgress
-from clsplat.rendering.memory_plan import parse_bytes
 from clsplat.runs.run import is_run, model_file
 
 if TYPE_CHECKING:
-    from clsplat.rendering.rasterizer import Renderer
+    from clsplat.rendering.renderer import Renderer
     from clsplat.scenes.scene import View
 
 QUICK = 2.0
@@ -220,7 +221,7 @@ def _measure(verb: Convert, original: Gaussians, read: Gaussians, matrix: Float6
     """PSNR in dB of the model as it was read and of the one that was written, which is seen by cameras that moved
     along, against the photographs and against each other."""
     from clsplat.device.context import open_device
-    from clsplat.rendering.rasterizer import Renderer
+    from clsplat.rendering.renderer import Renderer
     from clsplat.selftest.result import FORWARD
     from clsplat.selftest.trust import require
 
@@ -234,8 +235,8 @@ def _measure(verb: Convert, original: Gaussians, read: Gaussians, matrix: Float6
 
 def compared(background: str, views: Sequence[View], before: list[Float32], after: list[Float32]) -> dict[str, Any]:
     """Renders (H, W, 3) of the views: PSNR in dB of each, and the means."""
-    from clsplat.evaluation.held_out import background_colour, composite
     from clsplat.evaluation.metrics import psnr
+    from clsplat.images.alpha import background_colour, composite
 
     records: list[dict[str, Any]] = []
     for view, a, b in zip(views, before, after, strict=True):
@@ -257,7 +258,7 @@ def _views(verb: Convert) -> list[View]:
 
 
 def _render(renderer: Renderer, gaussians: Gaussians, verb: Convert, view: View, matrix: Float64 | None) -> Float32:
-    from clsplat.evaluation.held_out import background_colour
+    from clsplat.images.alpha import background_colour
 
     camera = view.camera if matrix is None else edit.transform_camera(view.camera, matrix)
     return renderer.render(gaussians, camera, background_colour(verb.background)).image

@@ -23,22 +23,21 @@ import tyro
 from tyro.conf import Positional, arg, subcommand
 
 from clsplat.cli.options import Compare, Convert, Device, Flag, Folder, Host, Info, Memory, Report, View
-from clsplat.config.pictures import ColourConfig, DeepConfig, FramingConfig, SamplingConfig, VideoConfig
-from clsplat.config.training import (
-    DEMO_ITERATIONS,
+from clsplat.config.pictures import (
     EXR_DEPTH,
-    HOST,
-    PORT,
-    PRESETS,
+    ColourConfig,
     Compression,
+    DeepConfig,
     ExrDepth,
+    FramingConfig,
     Parts,
-    Preset,
-    RasterizerConfig,
-    Schedule,
-    TrainConfig,
-    bundled,
+    SamplingConfig,
+    VideoConfig,
 )
+from clsplat.config.presets import PRESETS, Preset, Schedule, bundled
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import TrainConfig
+from clsplat.config.verbs import DEMO_ITERATIONS, HOST, PORT
 from clsplat.errors import ClsplatError, InputError, switched_on, system_trouble
 from clsplat.process import reader_has_gone, status_of, terminable
 
@@ -553,9 +552,3 @@ def one_line(error: BaseException) -> str:
 def _show_warning(message: Warning | str, *_: Any) -> None:
     """In place of `warnings.showwarning`, which would print the line of code as well."""
     print(f"clsplat: warning: {' '.join(str(message).split())}", file=sys.stderr)
-
-
-if __name__ == "__main__":  # python -m clsplat.cli
-    from clsplat.__main__ import main as whole
-
-    sys.exit(whole())

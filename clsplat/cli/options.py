@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from clsplat.config.training import HOST, PORT, TEST_EVERY
+from clsplat.config.verbs import HOST, PORT, TEST_EVERY
 
 Flag = Annotated[bool, FlagCreatePairsOff]
 Device = Annotated[str | None, arg(metavar="DEVICE")]

@@ -21,9 +21,9 @@ from clsplat.cli.render_request import Job, check_foreign, frames_there, read_jo
 from clsplat.errors import examples
 from clsplat.process import endings, interrupt, status_of
 from clsplat.progress import FrameProgress
-from clsplat.sequence import workers
-from clsplat.sequence.frame_renderer import Task, open_shader
-from clsplat.sequence.workers import Record
+from clsplat.sequence import existing, workers
+from clsplat.sequence.frame_renderer import open_shader
+from clsplat.sequence.task import Record, Task
 
 if TYPE_CHECKING:
     from clsplat.images.video import VideoWriter
@@ -52,8 +52,8 @@ def _run(job: Job) -> int:
             signal.signal(each, interrupt)
     there = frames_there(job)
     check_foreign(job, there)
-    workers.make_folders(tasks)
-    workers.remove_temporaries(tasks)
+    existing.make_folders(tasks)
+    existing.remove_temporaries(tasks)
     records: dict[int, Record] = {}
     lines = sys.stdout if not verb.json else sys.stderr if verb.progress in ("json", "openjd") else None
     start = time.monotonic()

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 from clsplat.cli.render_request import Job, frames_there
 from clsplat.config.pictures import FPS
 from clsplat.errors import amount, examples
-from clsplat.frame.window import COLOUR, crop, finer, on_tiles, renderer_channels
+from clsplat.frame.draw import COLOUR, renderer_channels
+from clsplat.frame.supersample import finer
+from clsplat.frame.window import crop, on_tiles
 from clsplat.sequence import workers
-from clsplat.sequence.frame_renderer import picture_camera
+from clsplat.sequence.task import picture_camera
 from clsplat.shots.frame_numbers import ranges
 
 if TYPE_CHECKING:
@@ -109,7 +111,7 @@ def plan_of(job: Job, selector: str | None) -> DevicePlan:
     from clsplat.frame.deep_exr import deep_rows
     from clsplat.frame.strips import strip_rows
     from clsplat.rendering.memory_needs import plan_frame
-    from clsplat.rendering.rasterizer import held_sh
+    from clsplat.rendering.renderer import held_sh
     from clsplat.stages.channels import Features
     from clsplat.stages.deep import DEEP_FLOATS
 

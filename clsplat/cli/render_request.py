@@ -12,19 +12,19 @@ from pathlib import Path
 import clsplat
 from clsplat.camera import Camera
 from clsplat.cli.main import Render
-from clsplat.config.pictures import ColourConfig, DeepConfig, PictureConfig, VideoConfig
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.memory import parse_bytes
+from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig, VideoConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError, examples
 from clsplat.files import check_new, digest
-from clsplat.frame.window import finer
+from clsplat.frame.supersample import finer
 from clsplat.gaussians import Gaussians
-from clsplat.images.channels import VIDEO, Encoding, check_format, parse_channels
+from clsplat.images.channels import VIDEO, check_format, parse_channels
 from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
-from clsplat.rendering.memory_plan import parse_bytes
 from clsplat.runs.run import model_file
-from clsplat.sequence import workers
-from clsplat.sequence.frame_renderer import RenderOptions, Task, picture_camera
+from clsplat.sequence import existing, task_list, workers
 from clsplat.sequence.settings_digest import digest_of
+from clsplat.sequence.task import RenderOptions, Task, picture_camera
 from clsplat.shots import Shot, choose_shot
 
 _PICTURES = (".png", ".tif", ".tiff")
@@ -85,9 +85,9 @@ def read_job(verb: Render) -> Job:
     )
     chosen = whole if verb.frames is None else whole.only(verb.frames)
     sampling = options.pictures.sampling
-    tasks = workers.make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
+    tasks = task_list.make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
     _check_pictures(tasks, options)
-    workers.check_folders(tasks)
+    existing.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
         check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
     _tell_unused(verb, options.channels)
@@ -115,8 +115,8 @@ def frames_there(job: Job) -> set[int]:
     which settings they were made."""
     if not job.verb.skip_existing:
         return set()
-    there = workers.complete(job.tasks, job.options)
-    if unknown := workers.untold([task for task in job.tasks if task.number in there]):
+    there = existing.complete(job.tasks, job.options)
+    if unknown := existing.untold([task for task in job.tasks if task.number in there]):
         warn(
             f"--skip-existing: {len(unknown)} of the frames that are there do not say how they were made, such as "
             f"{unknown[0]}: they are kept, whatever their cameras, precision and other settings are"

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from clsplat.cli.main import Bench, Demo, Devices, Eval, Render, Selftest, Sfm, Train, Tune, Verb
 from clsplat.cli.options import Compare, Convert, Info, Report, View
+from clsplat.config.memory import parse_bytes
 from clsplat.errors import CapacityError, InputError, plain
 from clsplat.process import status_of
-from clsplat.rendering.memory_plan import Plan, parse_bytes
+from clsplat.rendering.memory_plan import Plan
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -213,8 +214,8 @@ def _train_checked(verb: Train, held: ExitStack) -> int:
 
 def _train_verb(scene: Scene, run: Run, device: Device, between: Between | None = None) -> Gaussians:
     """The one place that calls the trainer."""
+    from clsplat.api import train as run_training
     from clsplat.progress import TrainProgress
-    from clsplat.training.loop import train as run_training
 
     def tell(plan: Plan) -> None:
         if device.memory.limit is not None or any(plan.pieces):
@@ -238,11 +239,12 @@ def evaluate(verb: Eval, *, held: bool = False) -> int:
     from clsplat import report
     from clsplat.config.training import TrainConfig
     from clsplat.device.context import open_device
-    from clsplat.evaluation.held_out import background_colour
     from clsplat.evaluation.held_out import evaluate as measure
     from clsplat.gaussians import Gaussians
+    from clsplat.images.alpha import background_colour
     from clsplat.images.colour import recorded_space
-    from clsplat.rendering.rasterizer import Renderer
+    from clsplat.rendering.renderer import Renderer
+    from clsplat.report import last
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, is_run, model_file
@@ -298,7 +300,7 @@ def evaluate(verb: Eval, *, held: bool = False) -> int:
     if given_run:
         given_run.write_eval(result)
         if (given_run.path / report.NAME).exists():
-            report.write_last(given_run, scene, gaussians)
+            last.write_last(given_run, scene, gaussians)
     if verb.json:
         print(json.dumps(result, indent=2))
         return 0
@@ -311,7 +313,8 @@ def evaluate(verb: Eval, *, held: bool = False) -> int:
 def bench(verb: Bench) -> int:
     """Measure. What can be wrong with the call is found before anything is."""
     from clsplat.bench import settings as tradeoff
-    from clsplat.bench import stages as measure
+    from clsplat.bench import stages as bench_stages
+    from clsplat.bench import subject as bench_subject
     from clsplat.bench.plots import check_plot, plot_settings
     from clsplat.device.context import Device, select
     from clsplat.files import check_new
@@ -332,14 +335,14 @@ def bench(verb: Bench) -> int:
     progress = StageProgress()
     device = require(Device(select(verb.device), profile=True))
     device.memory.limit = limit
-    most = int(device.cl_device.global_mem_size) // measure.GAUSSIAN_BYTES
+    most = int(device.cl_device.global_mem_size) // bench_stages.GAUSSIAN_BYTES
     if verb.source is None and verb.gaussians > most:
         raise InputError(f"--gaussians {verb.gaussians}: expected at most {most}, which fill {device.name}'s memory")
     if verb.source is None:
-        subject = measure.synthetic(verb.gaussians, *(size or (1024, 768)))
+        subject = bench_subject.synthetic(verb.gaussians, *(size or (1024, 768)))
     else:
-        subject = measure.load_subject(verb.source, size, progress)
-    result = measure.bench(subject, device, verb.rasterizer, repeat=verb.repeat, progress=progress)
+        subject = bench_subject.load_subject(verb.source, size, progress)
+    result = bench_stages.bench(subject, device, verb.rasterizer, repeat=verb.repeat, progress=progress)
     if verb.plot is not None:
         result["settings"] = tradeoff.compare(subject, device, repeat=verb.repeat, progress=progress)
         size_text = f"{result['width']}x{result['height']}, {result['gaussians']:,} Gaussians"
@@ -349,7 +352,7 @@ def bench(verb: Bench) -> int:
     if verb.json:
         print(json.dumps(result, indent=2))
         return 0
-    print(measure.table(result))
+    print(bench_stages.table(result))
     if "settings" in result:
         print("\n" + tradeoff.settings_table(result["settings"]))
     return 0

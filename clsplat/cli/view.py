@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import sys
 import threading
@@ -14,29 +13,25 @@ from typing import TYPE_CHECKING
 
 from clsplat.cli.main import Train
 from clsplat.cli.options import View
+from clsplat.config.memory import parse_bytes
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
-from clsplat.evaluation.held_out import background_colour
 from clsplat.gaussians import Gaussians
+from clsplat.images.alpha import background_colour
 from clsplat.process import endings
-from clsplat.rendering.memory_plan import parse_bytes
 from clsplat.runs.run import Run, is_run, model_file
 from clsplat.viewer.appearance import Look
-from clsplat.viewer.models import HeldModel, LiveModel
-from clsplat.viewer.refinement import Share, extent_of, looking, start_of
+from clsplat.viewer.models import HeldModel
+from clsplat.viewer.pose import extent_of, looking, start_of
 from clsplat.viewer.scheduler import Viewing
 from clsplat.viewer.server import Address, Server, World
+from clsplat.viewer.training_view import LONGEST_WAIT, TrainingView
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
-    from clsplat.training.trainer import Trainer
 
-LONGEST_WAIT = 0.5
-"""Seconds, so that a signal is seen to on systems where it does not end a wait."""
 FIRST = (640, 360)
 """Pixels of the pictures that are made before there is a page, so that kernels are built and the model is in place."""
-TELL_EVERY = 0.5
-"""Seconds between words of a training on its page."""
 
 
 def view(verb: View) -> int:
@@ -70,36 +65,6 @@ def view(verb: View) -> int:
                 if not viewing.work():
                     viewing.wait(LONGEST_WAIT)
     return 0
-
-
-class TrainingView:
-    """What `clsplat.training.loop.train` calls between two steps: pictures for those who look, within their share."""
-
-    def __init__(self, viewing: Viewing, server: Server, background: tuple[float, float, float], last: int) -> None:
-        self.viewing, self.server, self.background, self.last = viewing, server, background, last
-        self.share = Share()
-        self._told = -math.inf
-
-    def __call__(self, trainer: Trainer, interrupted: Callable[[], bool]) -> None:
-        """Returns at once where nobody looks."""
-        viewing = self.viewing
-        if viewing.model is None:
-            viewing.model = LiveModel(trainer, self.background)
-        if not len(viewing) and not self.server.paused:
-            return
-        viewing.work(self.share)
-        self._tell(trainer)
-        while self.server.paused and not interrupted():
-            self._tell(trainer, force=True)
-            if not viewing.work():
-                viewing.wait(LONGEST_WAIT)
-
-    def _tell(self, trainer: Trainer, *, force: bool = False) -> None:
-        now = self.viewing.clock()
-        if force or now - self._told > TELL_EVERY:
-            state = "paused" if self.server.paused else "training"
-            self.server.tell(f"{state}: step {trainer.step:,} of {self.last:,}, {trainer.parameters.count:,} Gaussians")
-            self._told = now
 
 
 def training_view(verb: Train) -> Callable[[Scene], AbstractContextManager[TrainingView]]:

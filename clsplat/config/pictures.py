@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of pictures (docs/pictures.md), each default once, as in `config`. Nothing slow is imported here, as the
+"""Settings of pictures (docs/pictures.md), each default once, as in `training`. Nothing slow is imported here, as the
 command line is made from them."""
 
 from __future__ import annotations
@@ -234,3 +234,20 @@ class VideoConfig:
             raise InputError(f"--video.crf {self.crf}: expected 0 to 51")
         if self.preset not in _PRESETS:
             raise InputError(f"--video.preset {self.preset}: expected one of {', '.join(_PRESETS)}")
+
+
+Parts = Literal["one", "several"]
+ExrDepth = Literal["half", "float"]
+EXR_DEPTH: ExrDepth = "float"
+Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How pictures are encoded. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
+
+    depth: ExrDepth = EXR_DEPTH
+    parts: Parts = "one"
+    compression: Compression = "zip"
+    bits: int = 8
+    quality: int = 95

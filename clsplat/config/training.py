@@ -1,167 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the rasterizer and of training, each default once: these dataclasses are the command line, the
-`config.toml` and the help. What several verbs, or a verb and the package, have beside them has its default here too.
+"""Settings of training, each default once: these dataclasses are the command line, the `config.toml` and the help.
 
 The training defaults are those of the paper's authors' 2024 code, with the paper's resolution warm-up.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from math import inf
-from numbers import Integral, Real
-from typing import Literal, get_args, get_origin, get_type_hints
+from typing import Literal
 
+from clsplat.config.checks import Rule, check_kinds, check_rules, check_steps
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
 
 Background = Literal["black", "white", "random"]
-Preset = Literal["exact", "default", "fast"]
-Schedule = Literal["paper", "short"]
 Growth = Literal["paper", "budget"]
-Parts = Literal["one", "several"]
-ExrDepth = Literal["half", "float"]
-EXR_DEPTH: ExrDepth = "float"
-TEST_EVERY = 8
-HOST, PORT = "127.0.0.1", 8080
-"""Where the viewer listens."""
-Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
-
-MOST = 1 << 62
-"""Below which whole numbers are, so that TOML has room for them."""
-
-_Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
-"""Names of settings, whether a value makes sense (which NaN must not), and what is expected."""
-
-
-def _check(config: object, prefix: str, rules: tuple[_Rule, ...]) -> None:
-    """Raise InputError naming the flag of the first setting that breaks its rule."""
-    for names, makes_sense, expected in rules:
-        for name in names:
-            value = getattr(config, name)
-            if not makes_sense(value):
-                raise InputError(f"{prefix}{name.replace('_', '-')} {value}: expected {expected}")
-
-
-def _check_kinds(config: object, prefix: str) -> None:
-    """Raise InputError naming the flag of the first setting that is of another kind than its field, which Python lets
-    through, or larger than config.toml can hold."""
-    for name, kind in get_type_hints(type(config)).items():
-        value = getattr(config, name)
-        if get_origin(kind) is Literal:
-            fits, expected = isinstance(value, str) and value in get_args(kind), f"one of {', '.join(get_args(kind))}"
-        elif get_origin(kind) is tuple:
-            fits = isinstance(value, tuple | list) and all(_is_whole(step) for step in value)
-            expected = f"whole numbers below {MOST}"
-        elif kind is int:
-            fits, expected = _is_whole(value), f"a whole number below {MOST}"
-        elif kind is float:
-            fits = isinstance(value, Real) and not _is_truth(value) and not 1e300 <= abs(float(value)) < inf
-            expected = "a number below 1e300"
-        else:
-            fits = _is_truth(value) if kind is bool else isinstance(value, kind)
-            expected = "True or False" if kind is bool else f"{kind.__name__}(...)"
-        if not fits:
-            text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-            raise InputError(f"{prefix}{name.replace('_', '-')} {text:.100}: expected {expected}")
-
-
-def _is_truth(value: object) -> bool:
-    return type(value).__name__ in ("bool", "bool_")  # NumPy's has had both names
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, Integral) and not _is_truth(value) and abs(int(value)) < MOST
-
-
-def _check_steps(flag: str, steps: tuple[int, ...]) -> None:
-    """Raise InputError unless the steps are from 1 up and in order."""
-    if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
-        raise InputError(f"{flag} {','.join(map(str, steps))}: expected steps from 1 up, in order")
-
-
-@dataclass(frozen=True)
-class RasterizerConfig:
-    """What the rasterizer skips. Only settings that are marked as approximate change a picture; the others change no
-    bit of a frame, and are there to be measured.
-
-    sh-tolerance and sh-storage are of frames of a model that is held on the device (render, eval), not of training.
-    docs/performance.md has the error of each setting, and the time that it buys.
-    """
-
-    extent: Literal["opacity", "constant", "3sigma"] = "opacity"
-    """How far a Gaussian reaches. opacity: to where its alpha is alpha-min; constant: as far as an opaque one would,
-    whatever its opacity; 3sigma: three standard deviations, which cuts what is visible of opaque ones (approximate)."""
-    tile_test: Literal["ellipse", "box", "square"] = "ellipse"
-    """In which tiles of 16 x 16 pixels a Gaussian is listed. ellipse: those that its ellipse reaches, or all of its
-    bounding box where that has at most 16; box: all of its bounding box; square: those that the square of its longest
-    half axis reaches, as in the code of Kerbl et al."""
-    depth_sort: Literal["visible", "pairs"] = "visible"
-    """What is sorted. visible: the visible Gaussians by depth, then their pairs with tiles, stably, by tile; pairs: all
-    pairs by tile and depth, as in the code of Kerbl et al."""
-    key_bits: Literal["needed", "all"] = "needed"
-    """Which bits are sorted by. needed: those in which the depths of the frame and its tiles differ; all: 32 of
-    each."""
-    row_skip: bool = True
-    """Visit only the rows of a tile that a Gaussian's bounding box reaches."""
-    column_skip: bool = True
-    """Visit only the vectors (pixels that are worked on at once) of a row that a Gaussian's bounding box reaches."""
-    vector_skip: bool = True
-    """Leave a vector of pixels when the Gaussian contributes to none of them. Frames on a CPU have no use for it: their
-    vectors are found by the ellipse, so that few are visited in vain."""
-    early_stop: bool = True
-    """Leave a tile when all its pixels are opaque; else go on to its last Gaussian, to no effect."""
-    last_contributor: bool = True
-    """A tile's gradient begins at the last Gaussian that one of its pixels takes, or at its last, to no effect."""
-    record_cells: bool = True
-    """A tile's gradient visits the cells of pixels in which a Gaussian contributes, as blending has recorded them; else
-    it finds those that the ellipse reaches once more."""
-    gradient_skip: bool = True
-    """A tile's gradient leaves out the recorded cells in which no pixel has one."""
-    frustum_cull: bool = True
-    """Leave out a Gaussian that reaches no tile of the image before its colour is worked out; else it has a colour and
-    a place in the order of depth, to no effect. What is not in front of the near plane has no projection, and is always
-    left out."""
-    opacity_cull: bool = True
-    """Leave out a Gaussian whose opacity is not over alpha-min before its colour is worked out; else as with
-    frustum-cull off, wherever it lies: it has no extent."""
-    sh_degree_limit: int = 3
-    """Leave out the bands of spherical harmonics (SH, colour by direction) above this degree, 0 to 3 (approximate)."""
-    sh_tolerance: float = 0.0
-    """Leave out a Gaussian's highest SH bands as long as that changes no channel of its colour, 0 to 1, by more than
-    this, from any direction: 0 leaves out those that are zero (approximate above 0). Bands that none needs are always
-    left out, those that some need only where that is half of all coefficients: from there on it pays."""
-    sh_storage: Literal["float", "half"] = "float"
-    """Keep the SH bands above 0 in 32 or in 16 bits (half is approximate, of half the memory)."""
-    alpha_min: float = 1 / 255
-    """Skip a Gaussian at a pixel where its alpha is less than this (approximate above the default, 1/255: one step of 8
-    bits)."""
-    transmittance_min: float = 1e-4
-    """A Gaussian that would take a pixel's transmittance to this or less is left out and ends the pixel (approximate
-    above 1e-4)."""
-
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
-        rules: tuple[_Rule, ...] = (
-            (("sh_degree_limit",), lambda value: 0 <= value <= 3, "0 to 3"),
-            (("sh_tolerance",), lambda value: 0 <= value <= 1, "0 to 1"),
-            (("alpha_min",), lambda value: 1e-3 <= value < 0.5, "0.001 to 0.5"),
-            (("transmittance_min",), lambda value: 1e-6 <= value < 0.5, "1e-6 to 0.5"),
-        )
-        _check_kinds(self, "--rasterizer.")
-        _check(self, "--rasterizer.", rules)
-
-
-DEMO_ITERATIONS = 2000
-"""Steps of `clsplat demo`, about a minute of two cores."""
-
-PRESETS: dict[Preset, RasterizerConfig] = {
-    "exact": RasterizerConfig(),
-    "default": RasterizerConfig(),
-    "fast": RasterizerConfig(alpha_min=2 / 255, transmittance_min=1e-3),
-}
-"""exact: nothing approximate; default: what is on unless asked for, equal to exact as long as every default has an
-error of zero; fast: approximations that are worth their error (docs/performance.md)."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +59,7 @@ class OptimiserConfig:
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
         rates = tuple(each.name for each in fields(self) if each.name.endswith(("_rate", "_rate_end")))
-        rules: tuple[_Rule, ...] = (
+        rules: tuple[Rule, ...] = (
             (rates, lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("means_rate_steps", "sh_rest_every"), lambda value: value >= 1, "at least 1"),
             (("cooldown",), lambda value: value >= 0, "at least 0"),
@@ -212,8 +67,8 @@ class OptimiserConfig:
             (("beta1", "beta2"), lambda value: 0 <= value < 1, "at least 0, less than 1"),
             (("epsilon",), lambda value: 0 < value < inf, "a finite number, more than 0"),
         )
-        _check_kinds(self, "--optimiser.")
-        _check(self, "--optimiser.", rules)
+        check_kinds(self, "--optimiser.")
+        check_rules(self, "--optimiser.", rules)
         if self.means_rate > 0 and self.means_rate_end == 0:  # in between it would be 0 as well, from the first step on
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0, the rate falls log-linearly to it")
 
@@ -271,7 +126,7 @@ class DensityConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        rules: tuple[_Rule, ...] = (
+        rules: tuple[Rule, ...] = (
             (("every", "start", "stop", "opacity_reset_every"), lambda value: value >= 0, "at least 0"),
             (
                 ("gradient_threshold", "max_world_fraction"),
@@ -287,9 +142,9 @@ class DensityConfig:
             (("prune_every",), lambda value: value >= 0, "at least 0"),
             (("prune_fraction",), lambda value: 0 <= value < 1, "at least 0, less than 1"),
         )
-        _check_kinds(self, "--density.")
-        _check(self, "--density.", rules)
-        _check_steps("--density.prune-at", self.prune_at)
+        check_kinds(self, "--density.")
+        check_rules(self, "--density.", rules)
+        check_steps("--density.prune-at", self.prune_at)
         if self.prune_fraction > 0 and not self.prune_at:
             raise InputError(
                 f"--density.prune-fraction {self.prune_fraction}: never used, expected steps in --density.prune-at too"
@@ -350,7 +205,7 @@ class TrainConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        rules: tuple[_Rule, ...] = (
+        rules: tuple[Rule, ...] = (
             (("sh_degree",), lambda value: 0 <= value <= 3, "0 to 3"),
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
             (("iterations", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
@@ -360,10 +215,10 @@ class TrainConfig:
                 "at least 0",
             ),
         )
-        _check_kinds(self, "--")
-        _check(self, "--", rules)
+        check_kinds(self, "--")
+        check_rules(self, "--", rules)
         for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):
-            _check_steps(f"--{name}", steps)
+            check_steps(f"--{name}", steps)
         if self.eval_at and self.eval_at[-1] > self.iterations:
             late = next(step for step in self.eval_at if step > self.iterations)
             raise InputError(
@@ -372,56 +227,3 @@ class TrainConfig:
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
-
-
-def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
-    """What `clsplat train --schedule` starts from.
-
-    paper: the defaults, made for 30,000 steps, whatever `iterations` is. short: for runs of about 7000 steps, in which
-    the paper's rates leave a model unfinished: colours, opacities and rotations learn faster, SH degrees come twice as
-    fast, the means' rate has fallen at the end, density control ends at five sevenths, and the last seventh cools down
-    (docs/decisions/0013-a-short-schedule.md).
-    """
-    if schedule == "paper":
-        return TrainConfig(iterations=iterations)
-    return TrainConfig(
-        iterations=iterations,
-        sh_degree_every=500,
-        optimiser=OptimiserConfig(
-            means_rate_steps=max(iterations, 1),
-            sh_dc_rate=4e-3,
-            sh_rest_rate=4e-4,
-            opacities_rate=0.05,
-            quaternions_rate=2e-3,
-            cooldown=max(iterations // 7, 0),
-            cooldown_to=0.2,
-        ),
-        density=DensityConfig(stop=max(5 * iterations // 7, 0)),
-    )
-
-
-def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> TrainConfig:
-    """What `clsplat train --preset --schedule --iterations` start from.
-
-    fast trains less: on pictures of a quarter of the size for a fourteenth of the steps and of half the size until two
-    sevenths, with fewer Gaussians, those dropped that add less than a tenth of a pixel to every view, the rates of the
-    short schedule with those of means, scales and rotations up to four times higher, and the higher SH bands in every
-    second step (docs/decisions/0015-the-fast-preset.md).
-    """
-    config = scheduled(schedule or ("short" if preset == "fast" else "paper"), iterations)
-    config = replace(config, rasterizer=PRESETS[preset])
-    if preset != "fast":
-        return config
-    optimiser = config.optimiser
-    return replace(
-        config,
-        warmup=tuple(sorted({max(iterations // 14, 1), max(2 * iterations // 7, 1)})),
-        optimiser=replace(
-            optimiser,
-            means_rate=2 * optimiser.means_rate,
-            scales_rate=4 * optimiser.scales_rate,
-            quaternions_rate=2 * optimiser.quaternions_rate,
-            sh_rest_every=2,
-        ),
-        density=replace(config.density, gradient_threshold=3e-4, min_contribution=0.1),
-    )

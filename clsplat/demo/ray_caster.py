@@ -19,14 +19,13 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.images.reading import write_spec
+from clsplat.images.writing import write_spec
 from clsplat.shots.viewpoints import look_at
 
-Float32 = NDArray[np.float32]
 Progress = Callable[[str, float | None], None]
 Palette = tuple[tuple[float, float, float], ...]
 

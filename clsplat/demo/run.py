@@ -9,13 +9,22 @@ import time
 from pathlib import Path
 from typing import Any
 
-from clsplat.config.training import DEMO_ITERATIONS, TrainConfig
+from clsplat.api import train
+from clsplat.config.training import TrainConfig
+from clsplat.config.verbs import DEMO_ITERATIONS
 from clsplat.demo.ray_caster import Progress, ignore_progress, write_photos
+from clsplat.device.context import open_device
 from clsplat.errors import InputError, examples
 from clsplat.files import atomic_write, is_file
+from clsplat.gaussians import Gaussians
+from clsplat.images.writing import write_image
+from clsplat.progress import StageProgress, TrainProgress
+from clsplat.rendering.renderer import Renderer
 from clsplat.runs.locks import locked
+from clsplat.runs.run import Run
 from clsplat.scenes import sfm
-from clsplat.shots.viewpoints import turntable
+from clsplat.scenes.scene import load_scene
+from clsplat.shots.generated import turntable
 
 PHOTOS = 40
 WIDTH, HEIGHT = 320, 240
@@ -55,9 +64,6 @@ def claim(output: Path) -> None:
 
 def _run_demo(output: Path, *, device: str | None, iterations: int, frames: int) -> dict[str, Any]:
     """As `run_demo`, alone in the folder."""
-    from clsplat.device.context import open_device
-    from clsplat.progress import StageProgress
-
     start = time.monotonic()
     # before minutes of work: is there a device of that name?
     opened = open_device(device)
@@ -97,11 +103,6 @@ def make_scene(output: Path, progress: Progress | None = None) -> Path:
 
 def _train(scene_folder: Path, run_folder: Path, iterations: int, device: Any) -> dict[str, Any]:
     """Train a run and give its evaluation on the held-out photos. An earlier demo's run is replaced."""
-    from clsplat.progress import TrainProgress
-    from clsplat.runs.run import Run
-    from clsplat.scenes.scene import load_scene
-    from clsplat.training.loop import train
-
     config = TrainConfig(iterations=iterations)
     scene = load_scene(scene_folder)
     run = Run.create(run_folder, config, scene=scene_folder, resume=False, overwrite=True)
@@ -113,12 +114,6 @@ def _train(scene_folder: Path, run_folder: Path, iterations: int, device: Any) -
 
 def _render_turntable(scene_folder: Path, run_folder: Path, target: Path, frames: int, device: Any) -> None:
     """A closed camera path around the scene as PNG files."""
-    from clsplat.gaussians import Gaussians
-    from clsplat.images.reading import write_image
-    from clsplat.progress import StageProgress
-    from clsplat.rendering.rasterizer import Renderer
-    from clsplat.scenes.scene import load_scene
-
     progress = StageProgress()
     cameras = [view.camera for view in load_scene(scene_folder).views]
     gaussians = Gaussians.load(run_folder / "model.ply")

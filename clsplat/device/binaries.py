@@ -20,7 +20,7 @@ import pyopencl as cl
 
 from clsplat.device.known import cache_folder
 from clsplat.device.processor import features
-from clsplat.device.shapes import wants_cache
+from clsplat.device.quirks import wants_cache
 from clsplat.files import atomic_write
 
 MOST_BYTES = 256 << 20

@@ -22,8 +22,9 @@ from clsplat.device.launch import launch_groups
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build, variant_of
+from clsplat.device.quirks import compiles_by_size, kind_of
 from clsplat.device.rehearsal import Rehearsal
-from clsplat.device.shapes import Shape, asked_shape, compiles_by_size, kind_of, shape_of, shape_text, why_another
+from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text, why_another
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import pyopencl as cl
 
+import clsplat
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import reason_of
 from clsplat.files import atomic_write, locked, parse_json
@@ -63,11 +64,9 @@ def _kernels_digest(broken: str) -> str:
 
 def driver_key(device: cl.Device) -> str:
     """All that an answer hangs on beside the shape."""
-    from clsplat import __version__
-
     driver = f"{device.platform.version.strip()} | {device.driver_version.strip()}"
     kernels = _kernels_digest(os.environ.get(BREAK, ""))
-    return f"{device.name.strip()} | {driver} | clsplat {__version__} {kernels}"
+    return f"{device.name.strip()} | {driver} | clsplat {clsplat.__version__} {kernels}"
 
 
 def _entry(value: object) -> Entry:

@@ -13,7 +13,7 @@ import pyopencl as cl
 
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.program import Kernel
-from clsplat.device.shapes import tells_group_sizes
+from clsplat.device.quirks import tells_group_sizes
 from clsplat.errors import DriverError
 
 if TYPE_CHECKING:

@@ -11,9 +11,6 @@ As a program it is that other process: it answers lines of JSON with lines of JS
 from __future__ import annotations
 
 import atexit
-import faulthandler
-import json
-import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -23,10 +20,9 @@ import numpy as np
 import pyopencl as cl
 
 from clsplat.device import known
-from clsplat.device.child import REGARDLESS, Child, ending_at_once, patience, python_module, regardless, tell
-from clsplat.device.program import Kernel, Variant, build, text_of
-from clsplat.device.shapes import caches_programs
-from clsplat.errors import DriverError, KernelBuildError
+from clsplat.device.child import REGARDLESS, Child, ending_at_once, patience, python_module, regardless
+from clsplat.device.program import Kernel, Variant, text_of
+from clsplat.errors import DriverError
 
 IDLE = 20.0
 """Seconds after which the process is ended: its device memory is worth more than its start, which takes half of one."""
@@ -68,7 +64,7 @@ class _Process:
 
     def _asked(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
         if self._child is None:
-            self._child = Child(python_module("clsplat.device.rehearsal", str(self._index)))
+            self._child = Child(python_module("clsplat.device.trial", str(self._index)))
         seconds = patience()
         self._child.send({**message, "seconds": seconds})
         try:
@@ -243,76 +239,3 @@ def _described(argument: Any) -> tuple[str, Any]:
         return "buffer", argument.size
     value = np.asarray(argument)
     return value.dtype.str, value.item()
-
-
-def _given(context: cl.Context, queue: cl.CommandQueue, kind: str, value: Any) -> Any:
-    """The argument that `_described` told of, memory full of zeros."""
-    if kind == "local":
-        return cl.LocalMemory(value)
-    if kind != "buffer":
-        return np.dtype(kind).type(value)
-    buffer = cl.Buffer(context, cl.mem_flags.READ_WRITE, value)
-    cl.enqueue_fill_buffer(queue, buffer, np.uint8(0), 0, value)
-    return buffer
-
-
-class _Stage:
-    """Where the child tries kernels: a device with a queue, and what has been built on it."""
-
-    def __init__(self, device: cl.Device) -> None:
-        self._device, self._context = device, cl.Context([device])
-        self._queue = cl.CommandQueue(self._context)
-        self._kernels: dict[str, dict[str, Any]] = {}
-
-    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        """Build, and launch if asked for."""
-        text = message["build"]
-        variant = Variant(text["stem"], text["source"], tuple(text["options"]))
-        try:
-            salt = ""
-            if variant.digest not in self._kernels:
-                program, salt = build(self._context, self._device, variant)
-                self._kernels[variant.digest] = {kernel.function_name: kernel for kernel in program.all_kernels()}
-                if caches_programs(self._device) and build(self._context, self._device, variant.anew(salt))[1]:
-                    return {"trouble": "has no kernels when it comes from the driver's cache"}
-            if "launch" in message:
-                self._launch(self._kernels[variant.digest], **message["launch"])
-        except (MemoryError, cl.MemoryError):
-            return {"memory": True}
-        except KernelBuildError as error:
-            return {"refused": str(error)[:300]}
-        except DriverError:
-            return {"trouble": "has no kernels when the driver has built it"}
-        except cl.Error as error:
-            return {"trouble": "cannot be launched: " + " ".join(str(error).split())[:300]}
-        return {"salt": salt}
-
-    def _launch(
-        self,
-        kernels: dict[str, Any],
-        kernel: str,
-        size: list[int],
-        local: list[int] | None,
-        arguments: list[tuple[str, Any]],
-    ) -> None:
-        given = [_given(self._context, self._queue, *argument) for argument in arguments]
-        kernels[kernel](self._queue, tuple(size), None if local is None else tuple(local), *given)
-        self._queue.finish()
-
-
-def _serve(index: int) -> None:
-    """The child: answer until the parent has gone; end by itself where a driver hangs and nobody is left to see it."""
-    from clsplat.device.context import all_devices
-
-    stage = None
-    for line in sys.stdin:
-        message = json.loads(line)
-        faulthandler.dump_traceback_later(1.5 * message["seconds"], exit=True)
-        stage = stage or _Stage(all_devices()[index])
-        answer = stage.answer(message)
-        faulthandler.cancel_dump_traceback_later()
-        tell(**answer)
-
-
-if __name__ == "__main__":
-    _serve(int(sys.argv[1]))

@@ -14,8 +14,9 @@ import pyopencl as cl
 
 from clsplat.device import known
 from clsplat.device.child import regardless
+from clsplat.device.quirks import is_rusticl, kind_of, pocl_version
 from clsplat.errors import DeviceError, reason_of
-from clsplat.files import parse_json
+from clsplat.files import atomic_write, parse_json
 
 LANES = (1, 4, 8, 16)
 """Pixels that a vector can have."""
@@ -50,56 +51,15 @@ class Shape:
         return max(4 * self.items << self.digit_bits, 32 << 10) if self.items > 1 else 32 << 10
 
 
-def kind_of(device: cl.Device) -> str:
-    """cpu, gpu or other."""
-    if device.type & cl.device_type.GPU:
-        return "gpu"
-    return "cpu" if device.type & cl.device_type.CPU else "other"
-
-
-def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
-    words = device.platform.version.split()
-    if "PoCL" not in words:
-        return None
-    digits = words[words.index("PoCL") + 1].split("-")[0].split("+")[0].split(".")
-    return int(digits[0]), int(digits[1])
-
-
-def _is_rusticl(device: cl.Device) -> bool:
-    return str(device.platform.name).strip() == "rusticl"
-
-
-def tells_group_sizes(device: cl.Device) -> bool:
-    """False for a driver that is wrong about the work-items that it allows a group of a kernel: Rusticl of Mesa 22.3
-    says 32 of every kernel, and runs groups of 1024."""
-    return not _is_rusticl(device)
-
-
-def caches_programs(device: cl.Device) -> bool:
-    """True for a driver that keeps what it builds on the disk, so that a second build takes no time."""
-    return _pocl_version(device) is not None
-
-
-def compiles_by_size(device: cl.Device) -> bool:
-    """True for a driver that compiles a kernel anew for a group of another size, and for launches from 65,536 items."""
-    return _pocl_version(device) is not None
-
-
-def wants_cache(device: cl.Device) -> bool:
-    """True for a driver that is known to build everything anew in each process, and to load its binaries again:
-    Intel's runtime for CPUs. Other drivers have a cache of their own, or have not been tried."""
-    return kind_of(device) == "cpu" and str(device.platform.name).strip() == "Intel(R) OpenCL"
-
-
 def default_shape(device: cl.Device) -> Shape:
     """The shape by type and vector width; why there are several is in docs/decisions/0003-one-source-many-shapes.md."""
     if kind_of(device) != "cpu":
         items = next((n for n in (256, 128, 64, 32, 16) if n <= most_items(device)), 1)
         return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
     lanes = 16 if device.native_vector_width_float >= 16 else 8
-    if _pocl_version(device) == (3, 0):
+    if pocl_version(device) == (3, 0):
         lanes = 8  # its compiler aborts on some float16 built-ins
-    if _is_rusticl(device):  # with vectors llvmpipe does not come back from the larger kernels
+    if is_rusticl(device):  # with vectors llvmpipe does not come back from the larger kernels
         return Shape(lanes=1, items=64, chunks=4 * device.max_compute_units)
     return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units)
 
@@ -245,8 +205,6 @@ def saved_shapes() -> dict[str, str]:
 
 def save_shape(device: cl.Device, shape: Shape | None) -> None:
     """Keep this for the device with the driver that it has; None forgets. Raises OSError."""
-    from clsplat.files import atomic_write
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         saved = saved_shapes()

@@ -9,13 +9,14 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation import metrics
 from clsplat.files import identity
-
-Image = NDArray[Any]
+from clsplat.images.alpha import Image, composite
+from clsplat.images.colour import displayed
+from clsplat.images.writing import write_image
 
 
 class EvaluatedView(Protocol):
@@ -30,23 +31,6 @@ class EvaluatedView(Protocol):
 
 
 ViewT = TypeVar("ViewT", bound=EvaluatedView)
-
-
-def background_colour(name: str) -> tuple[float, float, float]:
-    """The colour behind held-out views: white, or black also for "random"."""
-    return (1.0, 1.0, 1.0) if name == "white" else (0.0, 0.0, 0.0)
-
-
-def composite(image: Image, background: ArrayLike) -> Image:
-    """(H, W, 3) floats: the image, with straight alpha if it has four channels, over the colour `background` (3,)."""
-    pixels: Image = image
-    if np.issubdtype(image.dtype, np.integer):
-        pixels = image.astype(np.float32) / np.iinfo(image.dtype).max
-    if pixels.shape[2] == 3:
-        return pixels
-    alpha = pixels[:, :, 3:]
-    over: Image = pixels[:, :, :3] * alpha + np.asarray(background, pixels.dtype) * (1 - alpha)
-    return over
 
 
 def evaluate(
@@ -69,9 +53,6 @@ def evaluate(
     not finite, InputError naming a view that is too small, or a space that is not known.
     """
     records: list[dict[str, Any]] = []
-    if save_dir is not None:
-        from clsplat.images.colour import displayed
-        from clsplat.images.reading import write_image
     names = picture_names([view.name for view in views])
     for view, name in zip(views, names, strict=True):
         truth = composite(view.load(), background)

@@ -17,22 +17,22 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.config.pictures import DEEP_STRIP_FLOATS, DeepConfig
+from clsplat.config.pictures import DEEP_STRIP_FLOATS, DeepConfig, Encoding
 from clsplat.device.context import Device
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
 from clsplat.frame.strips import strips
 from clsplat.frame.window import on_tiles
 from clsplat.gaussians import Gaussians
-from clsplat.images.channels import DEEP, HALF_MAX, Encoding, Header, deep_spec
+from clsplat.images.channels import DEEP, HALF_MAX, deep_spec
 from clsplat.images.colour import Colours
-from clsplat.images.reading import atomic_output
+from clsplat.images.exr_header import Header
+from clsplat.images.writing import atomic_output
 from clsplat.rendering.memory_needs import frame_pixels
-from clsplat.rendering.rasterizer import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.stages.deep import DEEP_FLOATS
-
-Float32 = NDArray[np.float32]
 
 _OUTLIERS = 0.01
 """Share of the Gaussians in view that is nearer than the first bound, and that is further than the last."""

@@ -15,16 +15,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import PictureConfig
+from clsplat.config.pictures import Encoding, PictureConfig
+from clsplat.frame.draw import Draw, Layers, drawn_by
 from clsplat.frame.shutter_and_lens import sample_cameras, sampled
 from clsplat.frame.strips import in_strips, strip_rows, write_in_strips
-from clsplat.frame.window import Draw, Layers, drawn_by, framed, supersampled
-from clsplat.images.channels import Encoding, Header, write_layers
+from clsplat.frame.supersample import supersampled
+from clsplat.frame.window import framed
+from clsplat.images.channels import write_layers
 from clsplat.images.colour import SRGB, Colours
+from clsplat.images.exr_header import Header
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
-    from clsplat.rendering.rasterizer import Renderer
+    from clsplat.rendering.renderer import Renderer
 
 
 UNSEEN = 1e-6

@@ -10,15 +10,14 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.config.pictures import SamplingConfig
 from clsplat.errors import InputError
-from clsplat.frame.window import COLOUR, Draw, Layers, reframed
+from clsplat.frame.draw import COLOUR, Draw, Layers
+from clsplat.frame.window import reframed
 from clsplat.images.channels import LAYERS
-
-Float64 = NDArray[np.float64]
 
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 

@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import STRIP_PIXELS, FramingConfig
+from clsplat.config.pictures import STRIP_PIXELS, Encoding, FramingConfig
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
-from clsplat.frame.window import Draw, Layers, crop
-from clsplat.images.channels import LAYERS, Encoding, Header, check_format, encoded
-from clsplat.images.reading import atomic_output
+from clsplat.frame.draw import Draw, Layers
+from clsplat.frame.window import crop
+from clsplat.images.channels import LAYERS, check_format, encoded
+from clsplat.images.exr_header import Header
+from clsplat.images.writing import atomic_output
 from clsplat.rendering.memory_needs import frame_pixels
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standa
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,13 +17,13 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera, Window
-from clsplat.config.training import EXR_DEPTH, Compression, ExrDepth, Parts
+from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
 from clsplat.files import native_name
-from clsplat.images.reading import image_size, steps_of, unassociate, write_spec
-
-Float64 = NDArray[np.float64]
+from clsplat.images.alpha import unassociate
+from clsplat.images.exr_header import Header
+from clsplat.images.reading import image_size
+from clsplat.images.writing import steps_of, write_spec
 
 
 @dataclass(frozen=True)
@@ -66,30 +66,6 @@ DEEP = ("R", "G", "B", "A", "Z", "ZBack")
 """Channels of a deep picture."""
 
 
-@dataclass(frozen=True)
-class Encoding:
-    """How pictures are encoded. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
-
-    depth: ExrDepth = EXR_DEPTH
-    parts: Parts = "one"
-    compression: Compression = "zip"
-    bits: int = 8
-    quality: int = 95
-
-
-@dataclass(frozen=True, eq=False)
-class Header:
-    """What goes into the file beside pixels; window: None where the picture is the display window; chromaticities: x
-    and y of red, green, blue and white, none where they are not known; is_srgb: whether the colours are sRGB's."""
-
-    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
-    matrices: Mapping[str, Float64] = field(default_factory=dict)
-    window: Window | None = None
-    pixel_aspect: float = 1.0
-    chromaticities: Sequence[float] = ()
-    is_srgb: bool = True
-
-
 def parse_channels(text: str) -> tuple[str, ...]:
     """The names in `text`, comma-separated, in the order of LAYERS. Raises InputError."""
     asked = [word.strip() for word in text.split(",") if word.strip()]
@@ -115,42 +91,13 @@ def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> 
         raise InputError(f"{path}: {article} {extension[1:].upper()} {lacking}; write .exr, or other --channels")
 
 
-def camera_matrices(camera: Camera) -> dict[str, Float64]:
-    """worldToCamera and worldToNDC of row vectors, as OpenEXR defines them, for a camera that has an image plane; none
-    for others.
-
-    In the camera's space x is right, y up and z along the view, a left-handed frame. NDC: (0, 0) is the upper left
-    corner of the display window, (1, 1) the lower right one; z, of which OpenEXR says nothing, is 0 at the near plane
-    and 1 at infinity, or of an orthographic camera at its far plane; if that has none, 1 more a world unit.
-    """
-    if camera.projection not in ("perspective", "orthographic"):
-        return {}
-    to_camera = np.eye(4)
-    flip = np.diag([1.0, -1.0, 1.0])
-    to_camera[:3, :3] = (flip @ camera.rotation).T
-    to_camera[3, :3] = flip @ camera.translation
-    display = camera.window or camera
-    centre = camera.cx / display.width, camera.cy / display.height
-    projection = np.zeros((4, 4))
-    projection[0, 0] = camera.fx / display.width
-    projection[1, 1] = -camera.fy / display.height
-    if camera.projection == "perspective":  # w = z
-        projection[2] = [*centre, 1.0, 1.0]
-        projection[3, 2] = -camera.near
-    else:
-        along = 1 / (camera.far - camera.near) if np.isfinite(camera.far) else 1.0
-        projection[2, 2] = along
-        projection[3] = [*centre, -along * camera.near, 1.0]
-    return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
-
-
 def write_layers(
     path: Path, layers: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
 ) -> None:
     """Write a frame, atomically.
 
     layers: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
-    numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `reading.write_image`.
+    numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `writing.write_image`.
     """
     path, encoding, header = Path(path), encoding or Encoding(), header or Header()
     check_format(str(path), layers)

@@ -18,10 +18,9 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.config.pictures import ColourConfig
 from clsplat.errors import InputError, examples
-
-Float32 = NDArray[np.float32]
 
 SRGB = "sRGB"
 """sRGB's curve over Rec.709's primaries: what 8-bit photographs are in, and models that say nothing else."""

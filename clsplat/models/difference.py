@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians import Float64, Gaussians
+from clsplat.arrays import Float64
+from clsplat.gaussians import Gaussians
 from clsplat.models.codec import values as packing
 
 UNITS = {

@@ -14,10 +14,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, Camera
 from clsplat.errors import InputError
-from clsplat.gaussians import Float32, Float64, Gaussians
-from clsplat.reference.sh import sh_basis
+from clsplat.gaussians import Gaussians
+from clsplat.spherical_harmonics import sh_basis
 
 FAR = 64.0
 """A model that is moved farther from the origin than so many of its own sizes counts from there (decision 0017)."""

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.camera import NEAR
 from clsplat.files import is_file, open_input
-from clsplat.gaussians import Float32, Gaussians
+from clsplat.gaussians import Gaussians
 from clsplat.images.colour import recorded_space
 from clsplat.models.codec import values as packing
 from clsplat.models.formats import format_of, model_path, ply, tell_kind

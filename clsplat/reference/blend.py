@@ -10,12 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float64, Int64
 from clsplat.reference.project import ALPHA_MIN, Projected
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 ALPHA_MAX = float(np.float32(0.99))
 TRANSMITTANCE_MIN = float(np.float32(1e-4))

@@ -5,11 +5,9 @@ docs/cameras.md."""
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
-
-Float64 = NDArray[np.float64]
 
 
 def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:

@@ -7,15 +7,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float64, Int64
 from clsplat.camera import Camera
 from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN, footprint
 from clsplat.reference.cameras import period, pixel_from_world, wrapped
 from clsplat.reference.project import ALPHA_MIN, Projected, rotation_matrices, view_directions
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN, footprint
 from clsplat.reference.project import ALPHA_MIN, Projected
-
-Float64 = NDArray[np.float64]
 
 
 def deep(

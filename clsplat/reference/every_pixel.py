@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN
@@ -19,8 +19,6 @@ from clsplat.reference.project import ALPHA_MIN, Projected, project
 from clsplat.reference.rays import Tangents, ray_alphas, tangents
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

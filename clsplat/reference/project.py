@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera, Window
-from clsplat.reference.sh import sh_basis, sh_basis_grad
+from clsplat.reference.sh import sh_basis_grad
+from clsplat.spherical_harmonics import sh_basis
 
-Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 ALPHA_MIN = 1.0 / 255.0

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.project import ALPHA_MIN, LOW_PASS, rotation_matrices, view_directions
 from clsplat.reference.render import parameters
-from clsplat.reference.sh import sh_basis
-
-Float64 = NDArray[np.float64]
+from clsplat.spherical_harmonics import sh_basis
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.blend import Blended, blend, blend_grad
 from clsplat.reference.project import Projected, project, project_grad
 from clsplat.reference.sort import depth_order
 
-Float64 = NDArray[np.float64]
 BLACK = (0.0, 0.0, 0.0)
 
 

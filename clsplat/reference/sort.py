@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from clsplat.arrays import Float64
 
 
 def depth_order(depths: Float64, visible: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Int64
 from clsplat.reference.blend import ALPHA_MAX, footprint
 from clsplat.reference.project import ALPHA_MIN, Projected
-
-Int64 = NDArray[np.int64]
 
 
 def touched_tiles(

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 
 _HALF_LOG2E = 0.5 * math.log2(math.e)
 

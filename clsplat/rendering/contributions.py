@@ -7,17 +7,18 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
 from clsplat.device.layout import SlotFields
 from clsplat.errors import InputError
-from clsplat.gaussians import Float32, Gaussians
+from clsplat.gaussians import Gaussians
 from clsplat.models.edit import drop_sh
 from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.stages.project import allocate_gaussians, host_gaussians, parts, upload_gaussians
+from clsplat.stages.device_gaussians import allocate_gaussians, host_gaussians, parts, upload_gaussians
 
 FIELDS = SlotFields(contributions=True)
 

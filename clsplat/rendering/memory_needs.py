@@ -6,12 +6,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from clsplat.camera import Camera
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.device.layout import PAD, TILE, SlotFields
 from clsplat.rendering.memory_plan import Need, Plan, plan
+from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.loss import strips
-from clsplat.stages.project import tiles_of
 from clsplat.stages.sort import scratch_bytes
 
 _SOURCE = 16

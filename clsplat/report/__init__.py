@@ -1,30 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """report.html, what a run came to in one file, and runs side by side (docs/report.md).
 
-`figures` reads a run, `svg` draws, `pictures` embeds, `page` and `compare` put pages together; `measure` is what
-training notes for them.
+`figures` reads a run, `svg` draws, `thumbnails` embeds, `page` and `compare` put pages together; `training.telemetry`
+is what training notes for them.
 """
 
 from __future__ import annotations
 
-import warnings
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from clsplat.gaussians import Gaussians
-    from clsplat.runs.run import Run
-    from clsplat.scenes.scene import Scene
-
 NAME = "report.html"
 """In a run's folder."""
-
-
-def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
-    """Write the report of a training that is done; trouble is a warning, as the model is there."""
-    try:
-        from clsplat.report.page import write_report
-
-        write_report(run, scene=scene, model=model)
-    except Exception as error:  # noqa: BLE001  # hours of training must not end as a failure for the sake of a page
-        why = " ".join(str(error).split()) or type(error).__name__
-        warnings.warn(f"no {NAME} ({why}); try again with: clsplat report {run.path}", stacklevel=2)

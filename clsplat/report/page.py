@@ -14,9 +14,9 @@ from markupsafe import Markup
 
 import clsplat
 from clsplat.errors import amount
-from clsplat.evaluation.held_out import background_colour
 from clsplat.files import atomic_write
 from clsplat.gaussians import Gaussians
+from clsplat.images.alpha import background_colour
 from clsplat.report import NAME, thumbnails
 from clsplat.report.figures import (
     CURVES,

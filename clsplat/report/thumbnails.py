@@ -16,15 +16,15 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
+from clsplat.arrays import Float32
 from clsplat.errors import ClsplatError, InputError
-from clsplat.evaluation.held_out import composite, picture_names
+from clsplat.evaluation.held_out import picture_names
 from clsplat.files import native_name
+from clsplat.images.alpha import composite
 from clsplat.images.colour import displayed, photos_space
 from clsplat.images.reading import downscale, error_of, read_image
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, View, detect, load_scene
-
-Float32 = NDArray[np.float32]
 
 MAX_SIDE = 640
 """Pixels of the longer side in a page."""

@@ -20,15 +20,14 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError, plain
 from clsplat.files import is_file, open_input
+from clsplat.rotations import rotation_from_quaternion
 from clsplat.scenes.lens import Lens, absurd, check_lens, models
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Value = TypeVar("Value")
 
 STEMS = ("cameras", "images", "points3D")
@@ -416,15 +415,3 @@ def _parsed(path: Path, number: int, expected: str, parse: Callable[[list[str]],
         return parse(words)
     except (ValueError, IndexError, OverflowError):
         raise InputError(f"{path}: line {number} does not read as {expected}; is the file cut or damaged?") from None
-
-
-def rotation_from_quaternion(quaternion: Float64) -> Float64:
-    """(3, 3) of a unit quaternion (4,), w x y z."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.config.training import Background
 from clsplat.errors import examples
-from clsplat.evaluation.held_out import background_colour, composite
+from clsplat.images.alpha import background_colour, composite
 from clsplat.scenes.lens import absurd
 
 if TYPE_CHECKING:

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import NEAR
 from clsplat.errors import InputError
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.spherical_harmonics import C0
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
-SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 INITIAL_OPACITY = 0.1
 MIN_SQUARED_DISTANCE = 1e-7
 """The authors' floor under the mean squared distance, which keeps points that coincide alive: world units squared in
@@ -27,8 +27,6 @@ LEAST_COLOUR = 1 / 512
 """Half a step of an 8 bit image. A channel that starts at 0 is at the clamp of colours, where it has no gradient, and
 rounding may keep it there for good."""
 NEIGHBOURS = 3
-
-Float64 = NDArray[np.float64]
 
 
 def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
@@ -77,7 +75,7 @@ def from_points(
     quaternions = np.zeros((count, 4), np.float32)
     quaternions[:, 0] = 1
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (np.maximum(rgb, LEAST_COLOUR) - 0.5) / SH_C0
+    sh[:, 0] = (np.maximum(rgb, LEAST_COLOUR) - 0.5) / C0
     return Gaussians(
         means=np.ascontiguousarray(xyz - origin, np.float32),
         quaternions=quaternions,
@@ -118,5 +116,5 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     points = low + rng.random((count, 3)) * (high - low)
-    colors = 0.5 + SH_C0 * rng.random((count, 3)) / 255
+    colors = 0.5 + C0 * rng.random((count, 3)) / 255
     return points, colors

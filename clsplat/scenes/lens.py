@@ -12,19 +12,18 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError, examples
-from clsplat.images.reading import associate, downscale, unassociate
+from clsplat.images.alpha import associate, unassociate
+from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
 
 with undisturbed():  # it says of a Ctrl-C that it is not installed, and puts a handler of SIGTERM that prints its stack
     import pycolmap
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 REFUSED = {"EQUIRECTANGULAR": "a panorama has no pinhole camera; cut it into perspective views first"}
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.evaluation.held_out import composite
+from clsplat.arrays import Float32, Float64
+from clsplat.images.alpha import composite
 
 if TYPE_CHECKING:
     from clsplat.camera import Camera
@@ -18,9 +19,6 @@ LONGEST = 400
 """Pixels of the photographs' longer side here: a point stands for a few of the full size."""
 UNSEEN = 0.5
 """Grey, for points that no photograph shows."""
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 def is_colourless(scene: Scene) -> bool:

@@ -13,19 +13,18 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, NEARS, Camera
-from clsplat.config.training import TEST_EVERY
+from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError, examples, plain
 from clsplat.files import digest, short_digest
 from clsplat.images.reading import companions, downscale, find_images, image_size, read_image, require_images
 from clsplat.scenes import colmap, transforms
 from clsplat.scenes.lens import Lens, undistort
+from clsplat.scenes.sfm import reconstruct
 from clsplat.scenes.transforms import Frame
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Kind = Literal["colmap", "blender", "transforms", "photos"]
 Split = Literal["train", "test"]
 Progress = Callable[[str, float | None], None]
@@ -302,8 +301,6 @@ def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = N
 
 
 def _reconstruct(path: Path, work_dir: Path | None, progress: Progress | None, heard: list[str]) -> Path:
-    from clsplat.scenes.sfm import reconstruct  # pulls in the whole of pycolmap's pipeline, for photos alone
-
     path = path.resolve()
     output = work_dir or path.with_name(f"{path.name}_colmap")
     with warnings.catch_warnings(record=True) as caught:

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import WINDOWS, is_file, native_name, require_room, room_error, write_error
-from clsplat.images.reading import cannot_be_searched, companions, error_of, jpeg_room, open_image
+from clsplat.images.reading import cannot_be_searched, companions, error_of, open_image
+from clsplat.images.writing import jpeg_room
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 """What pycolmap's wheel reads and writes; its OpenImageIO has no WebP, JPEG 2000 or HEIF."""

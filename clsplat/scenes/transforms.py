@@ -19,16 +19,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError, examples, plain
 from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.images.reading import EXTENSIONS, image_size, require_images
 from clsplat.models.formats import ply
 from clsplat.scenes.lens import Lens, absurd, check_lens
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 DRIVE = re.compile(r"\A[A-Za-z]:/")
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])

@@ -20,13 +20,14 @@ from clsplat.reference import project as reference_project
 from clsplat.reference.sort import depth_order
 from clsplat.selftest.scenes import Frozen
 from clsplat.stages.blend import Blended
+from clsplat.stages.device_camera import pack_camera, tiles_of
+from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.stages.duplicate import Band, Counted, Pairs
-from clsplat.stages.project import Projected, pack_camera, tiles_of, upload_gaussians
+from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists
 
 T = TypeVar("T")
 Array = NDArray[Any]
-Float64 = NDArray[np.float64]
 
 WHITEN = np.sqrt(0.5 * np.log2(np.e))
 MARGIN = 1e-4

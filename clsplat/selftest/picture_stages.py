@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera, Projection
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.layout import RAY
@@ -19,12 +20,13 @@ from clsplat.reference import every_pixel
 from clsplat.reference import rays as reference_rays
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
-from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Float64, Outcome, worst, wrong_counts
+from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, worst, wrong_counts
 from clsplat.stages.blend import Blended, blend
 from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
 from clsplat.stages.deep import deep
+from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.duplicate import count, duplicate
-from clsplat.stages.project import Projected, pack_camera, project
+from clsplat.stages.project import Projected, project
 from clsplat.stages.ranges import tile_lists
 
 ALL = Features.of(WIDTHS)

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.device.layout import TILE
 from clsplat.gaussians import Gaussians
-
-Float32 = NDArray[np.float32]
 
 STEPS = 1 << 12
 """Values between two ends."""

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.launch import launch_items
 from clsplat.device.layout import SLOT_PLAIN, SPLAT, TILE
+from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference import adam as reference_adam
 from clsplat.reference import blend as reference_blend
 from clsplat.reference import loss as reference_loss
@@ -21,25 +23,16 @@ from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
 from clsplat.reference.tiles import touched_tiles
-from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Float64, Outcome, worst, wrong_counts
+from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, worst, wrong_counts
 from clsplat.selftest.picture_stages import PICTURES
 from clsplat.selftest.scenes import evenly, keys
 from clsplat.stages.adam import adam
 from clsplat.stages.blend import blend, blend_grad
 from clsplat.stages.density import add_statistics, new_statistics
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.duplicate import Pairs, count, duplicate
 from clsplat.stages.loss import loss
-from clsplat.stages.project import (
-    GROUPS,
-    DeviceGaussians,
-    Projected,
-    Screen,
-    Slots,
-    allocate_gaussians,
-    group_shapes,
-    project,
-    project_grad,
-)
+from clsplat.stages.project import Projected, Screen, Slots, project, project_grad
 from clsplat.stages.ranges import tile_lists
 from clsplat.stages.sort import bitonic_sort, radix_sort
 

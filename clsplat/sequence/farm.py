@@ -17,22 +17,14 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import clsplat
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.sequence.frame_renderer import RenderOptions, Shader, Task, open_shader
-from clsplat.sequence.workers import (
-    HOST_BYTES,
-    Record,
-    Result,
-    encoded,
-    frame_bytes,
-    is_complete,
-    record_of,
-    remove_temporaries,
-    stamp,
-    video_frame,
-    write_frame,
-)
+from clsplat.files import digest
+from clsplat.gaussians import Gaussians
+from clsplat.sequence.existing import is_complete, remove_temporaries, stamp
+from clsplat.sequence.frame_renderer import Shader, open_shader
+from clsplat.sequence.task import Record, RenderOptions, Task
+from clsplat.sequence.workers import HOST_BYTES, Result, encoded, frame_bytes, record_of, video_frame, write_frame
 
 if TYPE_CHECKING:
     from clsplat.images.video import VideoWriter
@@ -77,9 +69,6 @@ class _Held:
     def shader_for(self, scene: Scene) -> Shader:
         key = (scene.model, scene.digest, scene.device, scene.memory_limit, repr(scene.options), repr(scene.rasterizer))
         if self.shader is None or key != self.key:
-            from clsplat.files import digest
-            from clsplat.gaussians import Gaussians
-
             self.key = self.shader = None  # its memory is free before the next takes some
             gaussians = Gaussians.load(scene.model)
             if (found := digest(scene.model)) != scene.digest:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from clsplat.images.channels import Encoding
+    from clsplat.config.pictures import Encoding
 
 SETTINGS = "clsplat:settings"
 """The attribute of EXR and PNG files that holds it."""

@@ -14,147 +14,29 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
-from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, SamplingConfig, VideoConfig
+from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig
 from clsplat.device.child import abandon
-from clsplat.errors import InputError, reason_of
-from clsplat.files import abandoned, is_file
+from clsplat.files import is_file
 from clsplat.images import channels as layers
-from clsplat.sequence.frame_renderer import RenderOptions, Shaded, Shader, Task, header, picture_camera, settings_digest
-from clsplat.sequence.settings_digest import SETTINGS
-from clsplat.shots import Shot
-from clsplat.shots.frame_numbers import output_paths
-from clsplat.shots.motion import camera_after, stretches
-
-if TYPE_CHECKING:
-    from clsplat.images.video import VideoWriter
+from clsplat.images.video import VideoWriter, frame_planes
+from clsplat.sequence.existing import MOST_WRITERS
+from clsplat.sequence.frame_renderer import Shaded, Shader
+from clsplat.sequence.task import Record, RenderOptions, Task, header, picture_camera
 
 Planes = NDArray[np.uint8]
 
 HOST_BYTES = 1 << 30
 """Main memory for frames that wait to be written, as a guide: three are held in any case."""
-MOST_WRITERS = 8
-WHAT_IT_IS = ("clsplat:model", "clsplat:colorspace")
-"""Attributes of a file that say whether it is the one that is wanted."""
 COPIES = 3
 """Of a frame, while it is encoded: as it was rendered, put together, converted."""
-
-
-@dataclass(frozen=True)
-class Record:
-    """What became of a frame. seconds: of rendering and writing it, without waiting; skipped: it was there; blank:
-    nothing of the model is in it, None where nobody looked; kernel_ms, transfer_ms: the device's, where that was asked
-    for."""
-
-    name: str
-    frame: int
-    path: str
-    width: int
-    height: int
-    seconds: float
-    skipped: bool = False
-    blank: bool | None = None
-    kernel_ms: float | None = None
-    transfer_ms: float | None = None
-
-    def document(self) -> dict[str, Any]:
-        """For JSON; without what was not measured."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
-
-
-def make_tasks(
-    chosen: Shot,
-    whole: Shot,
-    pattern: str,
-    resize: Callable[[Camera], Camera],
-    channels: Sequence[str],
-    sampling: SamplingConfig | None = None,
-) -> list[Task]:
-    """The frames of `chosen`, which are of the shot `whole`. Raises InputError for files that would be one, unless it
-    is a video, and for cameras that these channels, or the lens, are not defined for."""
-    sampling = sampling or SamplingConfig()
-    motion, moves = "motion" in channels, sampling.moves
-    chosen.check(channels)
-    if motion:
-        whole.check(channels)
-    at = {frame.number: index for index, frame in enumerate(whole.frames)}
-    if Path(pattern).suffix.lower() == layers.VIDEO:
-        paths = [Path(pattern)] * len(chosen.frames)
-    else:
-        paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
-    stretch = stretches(whole, resize, *sampling.shutter, motion=motion) if moves else lambda number: None
-    tasks = []
-    for frame, path in zip(chosen.frames, paths, strict=True):
-        camera = resize(frame.camera)
-        if sampling.has_lens and camera.projection != "perspective":
-            raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
-        after = None
-        if motion:
-            after = resize(camera_after(whole, at[frame.number])).resized(camera.width, camera.height)
-        tasks.append(Task(frame.number, frame.name, camera, path, after, stretch(frame.number)))
-    return tasks
-
-
-def check_folders(tasks: Sequence[Task]) -> None:
-    """Raise InputError where a file's folder is none, cannot be made or cannot be written to; makes nothing."""
-    for folder in sorted({task.path.parent for task in tasks}):
-        there = next(each for each in (folder, *folder.parents) if each.exists())
-        if not there.is_dir():
-            raise InputError(f"{there}: is a file, expected a folder to write {folder} to")
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(f"{there}: is not writable, expected a folder to write frames to")
-    for task in tasks:
-        if task.path.is_dir():
-            raise InputError(f"{task.path}: is a folder, expected the name of a file")
-
-
-def make_folders(tasks: Sequence[Task]) -> None:
-    """Make the files' folders. Raises InputError."""
-    for folder in sorted({task.path.parent for task in tasks}):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be made: {reason_of(error)}") from None
-
-
-def remove_temporaries(tasks: Sequence[Task]) -> None:
-    """Remove what a killed job has left of these files, and nothing that somebody still writes."""
-    for path in abandoned(task.path for task in tasks):
-        with suppress(OSError):
-            path.unlink()
-
-
-def is_complete(task: Task, options: RenderOptions) -> bool:
-    """Whether the frame's file is there: of its size, channels, model and settings, and readable to its end."""
-    told = {name: value for name, value in options.attributes.items() if name in WHAT_IT_IS}
-    told[SETTINGS] = settings_digest(task, options)
-    camera, deep = picture_camera(task, options), options.deep is not None
-    return layers.is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, told, deep=deep)
-
-
-def complete(tasks: Sequence[Task], options: RenderOptions) -> set[int]:
-    """The numbers of the frames that `--skip-existing` leaves out."""
-    with ThreadPoolExecutor(MOST_WRITERS) as pool:
-        return {
-            task.number
-            for task, whole in zip(tasks, pool.map(lambda task: is_complete(task, options), tasks), strict=True)
-            if whole
-        }
-
-
-def untold(tasks: Sequence[Task]) -> list[Path]:
-    """Those of the tasks' files that do not say with which settings they were made."""
-    with ThreadPoolExecutor(MOST_WRITERS) as pool:
-        said = pool.map(lambda task: layers.attribute(task.path, SETTINGS), tasks)
-        return [task.path for task, value in zip(tasks, said, strict=True) if value is None]
 
 
 def foreign(tasks: Sequence[Task]) -> list[Path]:
@@ -162,15 +44,6 @@ def foreign(tasks: Sequence[Task]) -> list[Path]:
     there = [task.path for task in tasks if is_file(task.path)]
     with ThreadPoolExecutor(MOST_WRITERS) as pool:
         return [path for path, others in zip(there, pool.map(layers.is_foreign, there), strict=True) if others]
-
-
-def stamp(path: Path) -> tuple[int, ...] | None:
-    """What tells a file from one that takes its place; None for no file."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_ino, found.st_mtime_ns, found.st_size
 
 
 def write_frame(task: Task, shaded: Shaded, options: RenderOptions) -> Record:
@@ -183,8 +56,6 @@ def write_frame(task: Task, shaded: Shaded, options: RenderOptions) -> Record:
 
 def video_frame(task: Task, shaded: Shaded, options: RenderOptions) -> tuple[Record, Planes]:
     """The frame as a video takes it."""
-    from clsplat.images.video import frame_planes
-
     start = time.monotonic()
     assert shaded.layers is not None, "frames of a video are not written one by one"
     planes = frame_planes(shaded.finish(shaded.layers)["rgb"])
@@ -336,7 +207,6 @@ def open_video(tasks: Sequence[Task], config: VideoConfig) -> Iterator[VideoWrit
     if not (tasks and tasks[0].is_video):
         yield None
         return
-    from clsplat.images.video import VideoWriter
 
     with VideoWriter(tasks[0].path, config) as video:
         yield video

@@ -9,17 +9,15 @@ from pathlib import Path
 from typing import Any, cast, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import LARGEST_FOCAL, Camera, Projection, focal_length
 from clsplat.errors import InputError
-from clsplat.scenes.colmap import rotation_from_quaternion
+from clsplat.rotations import rotation_from_quaternion
 from clsplat.scenes.transforms import Keys, numbers, short
 from clsplat.shots.keys import Key, interpolate
 from clsplat.shots.nerfstudio import image_side
 from clsplat.shots.shot import MOST_FRAMES, Frame, Shot
-
-Float64 = NDArray[np.float64]
 
 VERSION_KEY, VERSION = "clsplat_cameras", 1
 FOCAL = ("fx", "fy", "fov_x", "fov_y", "pixel_size")

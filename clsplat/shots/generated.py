@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera paths made from a scene's own cameras, of any number of frames. Turntables are in
-`clsplat.shots.viewpoints`."""
+"""Camera paths made from a scene's own cameras, of any number of frames."""
 
 from __future__ import annotations
 
@@ -9,14 +8,52 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.shots.keys import Key, interpolate
-from clsplat.shots.viewpoints import WIDEST_GAP, covered_arc, focus_point, look_at, turntable, up_axis
+from clsplat.shots.viewpoints import WIDEST_GAP, covered_arc, focus_point, look_at, up_axis
 
-Float64 = NDArray[np.float64]
+
+def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A closed camera path around what the cameras look at, `frames` views with the first camera's intrinsics.
+
+    It keeps the cameras' median distance and height. Where they stand all around it goes round once; where they
+    leave a wide gap it swings to and fro over the arc that they cover, as nobody has seen the rest. It begins near
+    the first camera. Raises ValueError for no cameras or no frames.
+    """
+    if not cameras or frames < 1:
+        raise ValueError(f"a turntable of {frames} frames from {len(cameras)} cameras: expected at least one of each")
+    up, focus = up_axis(cameras), focus_point(cameras)
+    offsets = np.stack([camera.position for camera in cameras]) - focus
+    heights = offsets @ up
+    level = offsets - heights[:, None] * up
+    aside = np.linalg.norm(level[0]) > 1e-9 * np.linalg.norm(offsets[0])
+    first = level[0] if aside else np.cross(up, cameras[0].rotation[0])
+    east = first / np.linalg.norm(first)
+    north = np.cross(up, east)
+    azimuths = np.arctan2(level @ north, level @ east)
+    radius, height = float(np.median(np.linalg.norm(level, axis=1))), float(np.median(heights))
+
+    time = np.arange(frames) / frames
+    begin, width = covered_arc(azimuths)
+    if 2 * np.pi - width <= WIDEST_GAP:
+        angles = 2 * np.pi * time
+    else:
+        # phase chosen so that the first frame is at azimuth 0, the first camera's
+        middle, half = begin + width / 2, width / 2
+        off = (-middle + np.pi) % (2 * np.pi) - np.pi
+        phase = np.arcsin(np.clip(off / half, -1, 1)) if half > 1e-6 else 0.0
+        angles = middle + half * np.sin(2 * np.pi * time + phase)
+    path = []
+    for angle in angles:
+        position = focus + height * up + radius * (np.cos(angle) * east + np.sin(angle) * north)
+        rotation, translation = look_at(position, focus, up)
+        path.append(replace(cameras[0], rotation=rotation, translation=translation))
+    return path
+
+
 PathName = Literal["turntable", "spiral", "through"]
 
 SPIRAL_TURNS = 2

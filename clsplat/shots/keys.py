@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
-
-Float64 = NDArray[np.float64]
 
 STEEPEST = 3.0
 """A tangent over the slope beside it. At 3 a cubic's inner Bezier points are a chord's length from its ends; for a

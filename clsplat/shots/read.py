@@ -8,7 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from clsplat.errors import InputError, examples
+from clsplat.scenes.colmap import find_model, read_cameras
+from clsplat.scenes.transforms import load_document, read_poses
+from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
+from clsplat.shots.generated import PATHS
+from clsplat.shots.nerfstudio import read_camera_path
 from clsplat.shots.shot import MOST_FRAMES, Shot, named, numbered
+from clsplat.shots.usd import read_usd
 
 COUNT = 120
 """Frames of a generated path: five seconds at 24 a second."""
@@ -34,8 +40,6 @@ def read_shot(path: Path, *, size: tuple[int | None, int | None] = (None, None),
     if path.is_dir():
         return _read_folder(path, size)
     if _is_usd(path):
-        from clsplat.shots.usd import read_usd
-
         return read_usd(path, size, usd_camera)
     if path.suffix.lower() == ".json":
         return _read_json(path, size)
@@ -62,8 +66,6 @@ def choose_shot(
         raise InputError(f"--count {count}: expected 1 to {MOST_FRAMES:,} frames")
     shot = read_shot(cameras, size=size, usd_camera=usd_camera)
     if path is not None:
-        from clsplat.shots.generated import PATHS
-
         if (kind := shot.frames[0].camera.projection) not in ("perspective", "orthographic"):
             raise InputError(f"{cameras}: its cameras are {kind}, --path needs perspective or orthographic ones")
         made = numbered(PATHS[path](shot.cameras, COUNT if count is None else count))
@@ -81,12 +83,8 @@ def _is_usd(path: Path) -> bool:
 
 
 def _read_folder(path: Path, size: tuple[int | None, int | None]) -> Shot:
-    from clsplat.scenes.colmap import read_cameras
-
     listed = sorted(each.name for each in path.glob("transforms*.json"))
     if listed:
-        from clsplat.scenes.colmap import find_model
-
         # a model below colmap/ beside a transforms.json is nerfstudio's, in a world that is not the file's
         model = find_model(path)
         if model is None or "colmap" in model.relative_to(path).parts:
@@ -100,10 +98,6 @@ def _read_folder(path: Path, size: tuple[int | None, int | None]) -> Shot:
 
 
 def _read_json(path: Path, size: tuple[int | None, int | None]) -> Shot:
-    from clsplat.scenes.transforms import load_document, read_poses
-    from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
-    from clsplat.shots.nerfstudio import read_camera_path
-
     document = load_document(path, "a file of cameras", f"'frames', 'camera_path' or '{VERSION_KEY}'")
     if VERSION_KEY in document:
         return read_keyed(path, document)

@@ -12,8 +12,8 @@ from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.stages.project import GROUPS, DeviceGaussians
-from clsplat.training.health import limit_of
+from clsplat.gaussians import GROUPS, limit_of
+from clsplat.stages.device_gaussians import DeviceGaussians
 
 REFUSED = ("parameters", "gradients", "moments", "steps")
 """Why the steps of elements were refused: what adam.cl counts."""

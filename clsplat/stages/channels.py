@@ -14,8 +14,9 @@ from clsplat.device.launch import launch_groups, launch_items
 from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
 from clsplat.stages.blend import Blended, tile_items
+from clsplat.stages.device_gaussians import AnyGaussians, parts
 from clsplat.stages.duplicate import Band
-from clsplat.stages.project import AnyGaussians, Projected, parts
+from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists
 
 WIDTHS = {"depth": 1, "normal": 3, "position": 3, "motion": 2}

@@ -9,22 +9,15 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.stages.project import (
-    AnyGaussians,
-    DeviceGaussians,
-    HostArray,
-    HostGaussians,
-    Projected,
-    Screen,
-    group_shapes,
-)
-
-Float32 = NDArray[np.float32]
+from clsplat.gaussians import group_shapes
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians
+from clsplat.stages.project import Projected, Screen
 
 NO_ROW = np.uint32(0xFFFFFFFF)
 """In a list of rows: a row of zeros."""

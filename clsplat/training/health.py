@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.gaussians import limit_of
+
 PATIENCE = 5
 """Troubled steps among the last WINDOW with which training goes back to a checkpoint."""
 WINDOW = 100
@@ -21,20 +23,11 @@ SMALLER = 0.5
 """What each return leaves of the learning rates, for the rest of the run."""
 MOST_LOST = 0.5
 """With more of its Gaussians broken a model is not mended: training goes back at once."""
-SH_LIMIT = 1e7
-"""No SH coefficient may be larger: a colour that project.cl does not draw for its size has one that is."""
-LIMIT = 1e19
-"""No parameter may be larger: its square is to be a float32."""
 KEPT = 1000
 """Gaussians of an incident of which a copy is kept."""
 
 Model = Mapping[str, NDArray[np.float32]]
 """Arrays by parameter group, the first axis of each being the Gaussians."""
-
-
-def limit_of(group: str) -> float:
-    """What the magnitudes of a group's parameters have to be under."""
-    return SH_LIMIT if group.startswith("sh_") else LIMIT
 
 
 @dataclass(frozen=True, eq=False)

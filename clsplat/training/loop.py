@@ -18,23 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.config.memory import parse_bytes
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.child import TrialInterrupted
 from clsplat.device.context import Device, open_device
 from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
-from clsplat.evaluation.held_out import background_colour, evaluate
+from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import Gaussians
+from clsplat.images.alpha import background_colour
 from clsplat.images.colour import photos_space
 from clsplat.process import Interrupted, endings
-from clsplat.rendering.memory_plan import Plan, parse_bytes
-from clsplat.rendering.rasterizer import Renderer
-from clsplat.report import write_last
+from clsplat.rendering.memory_plan import Plan
+from clsplat.rendering.renderer import Renderer
 from clsplat.runs import scene_record
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
 from clsplat.scenes.point_colours import is_colourless, photographed
+from clsplat.scenes.scene import Scene
 from clsplat.stages.loss import Loss
 from clsplat.training import telemetry
 from clsplat.training.health import RETURNS, WINDOW
@@ -42,7 +44,7 @@ from clsplat.training.repro import write_bundle
 from clsplat.training.trainer import Trainer, unusable
 
 if TYPE_CHECKING:
-    from clsplat.scenes.scene import Scene, View
+    from clsplat.scenes.scene import View
 
 REPORT_EVERY = 10
 """Steps between readings of the loss, which make host and device wait for each other."""
@@ -326,19 +328,7 @@ def train(
     on_plan: Callable[[Plan], None] | None = None,
     between: Between | None = None,
 ) -> Gaussians:
-    """Train on a scene; the model.
-
-    config: the run's, or the defaults, where it is not given; a run is told of another one. device: open, or as
-    `clsplat devices` names it; max_device_mem: at most so much of its memory, such as "256MiB". run: a folder for
-    metrics, checkpoints, held-out renders and the model, or None for none of them; resume: go on from the run's latest
-    checkpoint, without which a run that has been trained is refused; on_step: called every
-    REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes;
-    between: called before each step; it may render what the trainer has, and take its time, which is not counted.
-    Raises InputError for a scene without views, one that is not the resumed run's, and a run that another process
-    writes, ClsplatError where numbers are not finite again and again (docs/decisions/0016-never-a-nan.md; a warning
-    tells of what could be mended), and Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP after a
-    checkpoint has been written.
-    """
+    """As `clsplat.train`, without the report of the run."""
     config = _checked(scene, config, run, resume=resume)
     limit = parse_bytes(max_device_mem)
     opened = device if isinstance(device, Device) else open_device(device, limit)
@@ -361,8 +351,6 @@ def train(
 
 def _checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
     """The settings. Raises InputError where the arguments of `train` make no sense."""
-    from clsplat.scenes.scene import Scene
-
     for name, value, kind in (
         ("scene", scene, Scene),
         ("config", config, TrainConfig | None),
@@ -440,6 +428,4 @@ def _train(
         run.save_model(model, photos_space(view.path for view in scene.views))
         if scene.test_views:
             run.write_eval(session.evaluate(keep=True))
-        if config.report:
-            write_last(run, scene, model)
     return model

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray
+from clsplat.gaussians import GROUPS
 from clsplat.stages.adam import REFUSED
-from clsplat.stages.project import GROUPS, AnyGaussians
+from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training import health
 from clsplat.training.health import Incident, Patience
 

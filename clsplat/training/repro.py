@@ -31,11 +31,13 @@ from clsplat.device.context import Device, open_device
 from clsplat.device.layout import SPLAT, SlotFields
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import atomic_writer, parse_json
+from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.runs.run import config_text, parse_config, read_arrays
+from clsplat.runs.checkpoints import read_arrays
+from clsplat.runs.settings import config_text, parse_config
 from clsplat.stages.adam import REFUSED, adam
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.loss import loss
-from clsplat.stages.project import GROUPS, DeviceGaussians, allocate_gaussians, group_shapes
 from clsplat.stages.target import target
 from clsplat.training.density import adaptive
 from clsplat.training.health import Incident, finite_or_zero

@@ -19,7 +19,8 @@ from clsplat.device import cl
 from clsplat.device.context import Device
 from clsplat.device.layout import SlotFields
 from clsplat.errors import CapacityError
-from clsplat.stages.project import HostGaussians, add_slots
+from clsplat.stages.device_gaussians import HostGaussians
+from clsplat.stages.project import add_slots
 
 if TYPE_CHECKING:
     from clsplat.training.trainer import Trainer

@@ -18,11 +18,11 @@ from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.device.layout import SlotFields
 from clsplat.errors import ClsplatError, InputError
-from clsplat.evaluation.held_out import background_colour
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import GROUPS, Gaussians, group_shapes
+from clsplat.images.alpha import background_colour
 from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.runs.run import Checkpoint
+from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.initialise import from_scene
 from clsplat.stages.adam import adam, updates_sh_rest
 from clsplat.stages.density import (
@@ -35,18 +35,13 @@ from clsplat.stages.density import (
     try_gather,
     widen,
 )
-from clsplat.stages.loss import Loss, loss
-from clsplat.stages.project import (
-    GROUPS,
+from clsplat.stages.device_gaussians import (
     AnyGaussians,
     DeviceGaussians,
     HostArray,
     HostGaussians,
-    Projected,
-    Screen,
     allocate_gaussians,
     download_gaussians,
-    group_shapes,
     host_gaussians,
     host_zeros,
     parts,
@@ -54,41 +49,17 @@ from clsplat.stages.project import (
     to_host,
     upload_gaussians,
 )
+from clsplat.stages.loss import Loss, loss
+from clsplat.stages.project import Projected, Screen
 from clsplat.stages.target import target
 from clsplat.training.density import adaptive
 from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
+from clsplat.training.photographs import Photographs
 from clsplat.training.resolution import sizes_of
 
 if TYPE_CHECKING:
-    from clsplat.scenes.scene import Scene, View
-
-
-class Photographs:
-    """The training views' pixels at one resolution, decoded once each; uint8 where that holds them exactly."""
-
-    def __init__(self, views: list[View]) -> None:
-        self._views = views
-        self._factor = 0.0
-        self._held: dict[int, NDArray[Any]] = {}
-
-    def load(self, index: int, factor: float) -> NDArray[Any]:
-        """View `index` at 1/factor of its size, (H, W, 3 or 4), straight alpha."""
-        if factor != self._factor:
-            self._factor = factor
-            self._held.clear()
-        if index not in self._held:
-            camera = self._views[index].camera
-            image: NDArray[np.float32] = self._views[index].load(
-                max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
-            )
-            levels = np.rint(image * 255)
-            exact = (
-                np.array_equal((levels / np.float32(255)).astype(np.float32), image)
-                and 0 <= levels.min() <= levels.max() <= 255
-            )
-            self._held[index] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
-        return self._held[index]
+    from clsplat.scenes.scene import Scene
 
 
 _Moved = tuple[DeviceGaussians, DeviceGaussians, DeviceGaussians, DeviceGaussians]

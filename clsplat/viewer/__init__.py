@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The viewer: a page in the browser, whose picture the OpenCL device renders (docs/viewer.md).
 
-`session`, `look` and `recorder` are policy, without OpenCL and without viser; `viewing` shares the work of one thread
-among all who watch; `models` is what is looked at; `server` and `page` are what the browser gets, by viser.
+`pose`, `refinement`, `appearance` and `path_recorder` are policy, without OpenCL and without viser; `scheduler` shares
+the work of one thread among all who watch; `models` is what is looked at; `server` and `page` are what the browser
+gets, by viser.
 """

@@ -10,10 +10,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.gaussians import Gaussians
-from clsplat.images.reading import steps_of
+from clsplat.images.writing import steps_of
 
-Float32 = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Mode = Literal["colour", "depth", "alpha", "count"]
 MODES: tuple[Mode, ...] = get_args(Mode)

@@ -12,16 +12,18 @@ from dataclasses import replace
 from typing import Protocol
 
 from clsplat.camera import Camera
-from clsplat.config.training import PRESETS, RasterizerConfig
+from clsplat.config.presets import PRESETS
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.memory_needs import frame_pixels
-from clsplat.rendering.rasterizer import Rasterizer, Renderer
-from clsplat.stages.project import AnyGaussians
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.rendering.renderer import Renderer
+from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training.trainer import Trainer
 from clsplat.viewer.appearance import Image, Look, alpha_picture, colour_picture, count_picture, depth_picture, edited
-from clsplat.viewer.refinement import MOST_PIXELS
+from clsplat.viewer.pose import MOST_PIXELS
 
 HELD = 2
 """Models on the device: the one of the file, and one that is looked at in another way."""

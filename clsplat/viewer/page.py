@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One page of the viewer: its controls, and what they ask for. By viser; what they mean is in `look` and `recorder`."""
+"""One page of the viewer: its controls, and what they ask for. By viser; what they mean is in `appearance`."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clsplat.errors import ClsplatError, InputError, plain
+from clsplat.rotations import quaternion_of
 from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
 from clsplat.viewer.path_recorder import FPS, Recorder, save_path
-from clsplat.viewer.refinement import LARGEST_SIDE, MOST_PIXELS, Level, quaternion_of
+from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS
+from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
 
 if TYPE_CHECKING:
@@ -46,7 +48,7 @@ class ViserPage:
         self._drawing, self._drawn = 0, threading.Lock()
 
     def show(self, image: Image, level: Level, text: str) -> None:
-        """As `viewing.Page` has it."""
+        """As `scheduler.Page` has it."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
         if self._shown == 2:  # controls keep a browser busy: they may not come before the first picture
@@ -56,7 +58,7 @@ class ViserPage:
             self._say(", ".join(filter(None, (f"{width} x {height}, exact", text))))
 
     def tell(self, message: str) -> None:
-        """As `viewing.Page` has it."""
+        """As `scheduler.Page` has it."""
         self._build()
         self.client.add_notification("clsplat", plain(message), auto_close_seconds=10.0)
         self._say(plain(message))

@@ -10,7 +10,8 @@ from typing import Any
 
 from clsplat.errors import InputError
 from clsplat.files import atomic_write
-from clsplat.viewer.refinement import Pose, quaternion_of
+from clsplat.rotations import quaternion_of
+from clsplat.viewer.pose import Pose
 
 MOST_KEYS = 10_000
 MOST_FILES = 10_000

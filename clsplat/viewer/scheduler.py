@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Protocol
 
 from clsplat.errors import ClsplatError
 from clsplat.viewer.appearance import Image, Look
-from clsplat.viewer.refinement import Level, Pose, Refinement, Share, fitted
+from clsplat.viewer.pose import Pose, fitted
+from clsplat.viewer.refinement import Level, Refinement, Share
 
 if TYPE_CHECKING:
     from clsplat.viewer.models import Model

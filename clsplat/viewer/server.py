@@ -23,17 +23,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from clsplat.config.training import HOST, PORT
+from clsplat.arrays import Float64
+from clsplat.config.verbs import HOST, PORT
 from clsplat.errors import InputError, plain
-from clsplat.viewer.refinement import Start, read_pose
+from clsplat.viewer.page import ViserPage
+from clsplat.viewer.pose import Start, read_pose
 from clsplat.viewer.scheduler import Viewing
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import View
 
-Float64 = NDArray[np.float64]
 LOCAL = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
 """What a server for this machine alone may be asked for as."""
 FAR = 1000.0
@@ -110,8 +110,6 @@ class Server:
     """
 
     def __init__(self, viewing: Viewing, world: World, address: Address, *, training: bool = False) -> None:
-        from clsplat.viewer.page import ViserPage
-
         address.check()
         import viser
 

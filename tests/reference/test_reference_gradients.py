@@ -13,6 +13,7 @@ import scenes
 from compare import assert_close, assert_close_gradient
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.adam import adam
@@ -20,10 +21,10 @@ from clsplat.reference.blend import ALPHA_MAX, blend, blend_grad, footprint
 from clsplat.reference.loss import l1_dssim
 from clsplat.reference.project import ALPHA_MIN, conic_grad, covariance_grad, frustum_limits, project, project_grad
 from clsplat.reference.render import forward, parameters, render_grad
-from clsplat.reference.sh import sh_basis, sh_basis_grad
+from clsplat.reference.sh import sh_basis_grad
 from clsplat.reference.sort import depth_order
+from clsplat.spherical_harmonics import sh_basis
 
-Float64 = NDArray[np.float64]
 Arrays = dict[str, Float64]
 
 BACKGROUND = (0.2, 0.6, 0.4)

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from quick import quick
 
 from clsplat.camera import Camera
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, all_devices, open_device
 from clsplat.device.layout import SPLAT, TILE, SlotFields
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.rasterizer import Frame, Rasterizer
-from clsplat.stages.project import DeviceGaussians, Screen, allocate_gaussians, download_gaussians, upload_gaussians
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, download_gaussians, upload_gaussians
+from clsplat.stages.project import Screen
 
 BACKGROUND = (0.1, 0.2, 0.3)
 

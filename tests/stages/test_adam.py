@@ -10,9 +10,10 @@ from compare import assert_close
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
+from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference.adam import adam as reference
 from clsplat.stages.adam import adam
-from clsplat.stages.project import GROUPS, allocate_gaussians, group_shapes
+from clsplat.stages.device_gaussians import allocate_gaussians
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 100])

@@ -10,14 +10,15 @@ from pipeline import BACKGROUND, Pipeline
 from quick import quick
 from scenes import NAMED, SHAPE_MATTERS, overlap, random_cloud
 
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
+from clsplat.gaussians import GROUPS
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import count_pairs
+from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.stages.duplicate import Band
-from clsplat.stages.project import GROUPS, allocate_gaussians, upload_gaussians
 
 
 def most_in_a_tile(run: Pipeline) -> int:

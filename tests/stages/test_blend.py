@@ -11,14 +11,14 @@ import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
 from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.reference import render as reference
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import blend_grad
-from clsplat.stages.project import upload_gaussians
+from clsplat.stages.device_gaussians import upload_gaussians
 
 SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
 

@@ -19,7 +19,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference import channels as twin
 from clsplat.reference import render as reference
 from clsplat.stages.channels import Features, channels, features
-from clsplat.stages.project import pack_camera
+from clsplat.stages.device_camera import pack_camera
 
 ALL = Features.of(("normal", "position", "motion"))
 SCENES = {

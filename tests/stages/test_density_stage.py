@@ -13,10 +13,11 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import GROUPS, Gaussians, group_shapes
 from clsplat.reference import render as reference
 from clsplat.stages.density import NO_ROW, add_statistics, gather, new_statistics, widen
-from clsplat.stages.project import GROUPS, DeviceGaussians, Projected, Screen, group_shapes
+from clsplat.stages.device_gaussians import DeviceGaussians
+from clsplat.stages.project import Projected, Screen
 
 SIZES = (1, 2, 63, 64, 65, 127, 129, 1025)
 """A launch is rounded up to groups of 64."""

@@ -9,7 +9,7 @@ import scenes
 from pipeline import Pipeline
 from quick import quick
 
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT

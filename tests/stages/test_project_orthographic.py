@@ -15,7 +15,7 @@ from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 
 from clsplat.camera import Camera
 from clsplat.config.pictures import DeepConfig
-from clsplat.config.training import RasterizerConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep
@@ -25,7 +25,7 @@ from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
 from clsplat.reference.cameras import pixel_from_world
 from clsplat.reference.project import rotation_matrices
-from clsplat.rendering.rasterizer import ChannelResult, Renderer, RenderResult
+from clsplat.rendering.renderer import ChannelResult, Renderer, RenderResult
 
 FEATURES = ("normal", "position", "motion")
 

@@ -17,7 +17,7 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.reference import every_pixel
-from clsplat.rendering.rasterizer import ChannelResult, Renderer
+from clsplat.rendering.renderer import ChannelResult, Renderer
 
 
 def all_around(count: int, seed: int) -> Gaussians:

@@ -4,14 +4,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import transform
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Signs = tuple[int, int, int]
 
 UP_BACK: Signs = (1, -1, -1)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-Float32 = NDArray[np.float32]
+from clsplat.arrays import Float32
 
 SAMPLES = 1 << 16
 LLOYD_STEPS = 20

@@ -12,12 +12,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.reference.sh import C0
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
+from clsplat.spherical_harmonics import C0
 
 BLOCK_ROWS = 1 << 15
 LEAST_SCALE = 2.0**-149

@@ -49,7 +49,7 @@ from clsplat.models.codec.gltf_asset import (
 from clsplat.models.codec.values import BLOCK_ROWS
 from clsplat.models.edit import merge
 from clsplat.models.formats import spz
-from clsplat.reference.sh import C0
+from clsplat.spherical_harmonics import C0
 
 NAME = "glTF"
 SUFFIXES = (".gltf", ".glb")

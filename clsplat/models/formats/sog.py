@@ -31,6 +31,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError, plain
 from clsplat.files import (
     MAX_DOCUMENT,
@@ -55,8 +56,6 @@ LOSES = "positions to 16 bits, the rest to 8, spherical harmonics to a palette"
 FLOAT = False
 
 Bytes = NDArray[np.uint8]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 Progress = Callable[[str, float | None], None]
 

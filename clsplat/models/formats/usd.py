@@ -27,8 +27,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.errors import InputError, plain
 from clsplat.files import atomic_writer, native_name, open_input, scratch_folder
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
@@ -48,8 +48,6 @@ COEFFICIENTS, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphe
 MOST_LEVELS = 5000
 """Braces in a text: under 20,000 levels of prims USD's stack of 8 MiB is enough."""
 WORLD, PRIM = "/World", "/World/Gaussians"
-
-Float32 = NDArray[np.float32]
 
 
 def _pxr(path: Path) -> Any:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.config.training import DensityConfig
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat.train`: the training, and the report of its run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.gaussians import Gaussians
+from clsplat.rendering.memory_plan import Plan
+from clsplat.report.last import write_last
+from clsplat.runs.locks import locked
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene
+from clsplat.training import loop
+from clsplat.training.loop import Between, StepReport
+
+
+def train(
+    scene: Scene,
+    config: TrainConfig | None = None,
+    *,
+    device: Device | str | None = None,
+    max_device_mem: str | int | None = None,
+    run: Run | None = None,
+    resume: bool = False,
+    on_step: Callable[[StepReport], None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
+    between: Between | None = None,
+) -> Gaussians:
+    """Train on a scene; the model.
+
+    config: the run's, or the defaults, where it is not given; a run is told of another one. device: open, or as
+    `clsplat devices` names it; max_device_mem: at most so much of its memory, such as "256MiB". run: a folder for
+    metrics, checkpoints, held-out renders and the model, or None for none of them; resume: go on from the run's latest
+    checkpoint, without which a run that has been trained is refused; on_step: called every
+    REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes;
+    between: called before each step; it may render what the trainer has, and take its time, which is not counted.
+    Raises InputError for a scene without views, one that is not the resumed run's, and a run that another process
+    writes, ClsplatError where numbers are not finite again and again (docs/decisions/0016-never-a-nan.md; a warning
+    tells of what could be mended), and Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP after a
+    checkpoint has been written.
+    """
+    config = config or TrainConfig()
+    with nullcontext() if run is None else locked(run.path, "train"):
+        model = loop.train(
+            scene,
+            config,
+            device=device,
+            max_device_mem=max_device_mem,
+            run=run,
+            resume=resume,
+            on_step=on_step,
+            on_plan=on_plan,
+            between=between,
+        )
+        if run is not None and config.report:
+            write_last(run, scene, model)
+    return model

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is measured: a made-up scene, a model or a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.gaussians import Gaussians
+from clsplat.models.formats import is_model_name
+from clsplat.runs.run import Run, is_run
+from clsplat.scenes.initialise import from_scene
+from clsplat.scenes.scene import load_scene
+
+Progress = Callable[[str, float | None], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What is measured: a model, a view of it, and the photograph (H, W, 3) uint8 that a training step compares with,
+    or None for one made up from the frame itself."""
+
+    name: str
+    gaussians: Gaussians
+    camera: Camera
+    photograph: NDArray[np.uint8] | None = None
+
+
+def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Subject:
+    """A made-up scene, the same every time; as it stands 1.0 M (tile, Gaussian) pairs, 56 M (Gaussian, pixel) ones."""
+    rng = np.random.default_rng(0)
+    focal = 0.9 * width
+    camera = Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), np.zeros(3))
+    depths = rng.uniform(2.0, 10.0, (count, 1))
+    pixels = rng.uniform(-0.05, 1.05, (count, 2)) * (width, height)
+    means = np.concatenate([(pixels - (camera.cx, camera.cy)) / focal * depths, depths], axis=1)
+    sizes = 1.5 * np.sqrt(width * height / count)
+    sizes = sizes * np.exp(rng.normal(0.0, 0.5, (count, 1)) + rng.normal(0.0, 0.5, (count, 3)))
+    opacities = 0.005 + 0.99 * rng.beta(0.6, 0.8, count)
+    sh = rng.normal(0.0, 0.1, (count, 16, 3))
+    sh[:, 0] = rng.uniform(-1.5, 1.5, (count, 3))
+    arrays = (
+        means,
+        rng.normal(size=(count, 4)),
+        np.log(sizes * depths / focal),
+        np.log(opacities) - np.log1p(-opacities),
+        sh,
+    )
+    means32, quaternions, log_scales, logits, coefficients = (
+        np.ascontiguousarray(array, np.float32) for array in arrays
+    )
+    gaussians = Gaussians(means32, quaternions, log_scales, logits, coefficients)
+    return Subject("synthetic", gaussians, camera)
+
+
+def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Progress | None = None) -> Subject:
+    """A run: its model from the first view of its scene. A model file: as a run's, if it lies in one, else from a
+    camera in front of it. A scene: the Gaussians that training starts from. Raises InputError."""
+    run = next((Run.open(folder) for folder in (path, path.parent) if is_run(folder)), None)
+    if run is not None and (path.is_dir() or path == run.model_path):
+        gaussians = Gaussians.load(run.model_path)
+        if run.scene is None or not run.scene.exists():
+            return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
+        config = run.config
+        scene = load_scene(run.scene, resolution=config.resolution, test_every=config.test_every, progress=progress)
+    elif is_model_name(path):
+        gaussians = Gaussians.load(path)
+        return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
+    else:
+        scene = load_scene(path, progress=progress)
+        gaussians = from_scene(scene, TrainConfig().random_points, np.random.default_rng(0))
+    view = (scene.train_views or scene.views)[0]
+    camera = view.camera.resized(*size) if size else view.camera
+    pixels = view.load(camera.width, camera.height)[:, :, :3]
+    camera, gaussians = gaussians.local(camera), replace(gaussians, origin=np.zeros(3))
+    return Subject(str(path), gaussians, camera, np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
+
+
+def facing(gaussians: Gaussians, width: int, height: int) -> tuple[Gaussians, Camera]:
+    """The Gaussians, their means counted from where they are, and a camera with the world's axes that has nine tenths
+    of them in its image."""
+    low, middle, high = np.quantile(gaussians.means.astype(np.float64), (0.05, 0.5, 0.95), axis=0)
+    focal = 0.9 * width
+    half = np.maximum(high - middle, middle - low)
+    distance = max(float(np.max(2 * focal * half[:2] / (width, height))) + float(half[2]), 0.1)
+    position = middle - np.array([0.0, 0.0, distance])
+    camera = Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), -position)
+    return replace(gaussians, origin=np.zeros(3)), camera

@@ -1,0 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m clsplat.cli`, which is `python -m clsplat`."""
+
+from __future__ import annotations
+
+import sys
+
+if __name__ == "__main__":  # python -m clsplat.cli
+    from clsplat.__main__ import main as whole
+
+    sys.exit(whole())

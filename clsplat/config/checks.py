@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rules for settings, and the message where one is broken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+from numbers import Integral, Real
+from typing import Literal, get_args, get_origin, get_type_hints
+
+from clsplat.errors import InputError
+
+MOST = 1 << 62
+"""Below which whole numbers are, so that TOML has room for them."""
+Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
+"""Names of settings, whether a value makes sense (which NaN must not), and what is expected."""
+
+
+def check_rules(config: object, prefix: str, rules: tuple[Rule, ...]) -> None:
+    """Raise InputError naming the flag of the first setting that breaks its rule."""
+    for names, makes_sense, expected in rules:
+        for name in names:
+            value = getattr(config, name)
+            if not makes_sense(value):
+                raise InputError(f"{prefix}{name.replace('_', '-')} {value}: expected {expected}")
+
+
+def check_kinds(config: object, prefix: str) -> None:
+    """Raise InputError naming the flag of the first setting that is of another kind than its field, which Python lets
+    through, or larger than config.toml can hold."""
+    for name, kind in get_type_hints(type(config)).items():
+        value = getattr(config, name)
+        if get_origin(kind) is Literal:
+            fits, expected = isinstance(value, str) and value in get_args(kind), f"one of {', '.join(get_args(kind))}"
+        elif get_origin(kind) is tuple:
+            fits = isinstance(value, tuple | list) and all(_is_whole(step) for step in value)
+            expected = f"whole numbers below {MOST}"
+        elif kind is int:
+            fits, expected = _is_whole(value), f"a whole number below {MOST}"
+        elif kind is float:
+            fits = isinstance(value, Real) and not _is_truth(value) and not 1e300 <= abs(float(value)) < inf
+            expected = "a number below 1e300"
+        else:
+            fits = _is_truth(value) if kind is bool else isinstance(value, kind)
+            expected = "True or False" if kind is bool else f"{kind.__name__}(...)"
+        if not fits:
+            text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+            raise InputError(f"{prefix}{name.replace('_', '-')} {text:.100}: expected {expected}")
+
+
+def _is_truth(value: object) -> bool:
+    return type(value).__name__ in ("bool", "bool_")  # NumPy's has had both names
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, Integral) and not _is_truth(value) and abs(int(value)) < MOST
+
+
+def check_steps(flag: str, steps: tuple[int, ...]) -> None:
+    """Raise InputError unless the steps are from 1 up and in order."""
+    if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
+        raise InputError(f"{flag} {','.join(map(str, steps))}: expected steps from 1 up, in order")

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bundles of settings: presets of the rasterizer, schedules of a training."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
+
+Preset = Literal["exact", "default", "fast"]
+Schedule = Literal["paper", "short"]
+PRESETS: dict[Preset, RasterizerConfig] = {
+    "exact": RasterizerConfig(),
+    "default": RasterizerConfig(),
+    "fast": RasterizerConfig(alpha_min=2 / 255, transmittance_min=1e-3),
+}
+"""exact: nothing approximate; default: what is on unless asked for, equal to exact as long as every default has an
+error of zero; fast: approximations that are worth their error (docs/performance.md)."""
+
+
+def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
+    """What `clsplat train --schedule` starts from.
+
+    paper: the defaults, made for 30,000 steps, whatever `iterations` is. short: for runs of about 7000 steps, in which
+    the paper's rates leave a model unfinished: colours, opacities and rotations learn faster, SH degrees come twice as
+    fast, the means' rate has fallen at the end, density control ends at five sevenths, and the last seventh cools down
+    (docs/decisions/0013-a-short-schedule.md).
+    """
+    if schedule == "paper":
+        return TrainConfig(iterations=iterations)
+    return TrainConfig(
+        iterations=iterations,
+        sh_degree_every=500,
+        optimiser=OptimiserConfig(
+            means_rate_steps=max(iterations, 1),
+            sh_dc_rate=4e-3,
+            sh_rest_rate=4e-4,
+            opacities_rate=0.05,
+            quaternions_rate=2e-3,
+            cooldown=max(iterations // 7, 0),
+            cooldown_to=0.2,
+        ),
+        density=DensityConfig(stop=max(5 * iterations // 7, 0)),
+    )
+
+
+def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> TrainConfig:
+    """What `clsplat train --preset --schedule --iterations` start from.
+
+    fast trains less: on pictures of a quarter of the size for a fourteenth of the steps and of half the size until two
+    sevenths, with fewer Gaussians, those dropped that add less than a tenth of a pixel to every view, the rates of the
+    short schedule with those of means, scales and rotations up to four times higher, and the higher SH bands in every
+    second step (docs/decisions/0015-the-fast-preset.md).
+    """
+    config = scheduled(schedule or ("short" if preset == "fast" else "paper"), iterations)
+    config = replace(config, rasterizer=PRESETS[preset])
+    if preset != "fast":
+        return config
+    optimiser = config.optimiser
+    return replace(
+        config,
+        warmup=tuple(sorted({max(iterations // 14, 1), max(2 * iterations // 7, 1)})),
+        optimiser=replace(
+            optimiser,
+            means_rate=2 * optimiser.means_rate,
+            scales_rate=4 * optimiser.scales_rate,
+            quaternions_rate=2 * optimiser.quaternions_rate,
+            sh_rest_every=2,
+        ),
+        density=replace(config.density, gradient_threshold=3e-4, min_contribution=0.1),
+    )

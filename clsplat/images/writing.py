@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures to files: whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NoReturn
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.errors import ClsplatError, InputError, WriteError, plain
+from clsplat.files import is_file, native_name, replace, require_room, room_error, temporary_name, write_error
+from clsplat.images.alpha import associate, unassociate
+from clsplat.images.reading import one_line, png_is_whole
+
+Metadata = Mapping[str, str | int | float]
+CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+
+
+def write_image(
+    path: Path,
+    image: NDArray[Any],
+    metadata: Metadata | None = None,
+    *,
+    alpha: Literal["straight", "associated"] = "straight",
+    half: bool = False,
+) -> None:
+    """Write a picture, atomically: 8-bit PNG or float EXR, by the extension.
+
+    image (H, W) or (H, W, C), C = 1, 3 or 4; floats, in a PNG clipped to [0, 1] and rounded, or uint8. alpha: what
+    kind of RGBA is given; the file gets what its format wants. half: 16-bit floats in the EXR. metadata goes into the
+    header under its own names. Raises InputError for another extension or a folder that does not exist, ClsplatError
+    if writing fails (disk full); the previous file is whole then, and no temporary file is left.
+    """
+    path = Path(path)
+    extension = path.suffix.lower()
+    if extension not in (".png", ".exr"):
+        raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected .png or .exr")
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such folder to write {path.name} to")
+    pixels = np.asarray(image)
+    pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    if pixels.ndim != 3 or pixels.shape[2] not in CHANNEL_NAMES or 0 in pixels.shape:
+        raise ValueError(f"image {np.shape(image)}: expected (H, W), (H, W, 1), (H, W, 3) or (H, W, 4)")
+    if pixels.dtype == np.uint8:
+        pixels = pixels.astype(np.float32) / np.float32(255)
+    pixels = pixels.astype(np.float32)
+
+    is_png = extension == ".png"
+    if pixels.shape[2] == 4 and (alpha == "straight") != is_png:
+        pixels = unassociate(pixels) if is_png else associate(pixels)
+    if is_png:
+        pixels = steps_of([pixels], 8)
+    height, width, channels = pixels.shape
+    kind = oiio.UINT8 if is_png else oiio.HALF if half else oiio.FLOAT
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec.channelnames = CHANNEL_NAMES[channels]
+    if is_png:
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+    for name, value in (metadata or {}).items():
+        spec.attribute(name, value)
+    write_spec(path, [np.ascontiguousarray(pixels)], [spec], extension[1:])
+
+
+def steps_of(planes: Sequence[NDArray[Any]], bits: int) -> NDArray[Any]:
+    """Channels side by side as whole numbers, 0 to 1 as 0 to the largest; NaN as 0. A channel at a time, as they come
+    from the device as planes, and a pass over interleaved ones takes several times as long."""
+    height, width = planes[0].shape[:2]
+    whole = np.empty((height, width, sum(plane.shape[2] for plane in planes)), np.uint8 if bits == 8 else np.uint16)
+    scratch = np.empty((height, width), np.float32 if bits == 8 else np.float64)  # a float32 rounds 16 bits twice
+    most = scratch.dtype.type(2**bits - 1)
+    channels = (plane[:, :, channel] for plane in planes for channel in range(plane.shape[2]))
+    for at, channel in enumerate(channels):
+        np.fmin(np.fmax(channel, 0, out=scratch), 1, out=scratch)
+        np.multiply(scratch, most, out=scratch)
+        whole[:, :, at] = np.rint(scratch, out=scratch)
+    return whole
+
+
+def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], kind: str) -> None:
+    """Write a file of one part or several, (H, W, C) each with its OpenImageIO specification, atomically.
+
+    Raises ClsplatError if writing fails."""
+    with atomic_output(path, specs, kind) as output:
+        for index, pixels in enumerate(parts):
+            if index > 0:
+                output.take(output.file.open(output.name, specs[index], "AppendSubimage"))
+            output.take(output.file.write_image(pixels))
+
+
+def _is_whole(path: Path, kind: str, parts: int) -> bool:
+    """Whether the end of a picture that has been written is there: the last chunk of a PNG, the last row of others."""
+    if kind == "png":
+        return png_is_whole(path)
+    source = oiio.ImageInput.open(native_name(path))
+    if source is None:
+        oiio.geterror()
+        return False
+    try:
+        for part in range(parts):
+            if not source.seek_subimage(part, 0):
+                return False
+            spec = source.spec()
+            read = source.read_native_deep_scanlines if spec.deep else source.read_scanlines
+            last = spec.y + spec.height - 1
+            values = read(part, 0, last, last + 1, 0, 0, spec.nchannels, *(() if spec.deep else (oiio.FLOAT,)))
+            if values is None or source.geterror():
+                return False
+        return True
+    finally:
+        source.geterror()
+        source.close()
+
+
+def jpeg_room(spec: Any) -> int:
+    """More bytes than a JPEG of that size has."""
+    return int(spec.width * spec.height * spec.nchannels * 5 // 4) + (1 << 16)
+
+
+@dataclass(frozen=True, eq=False)
+class Output:
+    """file: OpenImageIO's, open under the temporary name `temporary`."""
+
+    file: Any
+    temporary: Path
+    path: Path
+
+    @property
+    def name(self) -> str:
+        """The temporary name as OpenImageIO takes it."""
+        return native_name(self.temporary)
+
+    def take(self, done: bool) -> None:
+        """What the file's methods give. Raises WriteError or ClsplatError where that is failure."""
+        if not done:
+            self.fail(self.file.geterror())
+
+    def fail(self, reason: str) -> NoReturn:
+        """Raise WriteError where the system refuses to write, else ClsplatError: OpenImageIO seldom says which."""
+        written = self.temporary.stat().st_size if is_file(self.temporary) else 0
+        if error := room_error(self.temporary.parent):
+            self.file.close()
+            with suppress(OSError):  # so that the message has what is free without it
+                self.temporary.unlink()
+            raise write_error(self.path, error, written) from None
+        raise ClsplatError(f"{self.path}: cannot be written: {plain(one_line(reason))}")
+
+
+@contextmanager
+def atomic_output(path: Path, specs: Sequence[Any], kind: str) -> Iterator[Output]:
+    """A file to write that takes the place of `path` when the block ends well, and never exists otherwise.
+
+    specs: of its parts; raises ClsplatError if writing fails."""
+    # Not through files.atomic_writer: OpenImageIO writes to a name, not to an open file.
+    target = Path(os.path.realpath(path))
+    temporary = temporary_name(target)
+    output = Output(oiio.ImageOutput.create(kind), temporary, path)
+    # libjpeg ends the process when it cannot write
+    most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        with require_room(path, most):
+            # several parts have to be announced together
+            output.take(output.file.open(output.name, specs[0] if len(specs) == 1 else tuple(specs)))
+            yield output
+            output.take(output.file.close())
+        if not _is_whole(temporary, kind, len(specs)):  # the last bytes of a full disk are lost without a word
+            output.fail("the file is not whole")
+        replace(temporary, target)
+    except WriteError:
+        raise
+    except OSError as error:
+        raise write_error(path, error) from None
+    finally:
+        output.file.close()
+        with suppress(OSError):  # it is gone if all went well
+            temporary.unlink()

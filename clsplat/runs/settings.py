@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings as config.toml, and back."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from dataclasses import asdict, fields, is_dataclass
+from difflib import get_close_matches
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+import numpy as np
+import tomli_w
+
+import clsplat
+from clsplat.config.training import TrainConfig
+from clsplat.errors import InputError, plain
+from clsplat.files import read_document
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+MAX_SETTINGS, MAX_METRICS, MAX_LINE = 1 << 20, 64 << 20, 1 << 16
+"""Bytes of config.toml, of metrics.jsonl, hundreds of times what the longest training writes, and of a line of it."""
+T = TypeVar("T")
+RETIRED: dict[str, Any] = {"train.rasterizer.sh_angle": 0.0}
+"""Settings that earlier versions had, and the value of each with which it did nothing."""
+
+
+def config_text(config: TrainConfig, scene: Path | None) -> str:
+    """The content of config.toml."""
+    document: dict[str, Any] = {"clsplat": clsplat.__version__}
+    if scene is not None:
+        document["scene"] = str(scene)
+    document["train"] = _of_python(asdict(config))
+    return tomli_w.dumps(document)
+
+
+def _of_python(value: Any) -> Any:
+    """Settings without NumPy's numbers, which TOML does not know."""
+    if isinstance(value, dict):
+        return {key: _of_python(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_of_python(each) for each in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
+    """The configuration and the scene's path. Raises InputError naming the file and the key that is wrong."""
+    return parse_config(read_document(path, "the settings of a run", MAX_SETTINGS), path)
+
+
+def parse_config(text: str, path: Path, *, tell: bool = True) -> tuple[TrainConfig, Path | None]:
+    """As `read_config`, of the file's text; tell: warn of settings that there are no more."""
+    try:
+        document = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable as TOML ({error})") from None
+    for key in document:
+        if key not in ("clsplat", "scene", "train"):
+            raise InputError(
+                f"{path}: has {key!r}, which is no setting; expected clsplat, scene and the tables of train"
+            )
+    scene = document.get("scene")
+    if scene is not None and not (isinstance(scene, str) and scene):
+        raise InputError(f"{path}: scene is {scene!r}, expected the scene's path as text")
+    config = _from_table(TrainConfig, document.get("train", {}), path, "train", tell=tell)
+    try:
+        config.check()
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return config, Path(scene) if scene is not None else None
+
+
+def _from_table(cls: type[T], table: Any, path: Path, where: str, *, tell: bool) -> T:
+    """An instance of the dataclass `cls`; keys that are not there keep their defaults."""
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: {where} is {table!r}, expected a table")
+    types = get_type_hints(cls)
+    names = [f.name for f in fields(cls)]  # type: ignore[arg-type]  # every caller passes a dataclass
+    values = {}
+    for key, value in table.items():
+        if (name := f"{where}.{key}") in RETIRED:
+            if value != RETIRED[name] and tell:
+                _tell_retired(path, name, repr(value))
+            continue
+        if key not in names:
+            raise InputError(f"{path}: [{where}] has {key!r}, which is no setting there; {_meant(key, where)}")
+        if is_dataclass(types[key]):
+            values[key] = _from_table(types[key], value, path, f"{where}.{key}", tell=tell)
+        else:
+            values[key] = _value(types[key], value, f"{path}: {where}.{key}")
+    return cls(**values)
+
+
+def _meant(key: str, where: str) -> str:
+    """Where a setting of that name, or one like it, belongs."""
+    tables = {"train": TrainConfig} | {
+        f"train.{name}": kind for name, kind in get_type_hints(TrainConfig).items() if is_dataclass(kind)
+    }
+    places = {f.name: table for table, kind in reversed(tables.items()) for f in fields(kind)}
+    if key in places:
+        return f"it belongs to [{places[key]}]"
+    here = [name for name, table in places.items() if table == where]
+    near = get_close_matches(key, here, 1) or get_close_matches(key, places, 1)
+    if near:
+        return f"did you mean {near[0]!r} in [{places[near[0]]}]?"
+    return "take it out: was it written by another version?"
+
+
+@cache
+def _tell_retired(path: Path, name: str, value: str) -> None:
+    """A warning, once for a file however often it is read."""
+    warnings.warn(plain(f"{path}: {name} is {value} there and is passed over, this version has no such setting"))
+
+
+def _value(kind: Any, value: Any, what: str) -> Any:
+    """`value`, as TOML gives it, for a field of type `kind`."""
+    if get_origin(kind) is Literal:
+        if value in get_args(kind):
+            return value
+        raise InputError(f"{what} is {value!r}, expected one of {', '.join(map(str, get_args(kind)))}")
+    if get_origin(kind) is tuple:
+        if isinstance(value, list):
+            return tuple(_value(get_args(kind)[0], item, what) for item in value)
+    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300:
+        return float(value)
+    elif type(value) is kind and not (kind is int and abs(value) >= 1 << 62):
+        return value
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+    raise InputError(f"{what} is {value!r}, expected {words.get(kind, 'a list of whole numbers')}")

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is there already: frames of an earlier job, folders, temporary files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+from clsplat.errors import InputError, reason_of
+from clsplat.files import abandoned
+from clsplat.images import channels as layers
+from clsplat.sequence.settings_digest import SETTINGS
+from clsplat.sequence.task import RenderOptions, Task, picture_camera, settings_digest
+
+MOST_WRITERS = 8
+WHAT_IT_IS = ("clsplat:model", "clsplat:colorspace")
+"""Attributes of a file that say whether it is the one that is wanted."""
+
+
+def check_folders(tasks: Sequence[Task]) -> None:
+    """Raise InputError where a file's folder is none, cannot be made or cannot be written to; makes nothing."""
+    for folder in sorted({task.path.parent for task in tasks}):
+        there = next(each for each in (folder, *folder.parents) if each.exists())
+        if not there.is_dir():
+            raise InputError(f"{there}: is a file, expected a folder to write {folder} to")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise InputError(f"{there}: is not writable, expected a folder to write frames to")
+    for task in tasks:
+        if task.path.is_dir():
+            raise InputError(f"{task.path}: is a folder, expected the name of a file")
+
+
+def make_folders(tasks: Sequence[Task]) -> None:
+    """Make the files' folders. Raises InputError."""
+    for folder in sorted({task.path.parent for task in tasks}):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be made: {reason_of(error)}") from None
+
+
+def remove_temporaries(tasks: Sequence[Task]) -> None:
+    """Remove what a killed job has left of these files, and nothing that somebody still writes."""
+    for path in abandoned(task.path for task in tasks):
+        with suppress(OSError):
+            path.unlink()
+
+
+def is_complete(task: Task, options: RenderOptions) -> bool:
+    """Whether the frame's file is there: of its size, channels, model and settings, and readable to its end."""
+    told = {name: value for name, value in options.attributes.items() if name in WHAT_IT_IS}
+    told[SETTINGS] = settings_digest(task, options)
+    camera, deep = picture_camera(task, options), options.deep is not None
+    return layers.is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, told, deep=deep)
+
+
+def complete(tasks: Sequence[Task], options: RenderOptions) -> set[int]:
+    """The numbers of the frames that `--skip-existing` leaves out."""
+    with ThreadPoolExecutor(MOST_WRITERS) as pool:
+        return {
+            task.number
+            for task, whole in zip(tasks, pool.map(lambda task: is_complete(task, options), tasks), strict=True)
+            if whole
+        }
+
+
+def untold(tasks: Sequence[Task]) -> list[Path]:
+    """Those of the tasks' files that do not say with which settings they were made."""
+    with ThreadPoolExecutor(MOST_WRITERS) as pool:
+        said = pool.map(lambda task: layers.attribute(task.path, SETTINGS), tasks)
+        return [task.path for task, value in zip(tasks, said, strict=True) if value is None]
+
+
+def stamp(path: Path) -> tuple[int, ...] | None:
+    """What tells a file from one that takes its place; None for no file."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns, found.st_size

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera as the kernels take it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera, Window
+from clsplat.device.layout import CAMERA, TILE
+from clsplat.errors import InputError
+
+
+def pack_camera(camera: Camera) -> NDArray[np.float32]:
+    """A camera in the order of `layout.CAMERA`: its values rounded to float32, and as _LOW what that left of them.
+
+    Raises InputError for a panorama of more than a whole turn.
+    """
+    if camera.projection == "equirectangular" and camera.width > (turn := 2 * np.pi * camera.fx) * (1 + 1e-6):
+        wide = f"{camera.width} pixels wide, of which {turn:.1f} are a whole turn"
+        raise InputError(f"an equirectangular camera is {wide}: expected no more")
+    window = camera.window or Window(0, 0, camera.width, camera.height)
+    half_w, half_h = 0.5 * window.width / camera.fx, 0.5 * window.height / camera.fy
+    values = {
+        "FX": camera.fx,
+        "FY": camera.fy,
+        "CX": camera.cx,
+        "CY": camera.cy,
+        "NEAR": max(camera.near, 0.0),  # what is behind has no place in the order of depth
+        "HAND": float(np.copysign(1.0, np.linalg.det(camera.rotation))),
+        "XMIN": -camera.cx / camera.fx - window.clamp * half_w,
+        "XMAX": (window.width - camera.cx) / camera.fx + window.clamp * half_w,
+        "YMIN": -camera.cy / camera.fy - window.clamp * half_h,
+        "YMAX": (window.height - camera.cy) / camera.fy + window.clamp * half_h,
+        "WINDOW_X": window.x,
+        "WINDOW_Y": window.y,
+    }
+    for row in range(3):
+        values[f"T{row}"] = float(camera.translation[row])
+        values["P" + "XYZ"[row]] = float(camera.position[row])
+        for column in range(3):
+            values[f"R{row}{column}"] = float(camera.rotation[row, column])
+    rounded = {name: np.float32(value) for name, value in values.items()}
+    rounded.update({f"{name}_LOW": np.float32(value - float(rounded[name])) for name, value in values.items()})
+    return np.array([rounded[name] for name in CAMERA], np.float32)
+
+
+def tiles_of(camera: Camera) -> tuple[int, int]:
+    """Tiles across and down."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters, gradients and moments on the device, or on the host in parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
+from clsplat.device.context import Device
+from clsplat.gaussians import GROUPS, Gaussians, group_shapes
+
+
+@dataclass(frozen=True, eq=False)
+class ShStorage:
+    """How a model that is only rendered keeps its SH.
+
+    coefficients: of each channel; degrees (n,) uint8: the highest of each Gaussian that is looked at, None for all;
+    half: the bands above 0 as float16.
+    """
+
+    coefficients: int
+    degrees: NDArray[np.uint8] | None = None
+    half: bool = False
+
+    @property
+    def floats(self) -> int:
+        """Of one Gaussian's parameters and what is kept beside them, in what floats take, rounded up."""
+        rest = 3 * (self.coefficients - 1)
+        return 14 + (-(-rest // 2) if self.half else rest) + (self.degrees is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceGaussians:
+    """Parameters, or their gradients or moments: arrays by group name, the first axis of each being `count`.
+
+    Of a model that is held to be rendered (`ShStorage`) sh_rest may be float16, and there may be sh_degrees (count)
+    uint8.
+    """
+
+    count: int
+    coefficients: int
+    arrays: dict[str, DeviceArray]
+
+    def __getitem__(self, group: str) -> DeviceArray:
+        return self.arrays[group]
+
+
+@dataclass(frozen=True, eq=False)
+class HostArray:
+    """An array on the host that is used as a DeviceArray is."""
+
+    values: NDArray[Any]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.values.shape
+
+    def get(self) -> NDArray[Any]:
+        """A copy."""
+        return self.values.copy()
+
+    def set(self, values: NDArray[Any]) -> None:
+        """Copy from another array."""
+        self.values[...] = values
+
+    def fill(self, value: float) -> None:
+        """Set every element."""
+        self.values.fill(value)
+
+
+@dataclass(frozen=True, eq=False)
+class HostGaussians:
+    """As DeviceGaussians, but on the host: for use they go to the device `rows` at a time (`parts`)."""
+
+    count: int
+    coefficients: int
+    arrays: dict[str, HostArray]
+    rows: int
+
+    def __getitem__(self, group: str) -> HostArray:
+        return self.arrays[group]
+
+
+AnyGaussians = DeviceGaussians | HostGaussians
+
+
+def parts(
+    work: Workspace, *models: AnyGaussians, keep: bool = False
+) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...]]]:
+    """(start, stop, the models' rows from start to before stop on the device), all at once if they are there.
+
+    Of host models the part is valid until the next one is asked for; keep: what was done to it then goes back.
+    """
+    on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
+    if len(on_device) == len(models):
+        yield 0, models[0].count, on_device
+        return
+    streamed = [model for model in models if isinstance(model, HostGaussians)]
+    count, rows = streamed[0].count, streamed[0].rows
+    for start in range(0, count, rows):
+        stop = min(start + rows, count)
+        uploaded = []
+        for index, model in enumerate(streamed):
+            arrays = {}
+            for name, whole in model.arrays.items():
+                values = whole.values[start:stop]
+                arrays[name] = work.array(f"part{index}_{name}", values.shape, values.dtype)
+                arrays[name].set(values)
+            uploaded.append(DeviceGaussians(stop - start, model.coefficients, arrays))
+        yield start, stop, tuple(uploaded)
+        if keep:
+            for model, part in zip(streamed, uploaded, strict=True):
+                for name, array in part.arrays.items():
+                    array.read_into(model[name].values[start:stop])
+
+
+def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: bool = False) -> DeviceGaussians:
+    """Arrays for `count` Gaussians."""
+    arrays = {name: allocate(device, shape, np.float32) for name, shape in group_shapes(count, coefficients).items()}
+    if zero:
+        for array in arrays.values():
+            array.fill(0.0)
+    return DeviceGaussians(count, coefficients, arrays)
+
+
+def _grouped(gaussians: Gaussians, sh: ShStorage) -> dict[str, NDArray[Any]]:
+    host = {
+        "means": gaussians.means,
+        "quaternions": gaussians.quaternions,
+        "log_scales": gaussians.log_scales,
+        "opacity_logits": gaussians.opacity_logits,
+        "sh_dc": gaussians.sh[:, 0],
+        "sh_rest": gaussians.sh[:, 1 : sh.coefficients],
+    }
+    kinds = {"sh_rest": np.float16 if sh.half else np.float32}
+    arrays = {name: np.ascontiguousarray(values, kinds.get(name, np.float32)) for name, values in host.items()}
+    return arrays if sh.degrees is None else {**arrays, "sh_degrees": sh.degrees}
+
+
+def upload_gaussians(device: Device, gaussians: Gaussians, sh: ShStorage | None = None) -> DeviceGaussians:
+    """A copy on the device; sh: to be rendered alone."""
+    sh = sh or ShStorage(gaussians.sh.shape[1])
+    arrays = {name: upload(device, values) for name, values in _grouped(gaussians, sh).items()}
+    return DeviceGaussians(len(gaussians), sh.coefficients, arrays)
+
+
+def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None) -> HostGaussians:
+    """On the host, to go through the device `rows` at a time. Not a copy: to read, unless the caller may write.
+
+    sh: to be rendered alone.
+    """
+    sh = sh or ShStorage(gaussians.sh.shape[1])
+    arrays = {name: HostArray(values) for name, values in _grouped(gaussians, sh).items()}
+    return HostGaussians(len(gaussians), sh.coefficients, arrays, rows)
+
+
+def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
+    """Zeros, as moments begin."""
+    shapes = group_shapes(count, coefficients)
+    arrays = {name: HostArray(np.zeros(shape, np.float32)) for name, shape in shapes.items()}
+    return HostGaussians(count, coefficients, arrays, rows)
+
+
+def to_host(gaussians: AnyGaussians) -> HostGaussians:
+    """A copy of what is on the device, or what is on the host already."""
+    if isinstance(gaussians, HostGaussians):
+        return gaussians
+    arrays = {name: HostArray(array.get()) for name, array in gaussians.arrays.items()}
+    return HostGaussians(gaussians.count, gaussians.coefficients, arrays, gaussians.count)
+
+
+def to_device(device: Device, gaussians: HostGaussians) -> DeviceGaussians:
+    """A copy of what is on the host."""
+    arrays = {name: upload(device, array.values) for name, array in gaussians.arrays.items()}
+    return DeviceGaussians(gaussians.count, gaussians.coefficients, arrays)
+
+
+def download_gaussians(gaussians: AnyGaussians) -> Gaussians:
+    """A copy on the host."""
+    host = {name: gaussians[name].get() for name in GROUPS}
+    return Gaussians(
+        means=host["means"],
+        quaternions=host["quaternions"],
+        log_scales=host["log_scales"],
+        opacity_logits=host["opacity_logits"],
+        sh=np.concatenate([host["sh_dc"][:, None], host["sh_rest"]], axis=1),
+    )
