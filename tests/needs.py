@@ -61,6 +61,7 @@ NEEDS = {
     "chromium": Need("Chromium", "apt-get install chromium, or set CLSPLAT_CHROMIUM", lambda: bool(chromium_path())),
     "distributed": of_extra("distributed", "distributed", "farm"),
     "hatchling": of_extra("hatchling", "hatchling", "test"),
+    "importlinter": of_extra("importlinter", "import-linter", "dev"),
     "html5lib": of_extra("html5lib", "html5lib", "test"),
     "matplotlib": of_extra("matplotlib", "Matplotlib", "plot"),
     "node": Need(
