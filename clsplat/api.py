@@ -43,7 +43,7 @@ def train(
     tells of what could be mended), and Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP after a
     checkpoint has been written.
     """
-    config = config or TrainConfig()
+    config = loop.checked(scene, config, run, resume=resume)
     with nullcontext() if run is None else locked(run.path, "train"):
         model = loop.train(
             scene,

@@ -32,7 +32,6 @@ from clsplat.process import Interrupted, endings
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs import scene_record
-from clsplat.runs.locks import locked
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
 from clsplat.scenes.point_colours import is_colourless, photographed
@@ -318,7 +317,7 @@ def _rescued(session: _Session) -> Iterator[None]:
 
 def train(
     scene: Scene,
-    config: TrainConfig | None = None,
+    config: TrainConfig,
     *,
     device: Device | str | None = None,
     max_device_mem: str | int | None = None,
@@ -328,28 +327,26 @@ def train(
     on_plan: Callable[[Plan], None] | None = None,
     between: Between | None = None,
 ) -> Gaussians:
-    """As `clsplat.train`, without the report of the run."""
-    config = _checked(scene, config, run, resume=resume)
+    """As `clsplat.train`, for arguments that are `checked` and a run that is locked, without its report."""
     limit = parse_bytes(max_device_mem)
     opened = device if isinstance(device, Device) else open_device(device, limit)
     if isinstance(device, Device) and limit is not None:
         opened = device.with_memory_limit(limit)
     if run is None:
         return _train(scene, config, opened, None, on_step=on_step, on_plan=on_plan, between=between)
-    with locked(run.path, "train"):
-        if not resume and (run.checkpoints() or run.read_metrics()):
-            raise InputError(
-                f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
-                "starts again"
-            )
-        run.keep_config(config)
-        if resume:
-            scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
-        scene_record.keep(run, scene, resuming=resume)
-        return _train(scene, config, opened, run, resume=resume, on_step=on_step, on_plan=on_plan, between=between)
+    if not resume and (run.checkpoints() or run.read_metrics()):
+        raise InputError(
+            f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
+            "starts again"
+        )
+    run.keep_config(config)
+    if resume:
+        scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
+    scene_record.keep(run, scene, resuming=resume)
+    return _train(scene, config, opened, run, resume=resume, on_step=on_step, on_plan=on_plan, between=between)
 
 
-def _checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
+def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
     """The settings. Raises InputError where the arguments of `train` make no sense."""
     for name, value, kind in (
         ("scene", scene, Scene),
