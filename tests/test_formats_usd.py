@@ -160,10 +160,10 @@ def test_damaged_files(tmp_path: Path, suffix: str) -> None:
 def test_a_file_that_crashes_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "model.usdc"
     usd.write(path, lopsided(4, degree=0))
-    folder = tmp_path / "first" / "clsplat" / "formats"
+    folder = tmp_path / "first" / "clsplat" / "models" / "formats"
     folder.mkdir(parents=True)
-    (folder.parent / "__init__.py").write_text("")
-    (folder / "__init__.py").write_text("")
+    for package in (folder.parent.parent, folder.parent, folder):
+        (package / "__init__.py").write_text("")
     (folder / "usd.py").write_text("import os\n\n\ndef read_here(path):\n    os.abort()\n")
     monkeypatch.syspath_prepend(tmp_path / "first")  # of the other process
     for read in (usd.read, usd.describe):
