@@ -23,7 +23,7 @@ from clsplat.errors import ClsplatError
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.reference.render import render_grad
-from clsplat.report import last, page, thumbnails
+from clsplat.report import last, thumbnails
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import load_scene
 from clsplat.training import telemetry
