@@ -53,9 +53,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
                           , __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
 #endif
 ) {
-  const int tile = first_tile + get_group_id(0);
-  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
-  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];
+  TILE_OF_GROUP
   PIXEL_TABLES
   RAY_TABLES
   floatL t[OWNED], kept[OWNED], red[OWNED], green[OWNED], blue[OWNED];
@@ -64,7 +62,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
 
   Open open = 0;
   for (int k = 0; k < OWNED; ++k) {
-    const int cell = get_local_id(0) + k * ITEMS;
+    const int cell = OWN_CELL(k);
     const floatL y = (floatL)(tile_y) + PIXELS_Y(cell);
     t[k] = (floatL)(tile_x) + PIXELS_X(cell) < (floatL)(width) ? (floatL)(1.0f) : (floatL)(0.0f);
     t[k] = y < (floatL)(height) ? t[k] : (floatL)(0.0f);
@@ -130,11 +128,9 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   counts[2 * get_global_id(0) + 1] = evaluated;
 #endif
 
-  const size_t stride = (size_t)tiles_x * TILE;
-  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
   for (int k = 0; k < OWNED; ++k) {
-    const int cell = get_local_id(0) + k * ITEMS;
-    const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
+    const int cell = OWN_CELL(k);
+    const size_t pixel = CELL_IN_PLANE(cell);
     const floatL at_end = t[k] > 0.0f ? t[k] : kept[k];
     const floatL left = stop[k] >= 0 ? at_end : (floatL)(0.0f);
     STORE_CELL(float, fmaL(left, (floatL)(background[0]), red[k]), image + pixel, stride);

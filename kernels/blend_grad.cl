@@ -55,22 +55,16 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 ) {
 #if ITEMS > 1
   __local float scratch[SLOT_STRIDE * ITEMS];
-  __local int group_last;
 #endif
-  const int tile = first_tile + get_group_id(0);
-  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
-  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];
-  const size_t stride = (size_t)tiles_x * TILE;
-  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
-
+  TILE_OF_GROUP
   PIXEL_TABLES
   floatL t[OWNED], behind[OWNED], g_red[OWNED], g_green[OWNED], g_blue[OWNED];
   intL stop[OWNED];
   int last = begin;
   Open live = 0; // cells with a pixel that has a gradient
   for (int k = 0; k < OWNED; ++k) {
-    const int cell = get_local_id(0) + k * ITEMS;
-    const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
+    const int cell = OWN_CELL(k);
+    const size_t pixel = CELL_IN_PLANE(cell);
     t[k] = LOAD_CELL(float, transmittance + pixel, stride);
     stop[k] = LOAD_CELL(int, stops + pixel, stride);
     const intL inside = MASKL(stop[k] >= 0); // in padding nobody has written a gradient, and 0 * NaN is not 0
@@ -81,13 +75,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     last = max(last, maxL(stop[k]));
     if (ANYL((g_red[k] != 0.0f) | (g_green[k] != 0.0f) | (g_blue[k] != 0.0f))) OPEN_CELL(live, cell);
   }
-#if ITEMS > 1
-  if (get_local_id(0) == 0) group_last = begin;
-  barrier(CLK_LOCAL_MEM_FENCE);
-  atomic_max(&group_last, last);
-  barrier(CLK_LOCAL_MEM_FENCE);
-  last = group_last;
-#endif
+  RAISE_TO_GROUP_MAX(last)
 #ifdef NO_LAST_CONTRIBUTOR // RasterizerConfig.last_contributor: begin at the end of the list, to no effect
   last = end;
 #endif

@@ -14,7 +14,6 @@
 GROUP __kernel void limit_blend(const int rounds, __global const float *splats, __global float *sums) {
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {
-    const int vector = get_local_id(0) + k * ITEMS;
     const floatL x = PIXELS_X(k), y = PIXELS_Y(k);
     floatL t = (floatL)(1.0f), red = (floatL)(0.0f), green = (floatL)(0.0f), blue = (floatL)(0.0f);
     for (int i = 0; i < rounds; ++i) {

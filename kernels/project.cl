@@ -104,17 +104,10 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     if (count == 0) continue;
 #endif
     tile_counts[i] = count;
-#ifdef SH_DEGREES
-    const int bands = sh_degrees[i] + 1, used = min(SH_USED(coefficients), bands * bands);
-#else
-    const int used = SH_USED(coefficients);
-#endif
-    float4 colour = sh_fma(SH_CONSTANT, (float4)(sh_dc[3 * i], sh_dc[3 * i + 1], sh_dc[3 * i + 2], 0.0f), (float4)(0.5f));
-    __global const shT *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
-    for (int k = 1; k < used; ++k, f += 3)
-      colour = sh_fma(basis[k].lane[lane], sh_channels(f, k + 1 == coefficients), colour);
+    const float4 colour = sh_colour(basis, lane, SH_OF_GAUSSIAN(i, coefficients), coefficients, sh_dc + 3 * i,
+                                    sh_rest + 3 * (coefficients - 1) * i);
 #ifndef UNGUARDED
-    if (!(colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT)) {
+    if (!colour_is_drawn(colour)) {
       tile_counts[i] = 0;
 #ifdef KEEP_CULLED
       shown[i] = 0;
@@ -122,8 +115,6 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
       continue;
     }
 #endif
-    splat[SPLAT_RED] = colour.x > 0.0f ? colour.x : 0.0f;
-    splat[SPLAT_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
-    splat[SPLAT_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
+    store_colour(colour, splat + SPLAT_RED);
   }
 }

@@ -215,22 +215,13 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
 
   const float away[3] = {x - camera[CAMERA_PX], y - camera[CAMERA_PY], z - camera[CAMERA_PZ]};
   const float far = sqrt(fma1(away[0], away[0], fma1(away[1], away[1], away[2] * away[2])));
-  float basis[16];
-  sh_basis(SH_USED(coefficients), away[0] / far, away[1] / far, away[2] / far, basis);
-#ifdef SH_DEGREES
-  const int bands = sh_degrees[i] + 1, used = min(SH_USED(coefficients), bands * bands);
-#else
-  const int used = SH_USED(coefficients);
-#endif
-  float4 colour = sh_fma(SH_CONSTANT, (float4)(sh_dc[3 * i], sh_dc[3 * i + 1], sh_dc[3 * i + 2], 0.0f), (float4)(0.5f));
-  __global const shT *band = sh_rest + (size_t)3 * (coefficients - 1) * i;
-  for (int k = 1; k < used; ++k, band += 3)
-    colour = sh_fma(basis[k], sh_channels(band, k + 1 == coefficients), colour);
-  if (!(colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT)) {
+  Lanes basis[16];
+  sh_basis(SH_USED(coefficients), away[0] / far, away[1] / far, away[2] / far, &basis[0].all);
+  const float4 colour = sh_colour(basis, 0, SH_OF_GAUSSIAN(i, coefficients), coefficients, sh_dc + 3 * i,
+                                  sh_rest + 3 * (coefficients - 1) * i);
+  if (!colour_is_drawn(colour)) {
     tile_counts[i] = 0;
     return;
   }
-  splat[RAY_RED] = colour.x > 0.0f ? colour.x : 0.0f;
-  splat[RAY_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
-  splat[RAY_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
+  store_colour(colour, splat + RAY_RED);
 }

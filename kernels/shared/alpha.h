@@ -31,7 +31,7 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
 #define RAY_TABLES                                                                                                    \
   floatL ray_x[OWNED], ray_y[OWNED], ray_z[OWNED];                                                                    \
   for (int k = 0; k < OWNED; ++k) {                                                                                   \
-    const int cell = get_local_id(0) + k * ITEMS;                                                                     \
+    const int cell = OWN_CELL(k);                                                                                     \
     const float left = (float)tile_x + camera[CAMERA_WINDOW_X], top = (float)tile_y + camera[CAMERA_WINDOW_Y];        \
     ray_of(left + 0.5f + PIXELS_X(cell), top + 0.5f + PIXELS_Y(cell), camera, ray_x + k, ray_y + k, ray_z + k);       \
   }
@@ -50,4 +50,11 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
 // log2 of alpha before the cap, from the mean's offset in (u, v).
 static inline floatL log2_alpha(floatL u, floatL v, float log2o) {
   return fmaL(-u, u, fmaL(-v, v, (floatL)(log2o)));
+}
+
+// Alpha from its log2 before the cap, 0 in the lanes that do not take the Gaussian.
+static inline floatL alpha_where(intL taken, floatL power) {
+  floatL alpha = exp2L(power);
+  alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
+  return AS_FLOATL(AS_INTL(alpha) & taken);
 }

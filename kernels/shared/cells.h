@@ -9,6 +9,18 @@
 #define OWNED (CELLS / ITEMS)
 #define CELL_X(cell) ((cell) % COLUMNS * CELL_W)
 #define CELL_Y(cell) ((cell) / COLUMNS * CELL_H)
+#define OWN_CELL(k) (get_local_id(0) + (k) * ITEMS)
+
+// Where a group is, from a kernel's first_tile, tiles_x, height and ranges: the first pixel of its tile; its list, the
+// pairs from `begin` to before `end`; floats from a row of a plane to the next, and from plane to plane.
+#define TILE_OF_GROUP                                                                                                 \
+  const int tile = first_tile + get_group_id(0);                                                                      \
+  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                       \
+  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];                               \
+  const size_t stride = (size_t)tiles_x * TILE;                                                                       \
+  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
+// Where a cell's first pixel is in a plane.
+#define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
 
 // Coordinates of a cell's pixels in the tile, and the cell's part of a plane whose rows are `stride` apart.
 #define PIXELS_X(cell) ((floatL)(CELL_X(cell)) + LANE_X)

@@ -94,3 +94,32 @@ static inline float4 sh_fma(float a, float4 b, float4 c) {
   return fma((float4)(a), b, c);
 #endif
 }
+
+// Of the coefficients that there are, how many Gaussian i's colour has: with SH_DEGREES those of its own bands.
+#ifdef SH_DEGREES
+#define SH_OF_GAUSSIAN(i, coefficients) min(SH_USED(coefficients), (sh_degrees[i] + 1) * (sh_degrees[i] + 1))
+#else
+#define SH_OF_GAUSSIAN(i, coefficients) SH_USED(coefficients)
+#endif
+
+// A Gaussian's colour without its floor, (12) of docs/gradients.md, from one lane of the basis: `dc` (3) and `rest`
+// (coefficients - 1, 3) are its own, of which the first `used` coefficients count, dc with them.
+static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coefficients, __global const float *dc,
+                               __global const shT *rest) {
+  float4 colour = sh_fma(SH_CONSTANT, (float4)(dc[0], dc[1], dc[2], 0.0f), (float4)(0.5f));
+  for (int k = 1; k < used; ++k, rest += 3)
+    colour = sh_fma(basis[k].lane[lane], sh_channels(rest, k + 1 == coefficients), colour);
+  return colour;
+}
+
+// A colour that is not finite, or of COLOUR_LIMIT or more, is not drawn: one such pixel would be all of the loss.
+static inline int colour_is_drawn(float4 colour) {
+  return colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT;
+}
+
+// Red, green and blue one after the other, with the floor of (12).
+static inline void store_colour(float4 colour, __global float *rgb) {
+  rgb[0] = colour.x > 0.0f ? colour.x : 0.0f;
+  rgb[1] = colour.y > 0.0f ? colour.y : 0.0f;
+  rgb[2] = colour.z > 0.0f ? colour.z : 0.0f;
+}
