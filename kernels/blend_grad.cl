@@ -1,5 +1,12 @@
-// The gradient of blending, back to front (docs/gradients.md, equations 22 to 26, 48 and 49). A group owns a tile and
-// writes one slot of partial sums for each of its (tile, Gaussian) pairs, at a place of its own: no atomics.
+// The gradient of blending, back to front: partial sums for each pair of a tile and a Gaussian.
+//
+// Owner: A group owns a tile and writes one slot for each of its pairs, at a place of its own: no atomics on global
+//   memory.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Buffers: blend's, its transmittance and stops, image_gradient (3, height, width): of the loss by colour,
+//   slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE), every one of them: sums over the tile's pixels in blend's
+//   whitened units (49).
+// Equations: docs/gradients.md, (14), (22) to (26), (48), (49) and (55).
 //
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
@@ -13,7 +20,8 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#if defined(NO_GRADIENT_SKIP) || defined(CONTRIBUTIONS) // RasterizerConfig.gradient_skip; contributions are of all cells
+// RasterizerConfig.gradient_skip; contributions are of all cells.
+#if defined(NO_GRADIENT_SKIP) || defined(CONTRIBUTIONS)
 #define LIVE(cells, live) (cells)
 #else
 #define LIVE(cells, live) ((cells) & (live))
@@ -41,8 +49,6 @@ static inline void group_sums(float *values, __local float *scratch, __global fl
 }
 #endif
 
-// As blend, its transmittance and stops, image_gradient (3, height, width), slot_from_sorted (pairs)
-// -> slots (pairs, SLOT_STRIDE), every one of them.
 GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const int height,
                                __global const uint *ranges,
                                __global const uint *gaussian_from_sorted, __global const uint *slot_from_sorted,

@@ -1,6 +1,14 @@
-// The channels beside colour (docs/channels.md): features blended with the weights of the image, and what needs the order
-// of the Gaussians: depths at which a pixel is first hit and half opaque, how many it takes and which weighs most. A
-// group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
+// The channels beside colour: features blended with the weights of the image, and what needs the order of the
+// Gaussians: depths at which a pixel is first hit and half opaque, how many it takes and which weighs most.
+//
+// Owner: A group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Buffers: blend's ranges, gaussian_from_sorted, splats and stops, features (n, FEATURES) of features.cl, camera with
+//   RAYS -> planes (PLANES, height, width): mean features by weight, in their units, those from FEATURE_NORMAL on of
+//   unit length; depth of the median and of the first, in world units. whole (2, height, width): count, and the index
+//   of the Gaussian with the largest weight, the first of those, -1 for none. All else is 0 where nothing was added,
+//   and in padding.
+// Equations: docs/channels.md, (60) to (67); with RAYS docs/cameras.md, (14).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -13,10 +21,6 @@
 #define MEDIAN FEATURES
 #define FIRST (FEATURES + 1)
 
-// ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), features (n, FEATURES), stops (height, width)
-// of blend.cl, for the tiles from first_tile on -> planes (PLANES, height, width): mean features by weight, those from
-// FEATURE_NORMAL on of unit length; depth of the median, of the first; whole (2, height, width): count, and the index of
-// the Gaussian with the largest weight, the first of those, -1 for none. All 0 where nothing was added, and in padding.
 GROUP __kernel void channels(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
                              __global const uint *gaussian_from_sorted, __global const float *splats,
                              __global const float *features, __global const int *stops, __global float *planes,

@@ -1,6 +1,12 @@
-// A picture in slices by depth (docs/pictures.md, equations 70 to 73): the Gaussians of each bin of depths blended as if
-// they were alone, up to where the pixel ends in blend.cl. A tile's list is in order of depth, so that the bins come one
-// after the other. A group owns a tile, as in blend.cl.
+// A picture in slices by depth: the Gaussians of each bin of depths blended as if they were alone, up to where the
+// pixel ends in blend.cl. A tile's list is in order of depth, so that the bins come one after the other.
+//
+// Owner: A group owns a tile, as in blend.cl.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Buffers: blend's ranges, gaussian_from_sorted, splats and stops; bounds (bins - 1): the depths at which the next bin
+//   begins, rising, in world units; camera with RAYS -> planes (bins, DEEP_SIZE, height, width): colour associated with
+//   alpha, alpha, least and largest depth in world units. All 0 where nothing is added.
+// Equations: docs/pictures.md, (70) to (73).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -16,9 +22,6 @@
 #define DEEP_FIRST 4
 #define DEEP_LAST 5
 
-// ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), stops (height, width) of blend.cl, for the
-// tiles from first_tile on; bounds (bins - 1): the depths at which the next bin begins, rising -> planes (bins,
-// DEEP_SIZE, height, width): colour associated with alpha, alpha, least and largest depth. All 0 where nothing is added.
 GROUP __kernel void deep(const int first_tile, const int tiles_x, const int height, const int bins,
                          __constant float *bounds, __global const uint *ranges,
                          __global const uint *gaussian_from_sorted, __global const float *splats,

@@ -1,4 +1,10 @@
-// What adaptive density control (Kerbl et al. 2023, section 5) asks of the device: statistics and moving rows.
+// Statistics that adaptive density control reads, and the moving of rows that it orders.
+//
+// Owner: A work-item owns a Gaussian, in gather_rows a row that is written.
+// Launch: One work-item for each Gaussian or row, in groups of 64; those beyond the last do nothing.
+// Buffers: tile_counts (n): 0 where not seen; screen (n, 2): gradient of the mean on the image, per pixel; splats (n,
+//   SPLAT_SIZE) in pixels. Statistics (n) are added to in place. Shapes of the rest are above each kernel.
+// Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
 #include "shared/splat.h"
 

@@ -1,5 +1,13 @@
 // From visible Gaussians to one (tile, Gaussian) pair for each tile that an ellipse reaches, in order of depth, so that
 // a stable sort by tile alone leaves each tile's Gaussians front to back.
+//
+// Owner: A group owns a chunk of Gaussians in compact_visible. Elsewhere a work-item owns a Gaussian, in order_pairs a
+//   pair.
+// Launch: One group of ITEMS work-items for each chunk; elsewhere one work-item for each Gaussian or pair, in groups of
+//   64.
+// Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts, slots (n), counts of pairs and their
+//   scan. Shapes of the rest are above each kernel.
+// Equations: docs/gradients.md, (47), by shared/tile.h, which project.cl counts with.
 #include "shared/math.h"
 #include "shared/group.h"
 #include "shared/tile.h"

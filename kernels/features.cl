@@ -1,5 +1,12 @@
-// What a Gaussian brings to the channels beside colour (docs/channels.md): a row of FEATURES floats for each visible one.
-// FEATURE_X is the place of X in the row, where X is wanted. Built with one lane: its bits are those of any shape.
+// What a Gaussian brings to the channels beside colour: a row of FEATURES floats for each visible one. FEATURE_X is the
+// place of X in the row, where X is wanted.
+//
+// Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
+// Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
+// Buffers: camera: the frame's own; after: the one that motion goes to; tile_counts (n): 0 where not visible; means,
+//   quaternions, log_scales as in project.cl; splats (n, SPLAT_SIZE), all of one projection -> features (n, FEATURES),
+//   written where visible: depth and position in world units, a normal of unit length, motion in pixels.
+// Equations: docs/channels.md, (61) to (64), (74) and (75).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -99,8 +106,6 @@ static inline void motion_of(__constant float *camera, float x, float y, float z
 #endif
 #endif
 
-// tile_counts (n): 0 where not visible; camera: the frame's own; after: the one that motion goes to; splats (n,
-// SPLAT_SIZE) -> features (n, FEATURES), written where visible. All of one projection.
 __kernel void features(const uint n, __constant float *camera, __constant float *after,
                        __global const uint *tile_counts, __global const float *means,
                        __global const float *quaternions, __global const float *log_scales,

@@ -1,4 +1,10 @@
 // What the device can do at most, in the terms of the pipeline: `clsplat bench` states each stage's share of it.
+//
+// Owner: A work-item owns OWNED cells of pixels that nobody sees; in limit_copy LANES elements.
+// Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy one work-item for each LANES elements.
+// Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep the work from being left out.
+//   limit_copy: from (n) -> to (n).
+// Equations: those of blend.cl and blend_grad.cl, with no branch.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"

@@ -1,16 +1,18 @@
-// The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient (docs/gradients.md, equations 17 to 21), SSIM with the
-// usual 11 x 11 Gaussian window, sigma 1.5, zeros outside the image. The window is separable: vertical first, which
-// needs no margin, into planes with PAD zero columns on either side, then horizontal without bounds checks. A second
-// pair of passes convolves the three partial derivatives, the adjoint of the first.
+// The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient. SSIM has the usual 11 x 11 Gaussian window, sigma 1.5,
+// zeros outside the image. The window is separable: vertical first, which needs no margin, into planes with PAD zero
+// columns on either side, then horizontal without bounds checks. A second pair of passes convolves the three partial
+// derivatives, the adjoint of the first.
 //
-// E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So whatever a window is added up of counts from the pixel in
-// its middle (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is one of
+// Owner: A work-item owns every get_global_size(0)-th vector of one row of one channel: a whole row on a CPU.
+// Launch: A grid of strips x height x channels: all three channels at once, or one after the other where memory is
+//   short. `first` is the channel of the image that is the first of the launch's.
+// Buffers: image, target (3, rows, stride) in colour, padded to whole tiles; moments, partials and gradient, whose
+//   shapes are above each kernel; sums (3, 3, height, strips): SSIM, |image - target| and its square.
+// Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79).
+//
+// E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So whatever a window is added up of counts from the
+// pixel in its middle (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is one of
 // differences between a pixel and its neighbours.
-//
-// `first` is the channel of the image that is the first of a launch's: all three go at once, or one after the other where
-// memory is short, `channels` of them.
-//
-// A work-item owns every get_global_size(0)-th vector of one row of one channel: a whole row on a CPU.
 #include "shared/math.h"
 #include "shared/lanes.h"
 

@@ -1,6 +1,14 @@
-// Projection (Kerbl et al. 2023, section 4; docs/gradients.md, equations 1 to 13, 44 to 47 and 53 to 57; orthographic:
-// docs/cameras.md, 15 to 17): each Gaussian to its ellipse, colour, depth and number of tiles. A work-item has LANES Gaussians: in vectors as far as all have the same
-// to do, then the visible ones by turns.
+// Projection of perspective and orthographic cameras: each Gaussian to its ellipse, colour, depth and number of tiles.
+//
+// Owner: A work-item owns LANES Gaussians: in vectors as far as all have the same to do, then the visible ones by
+//   turns.
+// Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
+// Buffers: means (n, 3) in world units, quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n,
+//   3), sh_rest (n, coefficients - 1, 3) -> splats (n, SPLAT_SIZE) in pixels, depth in world units, written where
+//   visible; tile_counts (n): 0 where culled. With KEEP_CULLED shown (n): 1 where a splat is written, also of those
+//   that have no tile. Of a model that is held: with SH_DEGREES sh_degrees (n): the highest that is looked at.
+// Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
+//   Kerbl et al. 2023, section 4.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -16,11 +24,6 @@
 #define KEEP_CULLED !opaque.lane[lane]
 #endif
 
-// means (n, 3), quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n, 3),
-// sh_rest (n, coefficients - 1, 3); splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.
-// A colour that is not finite, or of more than COLOUR_LIMIT, is not drawn: one such pixel would be all of the loss.
-// With KEEP_CULLED shown (n): 1 where a splat is written, also of those that have no tile. Of a model that is held:
-// with SH_DEGREES sh_degrees (n): the highest that is looked at.
 __kernel void project(const uint n, const int coefficients, const int tiles_x, const int tiles_y,
                       __constant float *camera, __global const float *means, __global const float *quaternions,
                       __global const float *log_scales, __global const float *opacity_logits,

@@ -1,6 +1,14 @@
 // The gradient of projection: sums a Gaussian's slots in the order of its tiles, then the chain rule back to its
-// parameters (docs/gradients.md, equations 25 to 41 in the forms 50, 52 and 58 to 61). A work-item has LANES Gaussians,
-// of which it leaves those that are not visible.
+// parameters.
+//
+// Owner: A work-item owns LANES Gaussians, of which it leaves those that are not visible; in add_slots one.
+// Launch: One work-item for each LANES Gaussians, or for each one, in groups of 64; those beyond the last do nothing.
+// Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE);
+//   tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project.cl -> gradients of the
+//   parameters, of the same shapes, in loss per unit of each; rows of Gaussians that are not visible are left as they
+//   are. screen (n, 2): of the mean on the image, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n):
+//   what each adds to the image, sums of its blending weights over all pixels.
+// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -35,11 +43,6 @@ static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
   return x * x < 0.0625f ? series : s1 - s2;
 }
 
-// slots (pairs, SLOT_STRIDE), or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE).
-// tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project
-// -> gradients of the parameters (same shapes; rows of Gaussians that are not visible are left as they are) and of
-// the mean on the image: screen (n, 2) in pixels, plain or absolute; with CONTRIBUTIONS what each adds to the image:
-// contributions (n), sums of its blending weights over all pixels (55).
 __kernel void project_grad(const uint n, const int coefficients, __constant float *camera,
                            __global const uint *tile_counts, __global const uint *first_slots,
                            __global const float *slots, __global const float *splats, __global const float *means,

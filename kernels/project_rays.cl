@@ -1,6 +1,11 @@
-// Projection for equirectangular (RAYS == 1) and fisheye (RAYS == 2) cameras (docs/cameras.md, equations 8 to 14): each
-// Gaussian to its ellipse on the plane that touches the sphere of directions at its mean's, where perspective bends it
-// least; there is no pole and no seam. Built with one lane: its bits are those of any shape.
+// Projection for equirectangular (RAYS == 1) and fisheye (RAYS == 2) cameras: each Gaussian to its ellipse on the plane
+// that touches the sphere of directions at its mean's, where perspective bends it least; there is no pole and no seam.
+//
+// Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
+// Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
+// Buffers: As in project.cl, but for what that can leave out of a model that is held -> splats (n, RAY_SIZE),
+//   directions in the camera's axes and distance in world units; tile_counts (n).
+// Equations: docs/cameras.md, (8) to (14); colour docs/gradients.md, (12).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -133,7 +138,6 @@ static inline void store_box(const Tangent *t, int width, int height, int tiles_
   splat[RAY_ROWS] = as_float((uint)y0 | (uint)y1 << 16);
 }
 
-// As `project` in project.cl, but for what it can leave out of a model that is held; such a colour is not drawn either.
 __kernel void project_rays(const uint n, const int coefficients, const int width, const int height,
                            __constant float *camera, __global const float *means, __global const float *quaternions,
                            __global const float *log_scales, __global const float *opacity_logits,

@@ -1,6 +1,11 @@
-// One pass of a stable least-significant-digit radix sort: digit histogram of each chunk, (scan.cl over the
-// digit-major histograms), scatter. A group owns a chunk and an item a contiguous run of it, so that order within a
-// digit is order of position. Reduce-then-scan: it needs no forward progress between groups.
+// One pass of a stable least-significant-digit radix sort: digit histogram of each chunk, (scan.cl over the digit-major
+// histograms), scatter. Reduce-then-scan: it needs no forward progress between groups.
+//
+// Owner: A group owns a chunk and an item a contiguous run of it, so that order within a digit is order of position.
+// Launch: One group of ITEMS work-items for each chunk.
+// Buffers: keys, values (n), histograms (digits, groups) -> keys_out, values_out (n); counters (digits, ITEMS) in local
+//   memory.
+// Equations: none; docs/decisions/0001-split-sort.md.
 #include "shared/math.h"
 #include "shared/group.h"
 

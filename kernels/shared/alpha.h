@@ -44,7 +44,7 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
   const float log2o = (splat)[SPLAT_LOG2O];                                                                           \
   const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
 #define LOG2_ALPHA(splat, cell, k)                                                                                    \
-  log2_alpha(whitened_u(l11, l12, mx - AT_X(cell), my - AT_Y(cell)), l22 * (my - AT_Y(cell)), log2o)
+  log2_alpha(whitened_u(l11, l12, mx - AT_X(cell), my - AT_Y(cell)), (l22) * (my - AT_Y(cell)), log2o)
 #endif
 
 // log2 of alpha before the cap, from the mean's offset in (u, v).
