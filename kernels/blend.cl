@@ -47,17 +47,19 @@
 
 GROUP __kernel void blend(const int first_tile, const int tiles_x, const int width, const int height,
                           __global const uint *ranges, __global const uint *gaussian_from_sorted,
-                          __global const float *splats,
-                          __global const float *background, __global float *image, __global float *transmittance,
-                          __global int *stops
+                          __global const float *splats, __global const float *background, __global float *image,
+                          __global float *transmittance, __global int *stops
 #ifdef RECORD_CELLS
-                          , __global uint *cells_from_sorted
+                          ,
+                          __global uint *cells_from_sorted
 #endif
 #ifdef RAYS
-                          , __constant float *camera
+                          ,
+                          __constant float *camera
 #endif
 #ifdef COUNT_PAIRS
-                          , __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
+                          ,
+                          __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
 #endif
 ) {
   TILE_OF_GROUP

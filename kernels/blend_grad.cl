@@ -49,14 +49,14 @@ static inline void group_sums(float *values, __local float *scratch, __global fl
 }
 #endif
 
-GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const int height,
-                               __global const uint *ranges,
+GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
                                __global const uint *gaussian_from_sorted, __global const uint *slot_from_sorted,
                                __global const float *splats, __global const float *background,
                                __global const float *image_gradient, __global const float *transmittance,
                                __global const int *stops, __global float *slots
 #ifdef RECORD_CELLS
-                               , __global const uint *cells_from_sorted
+                               ,
+                               __global const uint *cells_from_sorted
 #endif
 ) {
 #if ITEMS > 1

@@ -26,7 +26,8 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
                              __global const float *features, __global const int *stops, __global float *planes,
                              __global int *whole
 #ifdef RAYS
-                             , __constant float *camera
+                             ,
+                             __constant float *camera
 #endif
 ) {
   TILE_OF_GROUP

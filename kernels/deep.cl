@@ -27,7 +27,8 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
                          __global const uint *gaussian_from_sorted, __global const float *splats,
                          __global const int *stops, __global float *planes
 #ifdef RAYS
-                         , __constant float *camera
+                         ,
+                         __constant float *camera
 #endif
 ) {
   TILE_OF_GROUP

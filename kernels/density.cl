@@ -19,8 +19,8 @@ static inline float ndc_norm(__global const float *screen, const size_t i, const
 // at 3 sigma. A view in which one of them is not finite does not count, here and below.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
                                  __global const uint *tile_counts, __global const float *screen,
-                                 __global const float *splats, __global float *gradient_sums,
-                                 __global float *seen, __global float *radii) {
+                                 __global const float *splats, __global float *gradient_sums, __global float *seen,
+                                 __global float *radii) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
   const float norm = ndc_norm(screen, i, x_scale, y_scale);
@@ -35,8 +35,7 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
 
 // As density_statistics -> agreeing (n): views in which the norm is at least the threshold.
 __kernel void view_agreement(const uint n, const float x_scale, const float y_scale, const float threshold,
-                             __global const uint *tile_counts, __global const float *screen,
-                             __global float *agreeing) {
+                             __global const uint *tile_counts, __global const float *screen, __global float *agreeing) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
   if (ndc_norm(screen, i, x_scale, y_scale) >= threshold) agreeing[i] += 1.0f;
@@ -61,6 +60,5 @@ __kernel void gather_rows(const uint count, const uint width, __global const uin
   const uint j = get_global_id(0);
   if (j >= count) return;
   const uint row = rows[j];
-  for (uint k = 0; k < width; ++k)
-    to[(size_t)width * j + k] = row == 0xffffffff ? 0.0f : from[(size_t)width * row + k];
+  for (uint k = 0; k < width; ++k) to[(size_t)width * j + k] = row == 0xffffffff ? 0.0f : from[(size_t)width * row + k];
 }

@@ -14,9 +14,9 @@
 
 #define LIMIT_SPLATS 64
 
-// The arithmetic of blending, pair after pair with no branch: every Gaussian reaches every pixel, sums stay in registers
-// and splats in the nearest cache. splats (LIMIT_SPLATS, SPLAT_SIZE) -> sums (items): keeps the work from being left
-// out. Each item does rounds * OWNED * LANES pairs.
+// The arithmetic of blending, pair after pair with no branch: every Gaussian reaches every pixel, sums stay in
+// registers and splats in the nearest cache. splats (LIMIT_SPLATS, SPLAT_SIZE) -> sums (items): keeps the work from
+// being left out. Each item does rounds * OWNED * LANES pairs.
 GROUP __kernel void limit_blend(const int rounds, __global const float *splats, __global float *sums) {
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {

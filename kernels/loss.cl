@@ -29,16 +29,16 @@ static inline void clear_margins(__global float *row, int stride) {
   for (int i = 0; i < PAD; ++i) row[i - PAD] = row[stride + i] = 0.0f;
 }
 
-#define OWN_ROWS                                                                                                      \
-  const int y = get_global_id(1), channel = get_global_id(2), channels = get_global_size(2);                          \
-  const int step = get_global_size(0) * LANES, x_first = get_global_id(0) * LANES;                                    \
-  const int padded = stride + 2 * PAD;                                                                                \
-  const size_t row = (size_t)plane * (first + channel) + (size_t)stride * y;                                          \
-  const size_t padded_plane = (size_t)padded * height;                                                                \
+#define OWN_ROWS                                                                                                       \
+  const int y = get_global_id(1), channel = get_global_id(2), channels = get_global_size(2);                           \
+  const int step = get_global_size(0) * LANES, x_first = get_global_id(0) * LANES;                                     \
+  const int padded = stride + 2 * PAD;                                                                                 \
+  const size_t row = (size_t)plane * (first + channel) + (size_t)stride * y;                                           \
+  const size_t padded_plane = (size_t)padded * height;                                                                 \
   const size_t padded_row = padded_plane * channel + (size_t)padded * y + PAD;
 
-// image, target (3, rows, stride) -> moments (5, channels, height, stride + 2 PAD), of vertical windows: means of x and y,
-// variances of x and y, covariance.
+// image, target (3, rows, stride) -> moments (5, channels, height, stride + 2 PAD), of vertical windows: means of x and
+// y, variances of x and y, covariance.
 __kernel void loss_vertical(const int first, const int height, const int stride, const int plane,
                             __global const float *image, __global const float *target, __global float *moments) {
   OWN_ROWS
@@ -71,7 +71,8 @@ __kernel void loss_vertical(const int first, const int height, const int stride,
 }
 
 // image, target, moments -> partials (3, channels, height, stride): dSSIM by the mean of x as far as it counts from the
-// pixel in the middle, by the variance and by the covariance, 0 right of the image; sums (3, 3, height, strips)[0]: SSIM.
+// pixel in the middle, by the variance and by the covariance, 0 right of the image; sums (3, 3, height, strips)[0]:
+// SSIM.
 __kernel void loss_ssim(const int first, const int width, const int height, const int stride, const int plane,
                         __global const float *image, __global const float *target, __global const float *moments,
                         __global float *partials, __global float *sums) {
@@ -116,8 +117,8 @@ __kernel void loss_ssim(const int first, const int width, const int height, cons
   sums[((size_t)(first + channel) * height + y) * get_global_size(0) + get_global_id(0)] = sumL(total);
 }
 
-// image, target, partials -> moments (5, channels, height, stride + 2 PAD): the partials' vertical windows, the first with
-// what the pixels differ by from the one in the middle; image and target, with margins.
+// image, target, partials -> moments (5, channels, height, stride + 2 PAD): the partials' vertical windows, the first
+// with what the pixels differ by from the one in the middle; image and target, with margins.
 __kernel void loss_vertical_grad(const int first, const int height, const int stride, const int plane,
                                  __global const float *image, __global const float *target,
                                  __global const float *partials, __global float *moments) {
@@ -151,8 +152,9 @@ __kernel void loss_vertical_grad(const int first, const int height, const int st
 // moments, image, target -> gradient (3, rows, stride), sums[1]: |image - target|, sums[2]: its square.
 // l1_scale and ssim_scale are the weights over the number of pixels and channels.
 __kernel void loss_grad(const int first, const int width, const int height, const int stride, const int plane,
-                        const float l1_scale, const float ssim_scale, __global const float *moments, __global const float *image,
-                        __global const float *target, __global float *gradient, __global float *sums) {
+                        const float l1_scale, const float ssim_scale, __global const float *moments,
+                        __global const float *image, __global const float *target, __global float *gradient,
+                        __global float *sums) {
   OWN_ROWS
   floatL absolute = (floatL)(0.0f), squares = absolute;
   for (int x = x_first; x < stride; x += step) {
@@ -167,8 +169,8 @@ __kernel void loss_grad(const int first, const int width, const int height, cons
       ssim = fmaL((floatL)(window[tap]), fmaL(by_p, LOADL(at + channels * padded_plane), here), ssim);
     }
     const floatL difference = p - q;
-    const floatL sign = difference > 0.0f ? (floatL)(l1_scale)
-                                          : (difference < 0.0f ? (floatL)(-l1_scale) : (floatL)(0.0f));
+    const floatL sign =
+        difference > 0.0f ? (floatL)(l1_scale) : (difference < 0.0f ? (floatL)(-l1_scale) : (floatL)(0.0f));
     const floatL column = (floatL)(x) + LANE_INDEX;
     const floatL g = fmaL((floatL)(-ssim_scale), ssim, sign);
     STOREL(column < (floatL)(width) ? g : (floatL)(0.0f), gradient + row + x);

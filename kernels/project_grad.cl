@@ -32,8 +32,8 @@ __kernel void add_slots(const uint n, __global const uint *tile_counts, __global
   for (int field = 0; field < SLOT_STRIDE; ++field) sums[(size_t)SLOT_STRIDE * i + field] = own[field];
 }
 
-// s1 - s2, their logarithms `x` apart: near each other by the series of exp(x) - 1, as what rounding leaves of two equal
-// scales' difference would turn every ball.
+// s1 - s2, their logarithms `x` apart: near each other by the series of exp(x) - 1, as what rounding leaves of two
+// equal scales' difference would turn every ball.
 static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
   floatL series = fmaL(x, (floatL)(1.0f / 720.0f), (floatL)(1.0f / 120.0f));
   series = fmaL(x, series, (floatL)(1.0f / 24.0f));
@@ -48,13 +48,12 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
                            __global const float *slots, __global const float *splats, __global const float *means,
                            __global const float *quaternions, __global const float *log_scales,
                            __global const float *opacity_logits, __global const float *sh_dc,
-                           __global const float *sh_rest,
-                           __global float *d_means,
-                           __global float *d_quaternions, __global float *d_log_scales,
-                           __global float *d_opacity_logits, __global float *d_sh_dc, __global float *d_sh_rest,
-                           __global float *screen
+                           __global const float *sh_rest, __global float *d_means, __global float *d_quaternions,
+                           __global float *d_log_scales, __global float *d_opacity_logits, __global float *d_sh_dc,
+                           __global float *d_sh_rest, __global float *screen
 #ifdef CONTRIBUTIONS
-                           , __global float *contributions
+                           ,
+                           __global float *contributions
 #endif
 ) {
   ROWS_OF_ITEM(n)

@@ -19,10 +19,10 @@
 #define BOX_SLACK 0.1f
 
 typedef struct {
-  float e1[3], e2[3]; // right and down on the tangent plane
-  float k[4];         // tangent plane by pixels: what one pixel is there
+  float e1[3], e2[3];                 // right and down on the tangent plane
+  float k[4];                         // tangent plane by pixels: what one pixel is there
   float low_x, high_x, low_y, high_y; // box in pixels, not clamped
-  int whole_rows;     // the box goes all the way round
+  int whole_rows;                     // the box goes all the way round
 } Tangent;
 
 // (10): f: the direction; reach: of the ellipse on the tangent plane, filled in by box_of.

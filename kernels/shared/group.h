@@ -11,17 +11,17 @@
 #endif
 #define GROUP __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 
-// Raises `value`, an int that every item has, to the largest of the group's. In a kernel's own scope and once in it, as it
-// declares local memory.
+// Raises `value`, an int that every item has, to the largest of the group's. In a kernel's own scope and once in it, as
+// it declares local memory.
 #if ITEMS == 1
 #define RAISE_TO_GROUP_MAX(value)
 #else
-#define RAISE_TO_GROUP_MAX(value)                                                                                     \
-  __local int group_max;                                                                                              \
-  if (get_local_id(0) == 0) group_max = value;                                                                        \
-  barrier(CLK_LOCAL_MEM_FENCE);                                                                                       \
-  atomic_max(&group_max, value);                                                                                      \
-  barrier(CLK_LOCAL_MEM_FENCE);                                                                                       \
+#define RAISE_TO_GROUP_MAX(value)                                                                                      \
+  __local int group_max;                                                                                               \
+  if (get_local_id(0) == 0) group_max = value;                                                                         \
+  barrier(CLK_LOCAL_MEM_FENCE);                                                                                        \
+  atomic_max(&group_max, value);                                                                                       \
+  barrier(CLK_LOCAL_MEM_FENCE);                                                                                        \
   value = group_max;
 #endif
 

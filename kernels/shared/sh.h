@@ -35,8 +35,8 @@ static inline void sh_basis(int coefficients, floatL x, floatL y, floatL z, floa
 }
 
 // d[3]: sum over k of weight[k] times the gradient of basis[k] by (x, y, z).
-static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, floatL z,
-                                         const floatL *weight, floatL *d) {
+static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, floatL z, const floatL *weight,
+                                         floatL *d) {
   d[0] = d[1] = d[2] = (floatL)(0.0f);
   if (coefficients < 4) return;
   d[0] = -0.4886025119029199f * weight[3];
@@ -57,9 +57,8 @@ static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, f
   d[1] += -3.0f * c9 * (xx - yy) * weight[9] + c10 * x * z * weight[10] -
           c11 * (4.0f * zz - xx - 3.0f * yy) * weight[11] - 6.0f * c12 * y * z * weight[12] +
           2.0f * c11 * x * y * weight[13] - 2.0f * c14 * y * z * weight[14] + 6.0f * c9 * x * y * weight[15];
-  d[2] += c10 * x * y * weight[10] - 8.0f * c11 * y * z * weight[11] +
-          3.0f * c12 * (2.0f * zz - xx - yy) * weight[12] - 8.0f * c11 * x * z * weight[13] +
-          c14 * (xx - yy) * weight[14];
+  d[2] += c10 * x * y * weight[10] - 8.0f * c11 * y * z * weight[11] + 3.0f * c12 * (2.0f * zz - xx - yy) * weight[12] -
+          8.0f * c11 * x * z * weight[13] + c14 * (xx - yy) * weight[14];
 }
 
 // Floats from the bits of finite halves, exactly, also where they are denormal; vload_half is slower.
