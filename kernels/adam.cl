@@ -1,10 +1,16 @@
-// Adam (Kingma and Ba 2015, algorithm 1; docs/gradients.md, equation 42) on one parameter group. It leaves the gradient
-// zero, so that the next step need only write the rows of visible Gaussians.
-// rate: learning rate / (1 - beta1^t); root: 1 / sqrt(1 - beta2^t).
+// Adam on one parameter group. It leaves the gradient zero, so that the next step need only write the rows of visible
+// Gaussians.
 //
-// No parameter and no moment becomes NaN or infinite here: an element of which the new values would be, or whose
-// parameter's square would not be less than `limit2`, is left as it is, and counted in the last four of `found` (8), of
-// which compact_visible has the first: by the parameter that it had, its gradient, its moments, or all of these well and
+// Owner: A work-item owns LANES elements that follow each other (adam), or LANES rows (adam_visible).
+// Launch: One work-item for each such piece, in groups of 64; those beyond the last piece do nothing.
+// Buffers: The group's parameters in its own units, their gradients, the moments `first` and `second`; `found` (8)
+//   counts. Scalars: rate is the learning rate / (1 - beta1^t), root is 1 / sqrt(1 - beta2^t). Shapes are above each
+//   kernel.
+// Equations: docs/gradients.md, (42); Kingma and Ba 2015, algorithm 1.
+//
+// No parameter and no moment becomes NaN or infinite here. An element is left as it is where its new values would be,
+// or where its parameter's square would not be less than `limit2`. It is counted in the last four of `found`, of which
+// compact_visible has the first four: by the parameter that it had, its gradient, its moments, or all of these well and
 // the step not. Moments that are broken begin again from zero. In the other cases the second moment becomes infinite
 // and the first 0, which refuses every step until the host has seen to the row (docs/decisions/0016-never-a-nan.md).
 #include "shared/math.h"

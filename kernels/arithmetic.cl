@@ -1,9 +1,14 @@
-// What the other kernels take for granted of a device's arithmetic, for `clsplat selftest`.
+// Division, square root, fused multiply-add and denormals, as the other kernels take them for granted, for `clsplat
+// selftest`.
+//
+// Owner: A work-item owns LANES elements that follow each other.
+// Launch: One work-item for each LANES elements, in groups of 64; those beyond the last do nothing.
+// Buffers: a, b, c (n), n a multiple of LANES, without units -> out (4, n): a / b, sqrt(b), a b + c with one rounding,
+//   and 2^-100 a times 2^-40, which is denormal where denormals are kept.
+// Equations: none.
 #include "shared/math.h"
 #include "shared/lanes.h"
 
-// a, b, c (n), n a multiple of LANES -> out (4, n): a / b, sqrt(b), a b + c with one rounding, and 2^-100 a times 2^-40,
-// which is denormal where denormals are kept.
 __kernel void arithmetic(const uint n, __global const float *a, __global const float *b, __global const float *c,
                          __global float *out) {
   const uint i = get_global_id(0) * LANES;

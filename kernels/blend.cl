@@ -1,9 +1,20 @@
-// Blending front to back until alpha saturates (Kerbl et al. 2023, section 6 and algorithm 2). A group owns a tile.
-// On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each only the cells that its ellipse reaches and
-// that have a pixel left to fill; on a GPU (LANES == 1) each work-item has pixels of its own. The bits are the same.
+// Blending front to back until alpha saturates: the image from each tile's list of Gaussians.
 //
-// `t` is the transmittance of pixels that go on and 0 in those that are finished, whose own is put aside in `kept`: there
-// no alpha has a weight, and no test is needed.
+// Owner: A group owns a tile. On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each only the
+//   cells that its ellipse reaches and that have a pixel left to fill. On a GPU (LANES == 1) each work-item has pixels
+//   of its own. The bits are the same.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, in row-major order (a band of tiles,
+//   or all).
+// Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), camera
+//   with RAYS -> image (3, height, width) of colour; transmittance (height, width): what is left at the end, 0 to 1;
+//   stops (height, width): the sorted index from which on the pixel takes no more, -1 in padding. Sizes are padded to
+//   whole tiles, and padding is black. cells_from_sorted (pairs): the cells of the tile, as bits, in which the Gaussian
+//   contributes, for the gradient to go through.
+// Equations: docs/gradients.md, (14) to (16) and (45); with RAYS docs/cameras.md, (14); Kerbl et al. 2023, section 6
+//   and algorithm 2.
+//
+// `t` is the transmittance of pixels that go on and 0 in those that are finished, whose own is put aside in `kept`:
+// there no alpha has a weight, and no test is needed.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -22,7 +33,8 @@
 #else
 #define RECORD(statements)
 #endif
-#if defined(CELLS_BY_ELLIPSE) && !defined(RECORD_CELLS) // few vectors are visited in vain: the test costs more than they
+// By ellipse few vectors are visited in vain: the test costs more than they.
+#if defined(CELLS_BY_ELLIPSE) && !defined(RECORD_CELLS)
 #define CONTRIBUTES(mask) 1
 #else
 #define CONTRIBUTES(mask) REACHES(mask)
@@ -33,29 +45,24 @@
 #define COUNT(statements)
 #endif
 
-// first_tile: the image's tile that is the first of the lists' (a band of tiles, or all), in row-major order.
-// ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), background (3) -> image (3, height, width),
-// transmittance (height, width): what is left at the end; stops (height, width): the sorted index from which on the
-// pixel takes no more, -1 in padding. Sizes are padded to whole tiles; padding is black. cells_from_sorted (pairs): the
-// cells of the tile, as bits, in which the Gaussian contributes, for the gradient to go through.
 GROUP __kernel void blend(const int first_tile, const int tiles_x, const int width, const int height,
                           __global const uint *ranges, __global const uint *gaussian_from_sorted,
-                          __global const float *splats,
-                          __global const float *background, __global float *image, __global float *transmittance,
-                          __global int *stops
+                          __global const float *splats, __global const float *background, __global float *image,
+                          __global float *transmittance, __global int *stops
 #ifdef RECORD_CELLS
-                          , __global uint *cells_from_sorted
+                          ,
+                          __global uint *cells_from_sorted
 #endif
 #ifdef RAYS
-                          , __constant float *camera
+                          ,
+                          __constant float *camera
 #endif
 #ifdef COUNT_PAIRS
-                          , __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
+                          ,
+                          __global uint *counts // (items, 2): pairs that contribute, pairs evaluated
 #endif
 ) {
-  const int tile = first_tile + get_group_id(0);
-  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
-  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];
+  TILE_OF_GROUP
   PIXEL_TABLES
   RAY_TABLES
   floatL t[OWNED], kept[OWNED], red[OWNED], green[OWNED], blue[OWNED];
@@ -64,7 +71,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
 
   Open open = 0;
   for (int k = 0; k < OWNED; ++k) {
-    const int cell = get_local_id(0) + k * ITEMS;
+    const int cell = OWN_CELL(k);
     const floatL y = (floatL)(tile_y) + PIXELS_Y(cell);
     t[k] = (floatL)(tile_x) + PIXELS_X(cell) < (floatL)(width) ? (floatL)(1.0f) : (floatL)(0.0f);
     t[k] = y < (floatL)(height) ? t[k] : (floatL)(0.0f);
@@ -130,11 +137,9 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   counts[2 * get_global_id(0) + 1] = evaluated;
 #endif
 
-  const size_t stride = (size_t)tiles_x * TILE;
-  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
   for (int k = 0; k < OWNED; ++k) {
-    const int cell = get_local_id(0) + k * ITEMS;
-    const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
+    const int cell = OWN_CELL(k);
+    const size_t pixel = CELL_IN_PLANE(cell);
     const floatL at_end = t[k] > 0.0f ? t[k] : kept[k];
     const floatL left = stop[k] >= 0 ? at_end : (floatL)(0.0f);
     STORE_CELL(float, fmaL(left, (floatL)(background[0]), red[k]), image + pixel, stride);

@@ -1,5 +1,12 @@
-// The gradient of blending, back to front (docs/gradients.md, equations 22 to 26, 48 and 49). A group owns a tile and
-// writes one slot of partial sums for each of its (tile, Gaussian) pairs, at a place of its own: no atomics.
+// The gradient of blending, back to front: partial sums for each pair of a tile and a Gaussian.
+//
+// Owner: A group owns a tile and writes one slot for each of its pairs, at a place of its own: no atomics on global
+//   memory.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Buffers: blend's, its transmittance and stops, image_gradient (3, height, width): of the loss by colour,
+//   slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE), every one of them: sums over the tile's pixels in blend's
+//   whitened units (49).
+// Equations: docs/gradients.md, (14), (22) to (26), (48), (49) and (55).
 //
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
@@ -13,7 +20,8 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#if defined(NO_GRADIENT_SKIP) || defined(CONTRIBUTIONS) // RasterizerConfig.gradient_skip; contributions are of all cells
+// RasterizerConfig.gradient_skip; contributions are of all cells.
+#if defined(NO_GRADIENT_SKIP) || defined(CONTRIBUTIONS)
 #define LIVE(cells, live) (cells)
 #else
 #define LIVE(cells, live) ((cells) & (live))
@@ -41,36 +49,28 @@ static inline void group_sums(float *values, __local float *scratch, __global fl
 }
 #endif
 
-// As blend, its transmittance and stops, image_gradient (3, height, width), slot_from_sorted (pairs)
-// -> slots (pairs, SLOT_STRIDE), every one of them.
-GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const int height,
-                               __global const uint *ranges,
+GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
                                __global const uint *gaussian_from_sorted, __global const uint *slot_from_sorted,
                                __global const float *splats, __global const float *background,
                                __global const float *image_gradient, __global const float *transmittance,
                                __global const int *stops, __global float *slots
 #ifdef RECORD_CELLS
-                               , __global const uint *cells_from_sorted
+                               ,
+                               __global const uint *cells_from_sorted
 #endif
 ) {
 #if ITEMS > 1
   __local float scratch[SLOT_STRIDE * ITEMS];
-  __local int group_last;
 #endif
-  const int tile = first_tile + get_group_id(0);
-  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
-  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];
-  const size_t stride = (size_t)tiles_x * TILE;
-  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
-
+  TILE_OF_GROUP
   PIXEL_TABLES
   floatL t[OWNED], behind[OWNED], g_red[OWNED], g_green[OWNED], g_blue[OWNED];
   intL stop[OWNED];
   int last = begin;
   Open live = 0; // cells with a pixel that has a gradient
   for (int k = 0; k < OWNED; ++k) {
-    const int cell = get_local_id(0) + k * ITEMS;
-    const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
+    const int cell = OWN_CELL(k);
+    const size_t pixel = CELL_IN_PLANE(cell);
     t[k] = LOAD_CELL(float, transmittance + pixel, stride);
     stop[k] = LOAD_CELL(int, stops + pixel, stride);
     const intL inside = MASKL(stop[k] >= 0); // in padding nobody has written a gradient, and 0 * NaN is not 0
@@ -81,13 +81,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     last = max(last, maxL(stop[k]));
     if (ANYL((g_red[k] != 0.0f) | (g_green[k] != 0.0f) | (g_blue[k] != 0.0f))) OPEN_CELL(live, cell);
   }
-#if ITEMS > 1
-  if (get_local_id(0) == 0) group_last = begin;
-  barrier(CLK_LOCAL_MEM_FENCE);
-  atomic_max(&group_last, last);
-  barrier(CLK_LOCAL_MEM_FENCE);
-  last = group_last;
-#endif
+  RAISE_TO_GROUP_MAX(last)
 #ifdef NO_LAST_CONTRIBUTOR // RasterizerConfig.last_contributor: begin at the end of the list, to no effect
   last = end;
 #endif

@@ -1,6 +1,14 @@
-// The channels beside colour (docs/channels.md): features blended with the weights of the image, and what needs the order
-// of the Gaussians: depths at which a pixel is first hit and half opaque, how many it takes and which weighs most. A
-// group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
+// The channels beside colour: features blended with the weights of the image, and what needs the order of the
+// Gaussians: depths at which a pixel is first hit and half opaque, how many it takes and which weighs most.
+//
+// Owner: A group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Buffers: blend's ranges, gaussian_from_sorted, splats and stops, features (n, FEATURES) of features.cl, camera with
+//   RAYS -> planes (PLANES, height, width): mean features by weight, in their units, those from FEATURE_NORMAL on of
+//   unit length; depth of the median and of the first, in world units. whole (2, height, width): count, and the index
+//   of the Gaussian with the largest weight, the first of those, -1 for none. All else is 0 where nothing was added,
+//   and in padding.
+// Equations: docs/channels.md, (60) to (67); with RAYS docs/cameras.md, (14).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -13,35 +21,24 @@
 #define MEDIAN FEATURES
 #define FIRST (FEATURES + 1)
 
-// ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), features (n, FEATURES), stops (height, width)
-// of blend.cl, for the tiles from first_tile on -> planes (PLANES, height, width): mean features by weight, those from
-// FEATURE_NORMAL on of unit length; depth of the median, of the first; whole (2, height, width): count, and the index of
-// the Gaussian with the largest weight, the first of those, -1 for none. All 0 where nothing was added, and in padding.
 GROUP __kernel void channels(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
                              __global const uint *gaussian_from_sorted, __global const float *splats,
                              __global const float *features, __global const int *stops, __global float *planes,
                              __global int *whole
 #ifdef RAYS
-                             , __constant float *camera
+                             ,
+                             __constant float *camera
 #endif
 ) {
-#if ITEMS > 1
-  __local int group_last;
-#endif
-  const int tile = first_tile + get_group_id(0);
-  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
-  const int begin = ranges[2 * get_group_id(0)];
-  const size_t stride = (size_t)tiles_x * TILE;
-  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
-
+  TILE_OF_GROUP
   PIXEL_TABLES
   RAY_TABLES
   floatL t[OWNED], sums[FEATURES + 1][OWNED], median[OWNED], nearest[OWNED], largest[OWNED];
   intL stop[OWNED], count[OWNED], heaviest[OWNED];
   int last = begin;
   for (int k = 0; k < OWNED; ++k) {
-    const int cell = get_local_id(0) + k * ITEMS;
-    stop[k] = LOAD_CELL(int, stops + stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell), stride);
+    const int cell = OWN_CELL(k);
+    stop[k] = LOAD_CELL(int, stops + CELL_IN_PLANE(cell), stride);
     t[k] = (floatL)(1.0f);
     for (int field = 0; field <= FEATURES; ++field) sums[field][k] = (floatL)(0.0f);
     median[k] = nearest[k] = largest[k] = (floatL)(0.0f);
@@ -49,13 +46,7 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
     heaviest[k] = (intL)(-1);
     last = max(last, maxL(stop[k]));
   }
-#if ITEMS > 1
-  if (get_local_id(0) == 0) group_last = begin;
-  barrier(CLK_LOCAL_MEM_FENCE);
-  atomic_max(&group_last, last);
-  barrier(CLK_LOCAL_MEM_FENCE);
-  last = group_last;
-#endif
+  RAISE_TO_GROUP_MAX(last)
 
   for (int i = begin; i < last; ++i) {
     const uint gaussian = gaussian_from_sorted[i];
@@ -72,9 +63,7 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
       const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
       if (ANYL(taken)) {
         const floatL before = t[k];
-        floatL alpha = exp2L(power);
-        alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
-        alpha = AS_FLOATL(AS_INTL(alpha) & taken);
+        const floatL alpha = alpha_where(taken, power);
         const floatL weight = before * alpha;
         t[k] = fmaL(-before, alpha, before);
         for (int field = 0; field < FEATURES; ++field)
@@ -93,8 +82,8 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
   }
 
   for (int k = 0; k < OWNED; ++k) {
-    const int cell = get_local_id(0) + k * ITEMS;
-    const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
+    const int cell = OWN_CELL(k);
+    const size_t pixel = CELL_IN_PLANE(cell);
     const floatL total = sums[FEATURES][k];
     const floatL divisor = total > 0.0f ? total : (floatL)(1.0f);
 #ifdef FEATURE_NORMAL

@@ -1,6 +1,12 @@
-// A picture in slices by depth (docs/pictures.md, equations 70 to 73): the Gaussians of each bin of depths blended as if
-// they were alone, up to where the pixel ends in blend.cl. A tile's list is in order of depth, so that the bins come one
-// after the other. A group owns a tile, as in blend.cl.
+// A picture in slices by depth: the Gaussians of each bin of depths blended as if they were alone, up to where the
+// pixel ends in blend.cl. A tile's list is in order of depth, so that the bins come one after the other.
+//
+// Owner: A group owns a tile, as in blend.cl.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Buffers: blend's ranges, gaussian_from_sorted, splats and stops; bounds (bins - 1): the depths at which the next bin
+//   begins, rising, in world units; camera with RAYS -> planes (bins, DEEP_SIZE, height, width): colour associated with
+//   alpha, alpha, least and largest depth in world units. All 0 where nothing is added.
+// Equations: docs/pictures.md, (70) to (73).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -16,44 +22,28 @@
 #define DEEP_FIRST 4
 #define DEEP_LAST 5
 
-// ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE), stops (height, width) of blend.cl, for the
-// tiles from first_tile on; bounds (bins - 1): the depths at which the next bin begins, rising -> planes (bins,
-// DEEP_SIZE, height, width): colour associated with alpha, alpha, least and largest depth. All 0 where nothing is added.
 GROUP __kernel void deep(const int first_tile, const int tiles_x, const int height, const int bins,
                          __constant float *bounds, __global const uint *ranges,
                          __global const uint *gaussian_from_sorted, __global const float *splats,
                          __global const int *stops, __global float *planes
 #ifdef RAYS
-                         , __constant float *camera
+                         ,
+                         __constant float *camera
 #endif
 ) {
-#if ITEMS > 1
-  __local int group_last;
-#endif
-  const int tile = first_tile + get_group_id(0);
-  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
-  const int begin = ranges[2 * get_group_id(0)];
-  const size_t stride = (size_t)tiles_x * TILE;
-  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
-
+  TILE_OF_GROUP
   PIXEL_TABLES
   RAY_TABLES
   floatL values[DEEP_SIZE][OWNED]; // of the bin; DEEP_ALPHA: its transmittance
   intL stop[OWNED];
   int last = begin;
   for (int k = 0; k < OWNED; ++k) {
-    const int cell = get_local_id(0) + k * ITEMS;
-    stop[k] = LOAD_CELL(int, stops + stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell), stride);
+    const int cell = OWN_CELL(k);
+    stop[k] = LOAD_CELL(int, stops + CELL_IN_PLANE(cell), stride);
     for (int field = 0; field < DEEP_SIZE; ++field) values[field][k] = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
     last = max(last, maxL(stop[k]));
   }
-#if ITEMS > 1
-  if (get_local_id(0) == 0) group_last = begin;
-  barrier(CLK_LOCAL_MEM_FENCE);
-  atomic_max(&group_last, last);
-  barrier(CLK_LOCAL_MEM_FENCE);
-  last = group_last;
-#endif
+  RAISE_TO_GROUP_MAX(last)
 
   int i = begin;
   for (int bin = 0; bin < bins; ++bin) {
@@ -71,9 +61,7 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
         const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
         if (ANYL(taken)) {
           const floatL before = values[DEEP_ALPHA][k];
-          floatL alpha = exp2L(power);
-          alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
-          alpha = AS_FLOATL(AS_INTL(alpha) & taken);
+          const floatL alpha = alpha_where(taken, power);
           const floatL weight = before * alpha;
           values[DEEP_ALPHA][k] = fmaL(-before, alpha, before);
           for (int channel = 0; channel < 3; ++channel)
@@ -86,8 +74,8 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
       }
     }
     for (int k = 0; k < OWNED; ++k) {
-      const int cell = get_local_id(0) + k * ITEMS;
-      const size_t pixel = stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell);
+      const int cell = OWN_CELL(k);
+      const size_t pixel = CELL_IN_PLANE(cell);
       for (int field = 0; field < DEEP_SIZE; ++field) {
         const floatL value = values[field][k];
         STORE_CELL(float, field == DEEP_ALPHA ? 1.0f - value : value,

@@ -1,4 +1,10 @@
-// What adaptive density control (Kerbl et al. 2023, section 5) asks of the device: statistics and moving rows.
+// Statistics that adaptive density control reads, and the moving of rows that it orders.
+//
+// Owner: A work-item owns a Gaussian, in gather_rows a row that is written.
+// Launch: One work-item for each Gaussian or row, in groups of 64; those beyond the last do nothing.
+// Buffers: tile_counts (n): 0 where not seen; screen (n, 2): gradient of the mean on the image, per pixel; splats (n,
+//   SPLAT_SIZE) in pixels. Statistics (n) are added to in place. Shapes of the rest are above each kernel.
+// Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
 #include "shared/splat.h"
 
@@ -13,8 +19,8 @@ static inline float ndc_norm(__global const float *screen, const size_t i, const
 // at 3 sigma. A view in which one of them is not finite does not count, here and below.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
                                  __global const uint *tile_counts, __global const float *screen,
-                                 __global const float *splats, __global float *gradient_sums,
-                                 __global float *seen, __global float *radii) {
+                                 __global const float *splats, __global float *gradient_sums, __global float *seen,
+                                 __global float *radii) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
   const float norm = ndc_norm(screen, i, x_scale, y_scale);
@@ -29,8 +35,7 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
 
 // As density_statistics -> agreeing (n): views in which the norm is at least the threshold.
 __kernel void view_agreement(const uint n, const float x_scale, const float y_scale, const float threshold,
-                             __global const uint *tile_counts, __global const float *screen,
-                             __global float *agreeing) {
+                             __global const uint *tile_counts, __global const float *screen, __global float *agreeing) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
   if (ndc_norm(screen, i, x_scale, y_scale) >= threshold) agreeing[i] += 1.0f;
@@ -55,6 +60,5 @@ __kernel void gather_rows(const uint count, const uint width, __global const uin
   const uint j = get_global_id(0);
   if (j >= count) return;
   const uint row = rows[j];
-  for (uint k = 0; k < width; ++k)
-    to[(size_t)width * j + k] = row == 0xffffffff ? 0.0f : from[(size_t)width * row + k];
+  for (uint k = 0; k < width; ++k) to[(size_t)width * j + k] = row == 0xffffffff ? 0.0f : from[(size_t)width * row + k];
 }

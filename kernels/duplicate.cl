@@ -1,5 +1,13 @@
 // From visible Gaussians to one (tile, Gaussian) pair for each tile that an ellipse reaches, in order of depth, so that
 // a stable sort by tile alone leaves each tile's Gaussians front to back.
+//
+// Owner: A group owns a chunk of Gaussians in compact_visible. Elsewhere a work-item owns a Gaussian, in order_pairs a
+//   pair.
+// Launch: One group of ITEMS work-items for each chunk; elsewhere one work-item for each Gaussian or pair, in groups of
+//   64.
+// Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts, slots (n), counts of pairs and their
+//   scan. Shapes of the rest are above each kernel.
+// Equations: docs/gradients.md, (47), by shared/tile.h, which project.cl counts with.
 #include "shared/math.h"
 #include "shared/group.h"
 #include "shared/tile.h"
@@ -48,8 +56,7 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
 
 // order (visible): by depth -> gaussian_from_rank, counts (visible)
 __kernel void order_counts(const uint visible, __global const uint *order, __global const uint *gaussian_from_visible,
-                           __global const uint *tile_counts, __global uint *gaussian_from_rank,
-                           __global uint *counts) {
+                           __global const uint *tile_counts, __global uint *gaussian_from_rank, __global uint *counts) {
   const uint rank = get_global_id(0);
   if (rank >= visible) return;
   const uint i = gaussian_from_visible[order[rank]];
@@ -75,8 +82,7 @@ __kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, 
 
 // tile_counts (n): on the whole image -> band_counts (n): among the tiles [first_tile, end_tile)
 __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, const int first_tile, const int end_tile,
-                          __global const uint *tile_counts, __global const float *splats,
-                          __global uint *band_counts) {
+                          __global const uint *tile_counts, __global const float *splats, __global uint *band_counts) {
   const uint i = get_global_id(0);
   if (i >= n) return;
   uint count = 0;
@@ -99,8 +105,7 @@ __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, co
 // slots the Gaussians, so that what is summed over slots streams through memory.
 // Only tiles from first_tile to before end_tile, from which keys count.
 __kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y, const int first_tile,
-                        const int end_tile,
-                        __global const uint *gaussian_from_rank, __global const uint *offsets,
+                        const int end_tile, __global const uint *gaussian_from_rank, __global const uint *offsets,
                         __global const uint *slots, __global const float *splats, __global uint *tile_keys,
                         __global uint2 *pair_ids) {
   const uint rank = get_global_id(0);
@@ -153,8 +158,7 @@ __kernel void duplicate_slots(const uint visible, const int tiles_x, const int t
 
 // slot_from_pair (pairs): by depth; tiles, gaussian_from_slot (pairs): by slot -> tile_keys, pair_ids (pairs): by depth
 __kernel void order_pairs(const uint pairs, __global const uint *slot_from_pair, __global const uint *tiles,
-                          __global const uint *gaussian_from_slot, __global uint *tile_keys,
-                          __global uint2 *pair_ids) {
+                          __global const uint *gaussian_from_slot, __global uint *tile_keys, __global uint2 *pair_ids) {
   const uint pair = get_global_id(0);
   if (pair >= pairs) return;
   const uint slot = slot_from_pair[pair];

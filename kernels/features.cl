@@ -1,5 +1,12 @@
-// What a Gaussian brings to the channels beside colour (docs/channels.md): a row of FEATURES floats for each visible one.
-// FEATURE_X is the place of X in the row, where X is wanted. Built with one lane: its bits are those of any shape.
+// What a Gaussian brings to the channels beside colour: a row of FEATURES floats for each visible one. FEATURE_X is the
+// place of X in the row, where X is wanted.
+//
+// Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
+// Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
+// Buffers: camera: the frame's own; after: the one that motion goes to; tile_counts (n): 0 where not visible; means,
+//   quaternions, log_scales as in project.cl; splats (n, SPLAT_SIZE), all of one projection -> features (n, FEATURES),
+//   written where visible: depth and position in world units, a normal of unit length, motion in pixels.
+// Equations: docs/channels.md, (61) to (64), (74) and (75).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -39,7 +46,8 @@ static inline InCamera in_camera(__constant float *camera, float x, float y, flo
 }
 
 // What a value of the camera has grown by.
-#define GROWN(name) ((after[CAMERA_##name] - camera[CAMERA_##name]) + (after[CAMERA_##name##_LOW] - camera[CAMERA_##name##_LOW]))
+#define GROWN(name)                                                                                                    \
+  ((after[CAMERA_##name] - camera[CAMERA_##name]) + (after[CAMERA_##name##_LOW] - camera[CAMERA_##name##_LOW]))
 
 // Angles by what the coordinates have grown by (74), (75): a small motion is nothing beside the rounding of two angles.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
@@ -89,22 +97,19 @@ static inline void motion_of(__constant float *camera, float x, float y, float z
   motion[0] = motion[1] = 0.0f;
   if (!(at_z.high > camera[CAMERA_NEAR])) return;
   float whole, rest;
-  image_position(at_x.high, at_x.low, at_z.high, at_z.low, camera[CAMERA_FX], camera[CAMERA_FX_LOW],
-                 camera[CAMERA_CX], camera[CAMERA_CX_LOW], camera[CAMERA_WINDOW_X], &whole, &rest);
+  image_position(at_x.high, at_x.low, at_z.high, at_z.low, camera[CAMERA_FX], camera[CAMERA_FX_LOW], camera[CAMERA_CX],
+                 camera[CAMERA_CX_LOW], camera[CAMERA_WINDOW_X], &whole, &rest);
   motion[0] = (whole - splat[SPLAT_PIXEL_X]) + (rest - splat[SPLAT_SUB_X]);
-  image_position(at_y.high, at_y.low, at_z.high, at_z.low, camera[CAMERA_FY], camera[CAMERA_FY_LOW],
-                 camera[CAMERA_CY], camera[CAMERA_CY_LOW], camera[CAMERA_WINDOW_Y], &whole, &rest);
+  image_position(at_y.high, at_y.low, at_z.high, at_z.low, camera[CAMERA_FY], camera[CAMERA_FY_LOW], camera[CAMERA_CY],
+                 camera[CAMERA_CY_LOW], camera[CAMERA_WINDOW_Y], &whole, &rest);
   motion[1] = (whole - splat[SPLAT_PIXEL_Y]) + (rest - splat[SPLAT_SUB_Y]);
 }
 #endif
 #endif
 
-// tile_counts (n): 0 where not visible; camera: the frame's own; after: the one that motion goes to; splats (n,
-// SPLAT_SIZE) -> features (n, FEATURES), written where visible. All of one projection.
 __kernel void features(const uint n, __constant float *camera, __constant float *after,
-                       __global const uint *tile_counts, __global const float *means,
-                       __global const float *quaternions, __global const float *log_scales,
-                       __global const float *splats, __global float *features) {
+                       __global const uint *tile_counts, __global const float *means, __global const float *quaternions,
+                       __global const float *log_scales, __global const float *splats, __global float *features) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
   __global float *row = features + FEATURES * i;

@@ -1,4 +1,10 @@
 // What the device can do at most, in the terms of the pipeline: `clsplat bench` states each stage's share of it.
+//
+// Owner: A work-item owns OWNED cells of pixels that nobody sees; in limit_copy LANES elements.
+// Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy one work-item for each LANES elements.
+// Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep the work from being left out.
+//   limit_copy: from (n) -> to (n).
+// Equations: those of blend.cl and blend_grad.cl, with no branch.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -8,13 +14,12 @@
 
 #define LIMIT_SPLATS 64
 
-// The arithmetic of blending, pair after pair with no branch: every Gaussian reaches every pixel, sums stay in registers
-// and splats in the nearest cache. splats (LIMIT_SPLATS, SPLAT_SIZE) -> sums (items): keeps the work from being left
-// out. Each item does rounds * OWNED * LANES pairs.
+// The arithmetic of blending, pair after pair with no branch: every Gaussian reaches every pixel, sums stay in
+// registers and splats in the nearest cache. splats (LIMIT_SPLATS, SPLAT_SIZE) -> sums (items): keeps the work from
+// being left out. Each item does rounds * OWNED * LANES pairs.
 GROUP __kernel void limit_blend(const int rounds, __global const float *splats, __global float *sums) {
   float sum = 0.0f;
   for (int k = 0; k < OWNED; ++k) {
-    const int vector = get_local_id(0) + k * ITEMS;
     const floatL x = PIXELS_X(k), y = PIXELS_Y(k);
     floatL t = (floatL)(1.0f), red = (floatL)(0.0f), green = (floatL)(0.0f), blue = (floatL)(0.0f);
     for (int i = 0; i < rounds; ++i) {

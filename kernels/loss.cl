@@ -1,16 +1,18 @@
-// The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient (docs/gradients.md, equations 17 to 21), SSIM with the
-// usual 11 x 11 Gaussian window, sigma 1.5, zeros outside the image. The window is separable: vertical first, which
-// needs no margin, into planes with PAD zero columns on either side, then horizontal without bounds checks. A second
-// pair of passes convolves the three partial derivatives, the adjoint of the first.
+// The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient. SSIM has the usual 11 x 11 Gaussian window, sigma 1.5,
+// zeros outside the image. The window is separable: vertical first, which needs no margin, into planes with PAD zero
+// columns on either side, then horizontal without bounds checks. A second pair of passes convolves the three partial
+// derivatives, the adjoint of the first.
 //
-// E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So whatever a window is added up of counts from the pixel in
-// its middle (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is one of
+// Owner: A work-item owns every get_global_size(0)-th vector of one row of one channel: a whole row on a CPU.
+// Launch: A grid of strips x height x channels: all three channels at once, or one after the other where memory is
+//   short. `first` is the channel of the image that is the first of the launch's.
+// Buffers: image, target (3, rows, stride) in colour, padded to whole tiles; moments, partials and gradient, whose
+//   shapes are above each kernel; sums (3, 3, height, strips): SSIM, |image - target| and its square.
+// Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79).
+//
+// E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So whatever a window is added up of counts from the
+// pixel in its middle (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is one of
 // differences between a pixel and its neighbours.
-//
-// `first` is the channel of the image that is the first of a launch's: all three go at once, or one after the other where
-// memory is short, `channels` of them.
-//
-// A work-item owns every get_global_size(0)-th vector of one row of one channel: a whole row on a CPU.
 #include "shared/math.h"
 #include "shared/lanes.h"
 
@@ -27,16 +29,16 @@ static inline void clear_margins(__global float *row, int stride) {
   for (int i = 0; i < PAD; ++i) row[i - PAD] = row[stride + i] = 0.0f;
 }
 
-#define OWN_ROWS                                                                                                      \
-  const int y = get_global_id(1), channel = get_global_id(2), channels = get_global_size(2);                          \
-  const int step = get_global_size(0) * LANES, x_first = get_global_id(0) * LANES;                                    \
-  const int padded = stride + 2 * PAD;                                                                                \
-  const size_t row = (size_t)plane * (first + channel) + (size_t)stride * y;                                          \
-  const size_t padded_plane = (size_t)padded * height;                                                                \
+#define OWN_ROWS                                                                                                       \
+  const int y = get_global_id(1), channel = get_global_id(2), channels = get_global_size(2);                           \
+  const int step = get_global_size(0) * LANES, x_first = get_global_id(0) * LANES;                                     \
+  const int padded = stride + 2 * PAD;                                                                                 \
+  const size_t row = (size_t)plane * (first + channel) + (size_t)stride * y;                                           \
+  const size_t padded_plane = (size_t)padded * height;                                                                 \
   const size_t padded_row = padded_plane * channel + (size_t)padded * y + PAD;
 
-// image, target (3, rows, stride) -> moments (5, channels, height, stride + 2 PAD), of vertical windows: means of x and y,
-// variances of x and y, covariance.
+// image, target (3, rows, stride) -> moments (5, channels, height, stride + 2 PAD), of vertical windows: means of x and
+// y, variances of x and y, covariance.
 __kernel void loss_vertical(const int first, const int height, const int stride, const int plane,
                             __global const float *image, __global const float *target, __global float *moments) {
   OWN_ROWS
@@ -69,7 +71,8 @@ __kernel void loss_vertical(const int first, const int height, const int stride,
 }
 
 // image, target, moments -> partials (3, channels, height, stride): dSSIM by the mean of x as far as it counts from the
-// pixel in the middle, by the variance and by the covariance, 0 right of the image; sums (3, 3, height, strips)[0]: SSIM.
+// pixel in the middle, by the variance and by the covariance, 0 right of the image; sums (3, 3, height, strips)[0]:
+// SSIM.
 __kernel void loss_ssim(const int first, const int width, const int height, const int stride, const int plane,
                         __global const float *image, __global const float *target, __global const float *moments,
                         __global float *partials, __global float *sums) {
@@ -114,8 +117,8 @@ __kernel void loss_ssim(const int first, const int width, const int height, cons
   sums[((size_t)(first + channel) * height + y) * get_global_size(0) + get_global_id(0)] = sumL(total);
 }
 
-// image, target, partials -> moments (5, channels, height, stride + 2 PAD): the partials' vertical windows, the first with
-// what the pixels differ by from the one in the middle; image and target, with margins.
+// image, target, partials -> moments (5, channels, height, stride + 2 PAD): the partials' vertical windows, the first
+// with what the pixels differ by from the one in the middle; image and target, with margins.
 __kernel void loss_vertical_grad(const int first, const int height, const int stride, const int plane,
                                  __global const float *image, __global const float *target,
                                  __global const float *partials, __global float *moments) {
@@ -149,8 +152,9 @@ __kernel void loss_vertical_grad(const int first, const int height, const int st
 // moments, image, target -> gradient (3, rows, stride), sums[1]: |image - target|, sums[2]: its square.
 // l1_scale and ssim_scale are the weights over the number of pixels and channels.
 __kernel void loss_grad(const int first, const int width, const int height, const int stride, const int plane,
-                        const float l1_scale, const float ssim_scale, __global const float *moments, __global const float *image,
-                        __global const float *target, __global float *gradient, __global float *sums) {
+                        const float l1_scale, const float ssim_scale, __global const float *moments,
+                        __global const float *image, __global const float *target, __global float *gradient,
+                        __global float *sums) {
   OWN_ROWS
   floatL absolute = (floatL)(0.0f), squares = absolute;
   for (int x = x_first; x < stride; x += step) {
@@ -165,8 +169,8 @@ __kernel void loss_grad(const int first, const int width, const int height, cons
       ssim = fmaL((floatL)(window[tap]), fmaL(by_p, LOADL(at + channels * padded_plane), here), ssim);
     }
     const floatL difference = p - q;
-    const floatL sign = difference > 0.0f ? (floatL)(l1_scale)
-                                          : (difference < 0.0f ? (floatL)(-l1_scale) : (floatL)(0.0f));
+    const floatL sign =
+        difference > 0.0f ? (floatL)(l1_scale) : (difference < 0.0f ? (floatL)(-l1_scale) : (floatL)(0.0f));
     const floatL column = (floatL)(x) + LANE_INDEX;
     const floatL g = fmaL((floatL)(-ssim_scale), ssim, sign);
     STOREL(column < (floatL)(width) ? g : (floatL)(0.0f), gradient + row + x);

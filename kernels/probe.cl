@@ -1,4 +1,9 @@
-// One wrapper for each shared function, so that tests can call it alone.
+// One wrapper for each shared function, so that tests can call it alone; a device is opened with probe_fma.
+//
+// Owner: A work-item owns an element; the one of probe_fma all of them.
+// Launch: One work-item for each element; probe_fma a single one.
+// Buffers: Above each kernel, without units.
+// Equations: none.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"

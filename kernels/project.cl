@@ -1,6 +1,14 @@
-// Projection (Kerbl et al. 2023, section 4; docs/gradients.md, equations 1 to 13, 44 to 47 and 53 to 57; orthographic:
-// docs/cameras.md, 15 to 17): each Gaussian to its ellipse, colour, depth and number of tiles. A work-item has LANES Gaussians: in vectors as far as all have the same
-// to do, then the visible ones by turns.
+// Projection of perspective and orthographic cameras: each Gaussian to its ellipse, colour, depth and number of tiles.
+//
+// Owner: A work-item owns LANES Gaussians: in vectors as far as all have the same to do, then the visible ones by
+//   turns.
+// Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
+// Buffers: means (n, 3) in world units, quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n,
+//   3), sh_rest (n, coefficients - 1, 3) -> splats (n, SPLAT_SIZE) in pixels, depth in world units, written where
+//   visible; tile_counts (n): 0 where culled. With KEEP_CULLED shown (n): 1 where a splat is written, also of those
+//   that have no tile. Of a model that is held: with SH_DEGREES sh_degrees (n): the highest that is looked at.
+// Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
+//   Kerbl et al. 2023, section 4.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -16,11 +24,6 @@
 #define KEEP_CULLED !opaque.lane[lane]
 #endif
 
-// means (n, 3), quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n, 3),
-// sh_rest (n, coefficients - 1, 3); splats (n, SPLAT_SIZE): written where visible; tile_counts (n): 0 where culled.
-// A colour that is not finite, or of more than COLOUR_LIMIT, is not drawn: one such pixel would be all of the loss.
-// With KEEP_CULLED shown (n): 1 where a splat is written, also of those that have no tile. Of a model that is held:
-// with SH_DEGREES sh_degrees (n): the highest that is looked at.
 __kernel void project(const uint n, const int coefficients, const int tiles_x, const int tiles_y,
                       __constant float *camera, __global const float *means, __global const float *quaternions,
                       __global const float *log_scales, __global const float *opacity_logits,
@@ -104,17 +107,10 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     if (count == 0) continue;
 #endif
     tile_counts[i] = count;
-#ifdef SH_DEGREES
-    const int bands = sh_degrees[i] + 1, used = min(SH_USED(coefficients), bands * bands);
-#else
-    const int used = SH_USED(coefficients);
-#endif
-    float4 colour = sh_fma(SH_CONSTANT, (float4)(sh_dc[3 * i], sh_dc[3 * i + 1], sh_dc[3 * i + 2], 0.0f), (float4)(0.5f));
-    __global const shT *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
-    for (int k = 1; k < used; ++k, f += 3)
-      colour = sh_fma(basis[k].lane[lane], sh_channels(f, k + 1 == coefficients), colour);
+    const float4 colour = sh_colour(basis, lane, SH_OF_GAUSSIAN(i, coefficients), coefficients, sh_dc + 3 * i,
+                                    sh_rest + 3 * (coefficients - 1) * i);
 #ifndef UNGUARDED
-    if (!(colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT)) {
+    if (!colour_is_drawn(colour)) {
       tile_counts[i] = 0;
 #ifdef KEEP_CULLED
       shown[i] = 0;
@@ -122,8 +118,6 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
       continue;
     }
 #endif
-    splat[SPLAT_RED] = colour.x > 0.0f ? colour.x : 0.0f;
-    splat[SPLAT_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
-    splat[SPLAT_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
+    store_colour(colour, splat + SPLAT_RED);
   }
 }

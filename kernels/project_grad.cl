@@ -1,6 +1,14 @@
 // The gradient of projection: sums a Gaussian's slots in the order of its tiles, then the chain rule back to its
-// parameters (docs/gradients.md, equations 25 to 41 in the forms 50, 52 and 58 to 61). A work-item has LANES Gaussians,
-// of which it leaves those that are not visible.
+// parameters.
+//
+// Owner: A work-item owns LANES Gaussians, of which it leaves those that are not visible; in add_slots one.
+// Launch: One work-item for each LANES Gaussians, or for each one, in groups of 64; those beyond the last do nothing.
+// Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE);
+//   tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project.cl -> gradients of the
+//   parameters, of the same shapes, in loss per unit of each; rows of Gaussians that are not visible are left as they
+//   are. screen (n, 2): of the mean on the image, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n):
+//   what each adds to the image, sums of its blending weights over all pixels.
+// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -24,8 +32,8 @@ __kernel void add_slots(const uint n, __global const uint *tile_counts, __global
   for (int field = 0; field < SLOT_STRIDE; ++field) sums[(size_t)SLOT_STRIDE * i + field] = own[field];
 }
 
-// s1 - s2, their logarithms `x` apart: near each other by the series of exp(x) - 1, as what rounding leaves of two equal
-// scales' difference would turn every ball.
+// s1 - s2, their logarithms `x` apart: near each other by the series of exp(x) - 1, as what rounding leaves of two
+// equal scales' difference would turn every ball.
 static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
   floatL series = fmaL(x, (floatL)(1.0f / 720.0f), (floatL)(1.0f / 120.0f));
   series = fmaL(x, series, (floatL)(1.0f / 24.0f));
@@ -35,23 +43,17 @@ static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
   return x * x < 0.0625f ? series : s1 - s2;
 }
 
-// slots (pairs, SLOT_STRIDE), or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE).
-// tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project
-// -> gradients of the parameters (same shapes; rows of Gaussians that are not visible are left as they are) and of
-// the mean on the image: screen (n, 2) in pixels, plain or absolute; with CONTRIBUTIONS what each adds to the image:
-// contributions (n), sums of its blending weights over all pixels (55).
 __kernel void project_grad(const uint n, const int coefficients, __constant float *camera,
                            __global const uint *tile_counts, __global const uint *first_slots,
                            __global const float *slots, __global const float *splats, __global const float *means,
                            __global const float *quaternions, __global const float *log_scales,
                            __global const float *opacity_logits, __global const float *sh_dc,
-                           __global const float *sh_rest,
-                           __global float *d_means,
-                           __global float *d_quaternions, __global float *d_log_scales,
-                           __global float *d_opacity_logits, __global float *d_sh_dc, __global float *d_sh_rest,
-                           __global float *screen
+                           __global const float *sh_rest, __global float *d_means, __global float *d_quaternions,
+                           __global float *d_log_scales, __global float *d_opacity_logits, __global float *d_sh_dc,
+                           __global float *d_sh_rest, __global float *screen
 #ifdef CONTRIBUTIONS
-                           , __global float *contributions
+                           ,
+                           __global float *contributions
 #endif
 ) {
   ROWS_OF_ITEM(n)

@@ -1,6 +1,11 @@
-// Projection for equirectangular (RAYS == 1) and fisheye (RAYS == 2) cameras (docs/cameras.md, equations 8 to 14): each
-// Gaussian to its ellipse on the plane that touches the sphere of directions at its mean's, where perspective bends it
-// least; there is no pole and no seam. Built with one lane: its bits are those of any shape.
+// Projection for equirectangular (RAYS == 1) and fisheye (RAYS == 2) cameras: each Gaussian to its ellipse on the plane
+// that touches the sphere of directions at its mean's, where perspective bends it least; there is no pole and no seam.
+//
+// Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
+// Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
+// Buffers: As in project.cl, but for what that can leave out of a model that is held -> splats (n, RAY_SIZE),
+//   directions in the camera's axes and distance in world units; tile_counts (n).
+// Equations: docs/cameras.md, (8) to (14); colour docs/gradients.md, (12).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -14,10 +19,10 @@
 #define BOX_SLACK 0.1f
 
 typedef struct {
-  float e1[3], e2[3]; // right and down on the tangent plane
-  float k[4];         // tangent plane by pixels: what one pixel is there
+  float e1[3], e2[3];                 // right and down on the tangent plane
+  float k[4];                         // tangent plane by pixels: what one pixel is there
   float low_x, high_x, low_y, high_y; // box in pixels, not clamped
-  int whole_rows;     // the box goes all the way round
+  int whole_rows;                     // the box goes all the way round
 } Tangent;
 
 // (10): f: the direction; reach: of the ellipse on the tangent plane, filled in by box_of.
@@ -133,7 +138,6 @@ static inline void store_box(const Tangent *t, int width, int height, int tiles_
   splat[RAY_ROWS] = as_float((uint)y0 | (uint)y1 << 16);
 }
 
-// As `project` in project.cl, but for what it can leave out of a model that is held; such a colour is not drawn either.
 __kernel void project_rays(const uint n, const int coefficients, const int width, const int height,
                            __constant float *camera, __global const float *means, __global const float *quaternions,
                            __global const float *log_scales, __global const float *opacity_logits,
@@ -215,22 +219,13 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
 
   const float away[3] = {x - camera[CAMERA_PX], y - camera[CAMERA_PY], z - camera[CAMERA_PZ]};
   const float far = sqrt(fma1(away[0], away[0], fma1(away[1], away[1], away[2] * away[2])));
-  float basis[16];
-  sh_basis(SH_USED(coefficients), away[0] / far, away[1] / far, away[2] / far, basis);
-#ifdef SH_DEGREES
-  const int bands = sh_degrees[i] + 1, used = min(SH_USED(coefficients), bands * bands);
-#else
-  const int used = SH_USED(coefficients);
-#endif
-  float4 colour = sh_fma(SH_CONSTANT, (float4)(sh_dc[3 * i], sh_dc[3 * i + 1], sh_dc[3 * i + 2], 0.0f), (float4)(0.5f));
-  __global const shT *band = sh_rest + (size_t)3 * (coefficients - 1) * i;
-  for (int k = 1; k < used; ++k, band += 3)
-    colour = sh_fma(basis[k], sh_channels(band, k + 1 == coefficients), colour);
-  if (!(colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT)) {
+  Lanes basis[16];
+  sh_basis(SH_USED(coefficients), away[0] / far, away[1] / far, away[2] / far, &basis[0].all);
+  const float4 colour = sh_colour(basis, 0, SH_OF_GAUSSIAN(i, coefficients), coefficients, sh_dc + 3 * i,
+                                  sh_rest + 3 * (coefficients - 1) * i);
+  if (!colour_is_drawn(colour)) {
     tile_counts[i] = 0;
     return;
   }
-  splat[RAY_RED] = colour.x > 0.0f ? colour.x : 0.0f;
-  splat[RAY_GREEN] = colour.y > 0.0f ? colour.y : 0.0f;
-  splat[RAY_BLUE] = colour.z > 0.0f ? colour.z : 0.0f;
+  store_colour(colour, splat + RAY_RED);
 }

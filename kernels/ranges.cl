@@ -1,8 +1,12 @@
-// Where each tile's pairs begin and end in the sorted list.
+// Where each tile's pairs begin and end in the sorted list, and the slot and the Gaussian of each pair there.
+//
+// Owner: A work-item owns a place in the sorted list; it writes a range's end where its neighbour has another tile.
+// Launch: One work-item for each pair, in groups of 64; those beyond the last do nothing.
+// Buffers: tile_keys, pair_from_sorted (pairs), sorted; pair_ids (pairs): slot and Gaussian, by depth -> ranges (tiles,
+//   2), zeroed before; slot_from_sorted, gaussian_from_sorted (pairs). All are indices.
+// Equations: none.
 #include "shared/math.h"
 
-// tile_keys, pair_from_sorted (pairs), sorted; pair_ids (pairs): slot and Gaussian, by depth -> ranges (tiles, 2), zeroed
-// before; slot_from_sorted, gaussian_from_sorted (pairs)
 __kernel void ranges(const uint pairs, __global const uint *tile_keys, __global const uint *pair_from_sorted,
                      __global const uint2 *pair_ids, __global uint *ranges, __global uint *slot_from_sorted,
                      __global uint *gaussian_from_sorted) {

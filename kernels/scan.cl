@@ -1,5 +1,10 @@
 // Exclusive prefix sum of unsigned integers in three launches: the sum of each chunk, the scan of those sums, the scan
-// inside each chunk. A group owns one chunk; as_flags != 0 takes every nonzero value as 1.
+// inside each chunk.
+//
+// Owner: A group owns one chunk; the one of scan_top the sums of all.
+// Launch: One group of ITEMS work-items for each chunk; scan_top a single group.
+// Buffers: values (n), sums (groups), total (1), out (n): counts; as_flags != 0 takes every nonzero value as 1.
+// Equations: out[i] is the sum of values[0] to values[i - 1].
 #include "shared/math.h"
 #include "shared/group.h"
 

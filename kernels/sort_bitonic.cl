@@ -1,10 +1,14 @@
 // Bitonic sort of a short array by one group in local memory, in a single launch: what a radix sort's dozen launches
 // cost more than. Ties go by value, which makes it stable where values are positions.
+//
+// Owner: The group owns the array, a work-item every ITEMS-th pair to compare.
+// Launch: One group of ITEMS work-items.
+// Buffers: keys (n) -> keys_out, values_out (n): sorted, the value being the position in keys; k, v (padded) in local
+//   memory, padded a power of two and at least n.
+// Equations: none; Batcher's bitonic network.
 #include "shared/math.h"
 #include "shared/group.h"
 
-// keys (n) in; keys_out, values_out (n): sorted, the value being the position in keys. local arrays (padded), padded a
-// power of two and at least n.
 GROUP __kernel void bitonic_sort(const uint n, const uint padded, __global const uint *keys, __global uint *keys_out,
                                  __global uint *values_out, __local uint *k, __local uint *v) {
   const uint item = get_local_id(0);

@@ -1,6 +1,11 @@
-// One pass of a stable least-significant-digit radix sort: digit histogram of each chunk, (scan.cl over the
-// digit-major histograms), scatter. A group owns a chunk and an item a contiguous run of it, so that order within a
-// digit is order of position. Reduce-then-scan: it needs no forward progress between groups.
+// One pass of a stable least-significant-digit radix sort: digit histogram of each chunk, (scan.cl over the digit-major
+// histograms), scatter. Reduce-then-scan: it needs no forward progress between groups.
+//
+// Owner: A group owns a chunk and an item a contiguous run of it, so that order within a digit is order of position.
+// Launch: One group of ITEMS work-items for each chunk.
+// Buffers: keys, values (n), histograms (digits, groups) -> keys_out, values_out (n); counters (digits, ITEMS) in local
+//   memory.
+// Equations: none; docs/decisions/0001-split-sort.md.
 #include "shared/math.h"
 #include "shared/group.h"
 
@@ -17,10 +22,10 @@ static inline void count_digits(uint begin, uint end, uint base, uint shift, uin
   BARRIER_LOCAL();
 }
 
-#define RUN(begin, end)                                                                                               \
-  const uint run = (chunk + ITEMS - 1) / ITEMS;                                                                       \
-  const uint chunk_end = min((uint)(get_group_id(0) + 1) * chunk, n);                                                 \
-  const uint begin = min((uint)get_group_id(0) * chunk + (uint)get_local_id(0) * run, chunk_end);                     \
+#define RUN(begin, end)                                                                                                \
+  const uint run = (chunk + ITEMS - 1) / ITEMS;                                                                        \
+  const uint chunk_end = min((uint)(get_group_id(0) + 1) * chunk, n);                                                  \
+  const uint begin = min((uint)get_group_id(0) * chunk + (uint)get_local_id(0) * run, chunk_end);                      \
   const uint end = min(begin + run, chunk_end);
 
 // keys (n) -> histograms (digits, groups)
@@ -37,10 +42,10 @@ GROUP __kernel void radix_histogram(const uint n, const uint chunk, const uint b
 }
 
 // keys, values (n), scanned histograms -> keys_out, values_out (n); identity != 0 takes positions for values.
-GROUP __kernel void radix_scatter(const uint n, const uint chunk, const uint base, const uint shift,
-                                  const uint digits, const int identity, __global const uint *keys,
-                                  __global const uint *values, __global const uint *histograms,
-                                  __global uint *keys_out, __global uint *values_out, __local uint *counters) {
+GROUP __kernel void radix_scatter(const uint n, const uint chunk, const uint base, const uint shift, const uint digits,
+                                  const int identity, __global const uint *keys, __global const uint *values,
+                                  __global const uint *histograms, __global uint *keys_out, __global uint *values_out,
+                                  __local uint *counters) {
   RUN(begin, end)
   count_digits(begin, end, base, shift, digits, keys, counters);
   for (uint digit = get_local_id(0); digit < digits; digit += ITEMS) {

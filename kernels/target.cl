@@ -1,5 +1,10 @@
-// A photograph into the blend's layout: (height, width, channels) interleaved to (3, height, width) planes padded with
-// zeros to whole tiles, alpha composited over the background that the render gets.
+// A photograph into the blend's layout, alpha composited over the background that the render gets.
+//
+// Owner: A work-item owns a pixel of the padded planes.
+// Launch: A grid of stride x rows, whole tiles.
+// Buffers: source (height, width, channels), bytes or floats, interleaved; background (3) -> planes (3, rows, stride)
+//   of colour in [0, 1] where the source is bytes, 0 in padding.
+// Equations: alpha c + (1 - alpha) background.
 #include "shared/math.h"
 
 #ifdef BYTES

@@ -9,6 +9,18 @@
 #define OWNED (CELLS / ITEMS)
 #define CELL_X(cell) ((cell) % COLUMNS * CELL_W)
 #define CELL_Y(cell) ((cell) / COLUMNS * CELL_H)
+#define OWN_CELL(k) (get_local_id(0) + (k) * ITEMS)
+
+// Where a group is, from a kernel's first_tile, tiles_x, height and ranges: the first pixel of its tile; its list, the
+// pairs from `begin` to before `end`; floats from a row of a plane to the next, and from plane to plane.
+#define TILE_OF_GROUP                                                                                                  \
+  const int tile = first_tile + get_group_id(0);                                                                       \
+  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                        \
+  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];                                \
+  const size_t stride = (size_t)tiles_x * TILE;                                                                        \
+  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
+// Where a cell's first pixel is in a plane.
+#define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
 
 // Coordinates of a cell's pixels in the tile, and the cell's part of a plane whose rows are `stride` apart.
 #define PIXELS_X(cell) ((floatL)(CELL_X(cell)) + LANE_X)
@@ -36,17 +48,17 @@ typedef int4 int4U __attribute__((aligned(4)));
 #else
 #define LANE_X ((floatL)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3))
 #define LANE_Y ((floatL)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3))
-#define LOAD_CELL(type, p, stride)                                                                                    \
-  ((type##16)(LOAD4(type, p), LOAD4(type, (p) + (stride)), LOAD4(type, (p) + 2 * (stride)),                           \
+#define LOAD_CELL(type, p, stride)                                                                                     \
+  ((type##16)(LOAD4(type, p), LOAD4(type, (p) + (stride)), LOAD4(type, (p) + 2 * (stride)),                            \
               LOAD4(type, (p) + 3 * (stride))))
-#define STORE_CELL(type, x, p, stride)                                                                                \
-  (STORE4(type, (x).lo.lo, p), STORE4(type, (x).lo.hi, (p) + (stride)), STORE4(type, (x).hi.lo, (p) + 2 * (stride)),  \
+#define STORE_CELL(type, x, p, stride)                                                                                 \
+  (STORE4(type, (x).lo.lo, p), STORE4(type, (x).lo.hi, (p) + (stride)), STORE4(type, (x).hi.lo, (p) + 2 * (stride)),   \
    STORE4(type, (x).hi.hi, (p) + 3 * (stride)))
 #endif
 #endif
 
 // From the first pixel's centre to the mean: whole pixels apart from the rest, which a float32 of the sum would cut.
-#define FROM_TILE(splat, axis, origin)                                                                                \
+#define FROM_TILE(splat, axis, origin)                                                                                 \
   ((splat[SPLAT_PIXEL_##axis] - (float)(origin)) + (splat[SPLAT_SUB_##axis] - 0.5f))
 
 // The cells that a Gaussian reaches: those that have a pixel in its ellipse, as bits, where one work-item walks
@@ -133,9 +145,9 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 }
 
 // Pixels' coordinates by table: conversions from integers in the inner loop made a chain through it in some compilers.
-#define PIXEL_TABLES                                                                                                  \
-  floatL table_x[COLUMNS], table_y[ROWS];                                                                             \
-  for (int column = 0; column < COLUMNS; ++column) table_x[column] = PIXELS_X(column);                                \
+#define PIXEL_TABLES                                                                                                   \
+  floatL table_x[COLUMNS], table_y[ROWS];                                                                              \
+  for (int column = 0; column < COLUMNS; ++column) table_x[column] = PIXELS_X(column);                                 \
   for (int row = 0; row < ROWS; ++row) table_y[row] = PIXELS_Y(row * COLUMNS);
 #define AT_X(cell) table_x[(cell) % COLUMNS]
 #define AT_Y(cell) table_y[(cell) / COLUMNS]
@@ -150,8 +162,7 @@ typedef uint Open;
 #define IN_OPEN(reach, open) ((reach) & (open))
 #endif
 
-#define FOR_CELLS(cell, reach)                                                                                        \
-  for (uint left = (reach), cell = 0; left && ((cell = LOWEST(left)), 1); left &= left - 1)
+#define FOR_CELLS(cell, reach) for (uint left = (reach), cell = 0; left && ((cell = LOWEST(left)), 1); left &= left - 1)
 #else
 typedef struct {
   int x0, x1, y0, y1;
@@ -184,15 +195,15 @@ typedef int Open; // how many of the item's
 #define IN_OPEN(reach, open) (reach)
 
 #if ITEMS == 1
-#define FOR_CELLS(cell, reach)                                                                                        \
-  for (int row = (reach).y0; row < (reach).y1; ++row)                                                                 \
+#define FOR_CELLS(cell, reach)                                                                                         \
+  for (int row = (reach).y0; row < (reach).y1; ++row)                                                                  \
     for (int cell = row * COLUMNS + (reach).x0, end_ = cell + (reach).x1 - (reach).x0; cell < end_; ++cell)
 #else
-#define IN_REACH(cell, reach)                                                                                         \
-  ((cell) % COLUMNS >= (reach).x0 && (cell) % COLUMNS < (reach).x1 && (cell) / COLUMNS >= (reach).y0 &&               \
+#define IN_REACH(cell, reach)                                                                                          \
+  ((cell) % COLUMNS >= (reach).x0 && (cell) % COLUMNS < (reach).x1 && (cell) / COLUMNS >= (reach).y0 &&                \
    (cell) / COLUMNS < (reach).y1)
-#define FOR_CELLS(cell, reach)                                                                                        \
-  for (int cell = get_local_id(0); cell < CELLS; cell += ITEMS)                                                       \
+#define FOR_CELLS(cell, reach)                                                                                         \
+  for (int cell = get_local_id(0); cell < CELLS; cell += ITEMS)                                                        \
     if (IN_REACH(cell, reach))
 #endif
 #endif

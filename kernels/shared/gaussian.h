@@ -10,18 +10,18 @@
 #define FORESHORTENED 256.0f
 
 typedef struct {
-  intL valid;            // not to be culled
-  floatL x, y, z;        // mean in the camera's frame
-  floatL lx, ly, lz;     // what rounding it to float32 left
-  floatL rx, ry;         // x/z and y/z as the Jacobian takes them, clamped; orthographic: 0
-  floatL jx, jy;         // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
-  floatL q[4];           // unit quaternion w x y z
-  floatL length;         // of the raw one
-  floatL a2[3];          // the last row of the camera from Gaussian rotation A: its axes' depths
-  floatL b1[3], b2[3];   // the two rows of J A
-  floatL c[3];           // their minors: b1[k] b2[l] - b1[l] b2[k] is c[m], for k, l, m in turn
-  floatL s[3];           // scales
-  floatL sxx, sxy, syy;  // projected covariance with the low-pass
+  intL valid;           // not to be culled
+  floatL x, y, z;       // mean in the camera's frame
+  floatL lx, ly, lz;    // what rounding it to float32 left
+  floatL rx, ry;        // x/z and y/z as the Jacobian takes them, clamped; orthographic: 0
+  floatL jx, jy;        // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
+  floatL q[4];          // unit quaternion w x y z
+  floatL length;        // of the raw one
+  floatL a2[3];         // the last row of the camera from Gaussian rotation A: its axes' depths
+  floatL b1[3], b2[3];  // the two rows of J A
+  floatL c[3];          // their minors: b1[k] b2[l] - b1[l] b2[k] is c[m], for k, l, m in turn
+  floatL s[3];          // scales
+  floatL sxx, sxy, syy; // projected covariance with the low-pass
   floatL det;
 } Projection;
 
@@ -40,8 +40,8 @@ static inline void rotation_of(const floatL *q, floatL *r) {
 
 // Row of cam_from_world times the mean (x, y, z). In float32 alone this would cost 1e-4 pixels, and a pixel at the edge
 // of an ellipse flips over that.
-#define CAMERA_ROW(index)                                                                                             \
-  camera_row(camera + CAMERA_R##index##0, camera + CAMERA_R##index##0_LOW, camera[CAMERA_T##index],                   \
+#define CAMERA_ROW(index)                                                                                              \
+  camera_row(camera + CAMERA_R##index##0, camera + CAMERA_R##index##0_LOW, camera[CAMERA_T##index],                    \
              camera[CAMERA_T##index##_LOW], x, y, z)
 
 static inline Double camera_row(__constant float *r, __constant float *r_low, float t, float t_low, floatL x, floatL y,
@@ -63,8 +63,8 @@ static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, 
 }
 #endif
 
-// (2): focal * (x / z) + centre, as whole pixels from the window's first and the rest in [0, 1): the rest has the same bits
-// in every window.
+// (2): focal * (x / z) + centre, as whole pixels from the window's first and the rest in [0, 1): the rest has the same
+// bits in every window.
 static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low, float focal, float focal_low,
                                   float centre, float centre_low, float window, floatL *whole, floatL *rest) {
   const floatL ratio = RATIO(x, z);
@@ -77,7 +77,8 @@ static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low
 }
 
 // From the camera's centre to the mean, along a world axis.
-#define FROM_CAMERA(means, axis, index) ((GATHER(means, 3, index) - camera[CAMERA_P##axis]) - camera[CAMERA_P##axis##_LOW])
+#define FROM_CAMERA(means, axis, index)                                                                                \
+  ((GATHER(means, 3, index) - camera[CAMERA_P##axis]) - camera[CAMERA_P##axis##_LOW])
 
 // x within [low, high], and NaN as it is.
 static inline floatL clampL(floatL x, float low, float high) {
@@ -158,8 +159,8 @@ static inline void refine(const uint *row, __global const float *quaternions, __
   }
 }
 
-// Fills *p: (1), (3) to (7). Conditions are positive, so that NaN culls. `row` as ROWS_OF_ITEM makes it. Returns 0 where
-// every one is culled.
+// Fills *p: (1), (3) to (7). Conditions are positive, so that NaN culls. `row` as ROWS_OF_ITEM makes it. Returns 0
+// where every one is culled.
 static inline int project_gaussians(const uint *row, __global const float *means, __global const float *quaternions,
                                     __global const float *log_scales, __constant float *camera, Projection *p) {
   const floatL x = GATHER(means, 3, 0), y = GATHER(means, 3, 1), z = GATHER(means, 3, 2);
@@ -186,9 +187,8 @@ static inline int project_gaussians(const uint *row, __global const float *means
   rotation_of(p->q, r);
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j)
-      a[3 * i + j] =
-          fmaL((floatL)(camera[CAMERA_R00 + 3 * i]), r[j],
-               fmaL((floatL)(camera[CAMERA_R01 + 3 * i]), r[3 + j], camera[CAMERA_R02 + 3 * i] * r[6 + j]));
+      a[3 * i + j] = fmaL((floatL)(camera[CAMERA_R00 + 3 * i]), r[j],
+                          fmaL((floatL)(camera[CAMERA_R01 + 3 * i]), r[3 + j], camera[CAMERA_R02 + 3 * i] * r[6 + j]));
   p->s[0] = expL(GATHER(log_scales, 3, 0));
   p->s[1] = expL(GATHER(log_scales, 3, 1));
   p->s[2] = expL(GATHER(log_scales, 3, 2));

@@ -11,6 +11,20 @@
 #endif
 #define GROUP __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 
+// Raises `value`, an int that every item has, to the largest of the group's. In a kernel's own scope and once in it, as
+// it declares local memory.
+#if ITEMS == 1
+#define RAISE_TO_GROUP_MAX(value)
+#else
+#define RAISE_TO_GROUP_MAX(value)                                                                                      \
+  __local int group_max;                                                                                               \
+  if (get_local_id(0) == 0) group_max = value;                                                                         \
+  barrier(CLK_LOCAL_MEM_FENCE);                                                                                        \
+  atomic_max(&group_max, value);                                                                                       \
+  barrier(CLK_LOCAL_MEM_FENCE);                                                                                        \
+  value = group_max;
+#endif
+
 // The sum of the values of the items before this one; *total gets the sum of all. scratch holds ITEMS elements.
 static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint *total) {
 #if ITEMS == 1

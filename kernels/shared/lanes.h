@@ -147,17 +147,17 @@ static inline floatL exp2L(floatL x) {
 #elif LANES == 8
 #define GATHER(array, width, field) ((floatL)(ROW4_(array, width, field, 0), ROW4_(array, width, field, 4)))
 #else
-#define GATHER(array, width, field)                                                                                   \
-  ((floatL)(ROW4_(array, width, field, 0), ROW4_(array, width, field, 4), ROW4_(array, width, field, 8),              \
+#define GATHER(array, width, field)                                                                                    \
+  ((floatL)(ROW4_(array, width, field, 0), ROW4_(array, width, field, 4), ROW4_(array, width, field, 8),               \
             ROW4_(array, width, field, 12)))
 #endif
 
 // The rows of a work-item that has LANES of n, the last one again where they end.
-#define ROWS_OF_ITEM(n)                                                                                               \
-  const uint first_row = get_global_id(0) * LANES;                                                                    \
-  if (first_row >= (n)) return;                                                                                       \
-  uint row[LANES];                                                                                                    \
-  for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < (n) ? first_row + lane : (n) - 1;          \
+#define ROWS_OF_ITEM(n)                                                                                                \
+  const uint first_row = get_global_id(0) * LANES;                                                                     \
+  if (first_row >= (n)) return;                                                                                        \
+  uint row[LANES];                                                                                                     \
+  for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < (n) ? first_row + lane : (n) - 1;           \
   const uint lanes_used = (n) - first_row < LANES ? (n) - first_row : LANES;
 
 // A vector to be had lane by lane.

@@ -1,5 +1,5 @@
-// Ask for memory some Gaussians ahead: a tile's Gaussians, or those next in depth, lie anywhere, and a loop's body is too
-// long for the processor to look so far forward by itself. Only a hint; GPUs hide latency by other work-items.
+// Ask for memory some Gaussians ahead: a tile's Gaussians, or those next in depth, lie anywhere, and a loop's body is
+// too long for the processor to look so far forward by itself. Only a hint; GPUs hide latency by other work-items.
 #define AHEAD 16
 #if ITEMS == 1 && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)

@@ -35,8 +35,8 @@ static inline void sh_basis(int coefficients, floatL x, floatL y, floatL z, floa
 }
 
 // d[3]: sum over k of weight[k] times the gradient of basis[k] by (x, y, z).
-static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, floatL z,
-                                         const floatL *weight, floatL *d) {
+static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, floatL z, const floatL *weight,
+                                         floatL *d) {
   d[0] = d[1] = d[2] = (floatL)(0.0f);
   if (coefficients < 4) return;
   d[0] = -0.4886025119029199f * weight[3];
@@ -57,9 +57,8 @@ static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, f
   d[1] += -3.0f * c9 * (xx - yy) * weight[9] + c10 * x * z * weight[10] -
           c11 * (4.0f * zz - xx - 3.0f * yy) * weight[11] - 6.0f * c12 * y * z * weight[12] +
           2.0f * c11 * x * y * weight[13] - 2.0f * c14 * y * z * weight[14] + 6.0f * c9 * x * y * weight[15];
-  d[2] += c10 * x * y * weight[10] - 8.0f * c11 * y * z * weight[11] +
-          3.0f * c12 * (2.0f * zz - xx - yy) * weight[12] - 8.0f * c11 * x * z * weight[13] +
-          c14 * (xx - yy) * weight[14];
+  d[2] += c10 * x * y * weight[10] - 8.0f * c11 * y * z * weight[11] + 3.0f * c12 * (2.0f * zz - xx - yy) * weight[12] -
+          8.0f * c11 * x * z * weight[13] + c14 * (xx - yy) * weight[14];
 }
 
 // Floats from the bits of finite halves, exactly, also where they are denormal; vload_half is slower.
@@ -93,4 +92,33 @@ static inline float4 sh_fma(float a, float4 b, float4 c) {
 #else
   return fma((float4)(a), b, c);
 #endif
+}
+
+// Of the coefficients that there are, how many Gaussian i's colour has: with SH_DEGREES those of its own bands.
+#ifdef SH_DEGREES
+#define SH_OF_GAUSSIAN(i, coefficients) min(SH_USED(coefficients), (sh_degrees[i] + 1) * (sh_degrees[i] + 1))
+#else
+#define SH_OF_GAUSSIAN(i, coefficients) SH_USED(coefficients)
+#endif
+
+// A Gaussian's colour without its floor, (12) of docs/gradients.md, from one lane of the basis: `dc` (3) and `rest`
+// (coefficients - 1, 3) are its own, of which the first `used` coefficients count, dc with them.
+static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coefficients, __global const float *dc,
+                               __global const shT *rest) {
+  float4 colour = sh_fma(SH_CONSTANT, (float4)(dc[0], dc[1], dc[2], 0.0f), (float4)(0.5f));
+  for (int k = 1; k < used; ++k, rest += 3)
+    colour = sh_fma(basis[k].lane[lane], sh_channels(rest, k + 1 == coefficients), colour);
+  return colour;
+}
+
+// A colour that is not finite, or of COLOUR_LIMIT or more, is not drawn: one such pixel would be all of the loss.
+static inline int colour_is_drawn(float4 colour) {
+  return colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT;
+}
+
+// Red, green and blue one after the other, with the floor of (12).
+static inline void store_colour(float4 colour, __global float *rgb) {
+  rgb[0] = colour.x > 0.0f ? colour.x : 0.0f;
+  rgb[1] = colour.y > 0.0f ? colour.y : 0.0f;
+  rgb[2] = colour.z > 0.0f ? colour.z : 0.0f;
 }

@@ -5,7 +5,8 @@
 // Slack in pixels over what float32 loses here; a tile too many only costs time, one too few would show.
 #define TILE_SLACK 0.01f
 
-// u^2 + v^2 at the edge of a Gaussian's ellipse: where its alpha is ALPHA_MIN, unless RasterizerConfig.extent says other.
+// u^2 + v^2 at the edge of a Gaussian's ellipse: where its alpha is ALPHA_MIN, unless RasterizerConfig.extent says
+// other.
 #ifdef EXTENT_BUDGET
 #define EXTENT(log2o) EXTENT_BUDGET
 #else
@@ -62,14 +63,15 @@ static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, in
 #else
 typedef struct {
   float mx, my, l11, l12, l22, half_w, half_h;
-  float budget;  // u^2 + v^2 at its edge
-  float tangent; // dy / dx from the mean to the ellipse's rightmost point, times half_w
+  float budget;                           // u^2 + v^2 at its edge
+  float tangent;                          // dy / dx from the mean to the ellipse's rightmost point, times half_w
   int tile_x0, tile_x1, tile_y0, tile_y1; // tiles that its box reaches
-  int box; // how many
+  int box;                                // how many
 } Ellipse;
 
 #ifdef SQUARE_TILE_TEST
-// In pixels: the larger eigenvalue of the covariance, as Kerbl et al.'s code has it, which comes back from its whitening.
+// In pixels: the larger eigenvalue of the covariance, as Kerbl et al.'s code has it, which comes back from its
+// whitening.
 static inline float longest_half_axis(__global const float *splat) {
   const float larger = larger_eigenvalue(splat[SPLAT_L11], splat[SPLAT_L12], splat[SPLAT_L22]);
   return sqrt(EXTENT(splat[SPLAT_LOG2O]) * larger);
