@@ -18,7 +18,7 @@ SMOOTHING = 0.1
 
 
 class StepReport(Protocol):
-    """What is shown of a training step, `clsplat.training.loop.StepReport` for one; seconds of training so far."""
+    """The figures shown of a training step, `clsplat.training.loop.StepReport` for one; seconds: of training so far."""
 
     @property
     def step(self) -> int: ...
@@ -106,9 +106,10 @@ class TrainProgress:
 
 
 class StageProgress:
-    """For work in named stages: call it with the stage and the fraction done, or None where that is unknown.
+    """Progress of work in named stages: call it with the stage and the fraction done, or None where that is unknown.
 
-    after: seconds in which nothing is said, for work that is mostly quick."""
+    after: seconds in which nothing is said, for work that is mostly quick.
+    """
 
     def __init__(
         self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic, after: float = 0.0
@@ -129,7 +130,7 @@ class StageProgress:
 
 
 class FrameRecord(Protocol):
-    """What is shown of a frame, `clsplat.sequence.task.Record` for one; seconds that it took."""
+    """The figures shown of a frame, `clsplat.sequence.task.Record` for one; seconds: time that it took."""
 
     @property
     def name(self) -> str: ...

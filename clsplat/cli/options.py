@@ -30,7 +30,7 @@ class View:
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None
     """Folder with the scene, for its cameras and photos; the one the run was trained on if not given."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
-    """Background behind the Gaussians. If not given: as the run has it, else black."""
+    """Background behind the Gaussians. If not given: the run's setting, else black."""
     host: Host = HOST
     """Address that the page is served at: this machine alone, unless another is given."""
     port: int = PORT

@@ -24,7 +24,7 @@ from clsplat.device.quirks import wants_cache
 from clsplat.files import atomic_write
 
 MOST_BYTES = 256 << 20
-"""Of all files together; the oldest go. A binary takes 30 to 500 KB, all tests together 90 MB."""
+"""Limit of all files together; the oldest go. A binary takes 30 to 500 KB, all tests together 90 MB."""
 TARGET = "CL_CONFIG_"
 """Variables that begin so tell Intel's runtime which processor to build for, and how."""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How close a render is to its photograph: PSNR, SSIM, and LPIPS where the optional extra is installed.
+"""Closeness of a render to its photograph: PSNR, SSIM, and LPIPS where the optional extra is installed.
 
 Images are (H, W, 3), clamped to [0, 1] and compared in float64.
 """
@@ -59,7 +59,7 @@ def lpips(image: Image, truth: Image) -> float | None:
 
 
 def lpips_missing() -> str | None:
-    """Why there is no LPIPS, in a few words; None where there is."""
+    """The reason that there is no LPIPS, in a few words; None where there is."""
     model = _lpips_model()
     return model if isinstance(model, str) else None
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be done to a model without a device: cut, move, thin out, put together. Nothing is changed in place.
+"""Edits of a model without a device: cut, move, thin out, put together. Nothing is changed in place.
 
 A similarity (4, 4) takes the world to a new one: x' = s Q x + t, where Q is a rotation or one with a mirror. A Gaussian
 N(m, R S S R^T) becomes N(s Q m + t, Q R s S s S R^T Q^T), its colour f, a function of the direction of view, becomes
@@ -21,7 +21,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import sh_basis
 
 FAR = 64.0
-"""A model that is moved farther from the origin than so many of its own sizes counts from there (decision 0017)."""
+"""Distance from the origin, in a model's own sizes, beyond which a model that is moved counts from there (decision
+0017)."""
 SCALES = (1e-12, 1e12)
 """Between these scales lie; beyond them float32's means would be 0 or infinite."""
 _SIMILAR = 1e-6
@@ -29,7 +30,7 @@ _SIMILAR = 1e-6
 
 
 def take(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
-    """Those rows, (n,) booleans or indices."""
+    """The Gaussians of those rows, (n,) booleans or indices."""
     return Gaussians(
         gaussians.means[rows],
         gaussians.quaternions[rows],

@@ -61,7 +61,7 @@ class Frame:
 
 @dataclass(eq=False)
 class Transforms:
-    """What the files say. points (N, 3) and colors (N, 3) in [0, 1] are nerfstudio's sparse points, if any.
+    """Contents of the files. points (N, 3) and colors (N, 3) in [0, 1] are nerfstudio's sparse points, if any.
 
     box: instant-ngp's volume, the corners (low, high), world units, or None.
     """
@@ -190,7 +190,7 @@ def _contradictions(path: Path, readers: list[Keys], frames: list[Frame]) -> lis
 
 
 def _shutter(value: object) -> bool:
-    """Whether a rolling shutter does anything."""
+    """True if a rolling shutter does anything."""
     return any(value) if isinstance(value, list) else bool(value)
 
 
@@ -241,7 +241,7 @@ class Keys:
         return float(value)
 
     def require(self, key: str) -> float:
-        """As `number`; InputError also where there is none."""
+        """The number of `key`; InputError for what `number` refuses, and where there is none."""
         value = self.number(key)
         if value is None:
             raise InputError(f"{self.where}: has no '{key}', expected a number")

@@ -36,12 +36,12 @@ BUILT_WITH: dict[str, dict[str, object]] = {
     "deep": {"DEEP_SIZE": DEEP_FLOATS},
     "project_rays": {"LANES": 1, "RAYS": 1},
 }
-"""Of the kernels that are not built without."""
+"""Defines of the kernels that are not built without."""
 
 
 @cache
 def stored_digests() -> dict[str, Any]:
-    """By scene and stage: of all drivers and shapes, or by shape where the order of sums is the shape's."""
+    """Digests by scene and stage: of all drivers and shapes, or by shape where the order of sums is the shape's."""
     found: dict[str, Any] = json.loads(DIGESTS.read_text())["digests"]
     return found
 

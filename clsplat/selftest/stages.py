@@ -285,7 +285,8 @@ def _moments(splats: reference_project.Projected, wanted: reference_blend.BlendG
 
 
 def _project_grad(bench: Bench) -> Outcome:
-    """From slots that are made up, so that an error of blending's gradient is not counted here."""
+    """The gradient of projection, from slots that are made up, so that an error of blending's gradient is not counted
+    here."""
     device, n = bench.device, bench.model.count
     coefficients = bench.model.coefficients
     values = evenly(33, (bench.counted.pairs, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One thread's work for all who watch: whose picture is next, and what else they ask for. No OpenCL, no viser.
+"""Scheduler of one thread's work for all viewers: whose picture is next, and their other requests. No OpenCL, no viser.
 
-Any thread may say what somebody wants; `work` alone renders, in the thread that owns the device.
+Any thread may say what a viewer wants; `work` alone renders, in the thread that owns the device.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 
 
 class Page(Protocol):
-    """What one sees."""
+    """The page of a viewer."""
 
     def show(self, image: Image, level: Level, text: str) -> None:
         """A picture (H, W, 3), and what there is to be said of it."""
         ...
 
     def tell(self, message: str) -> None:
-        """Why there is no picture."""
+        """Show the reason that there is no picture."""
         ...
 
 
 @dataclass(eq=False)
 class Watcher:
-    """One who watches."""
+    """One viewer: page, refinement, look and pose."""
 
     page: Page
     refinement: Refinement
@@ -46,7 +46,7 @@ class Watcher:
 
 
 class Viewing:
-    """Those who watch a model. model: None until there is one."""
+    """All viewers of a model. model: None until there is one."""
 
     def __init__(self, model: Model | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
         self.model, self.clock = model, clock
@@ -69,12 +69,12 @@ class Viewing:
             self._watchers.pop(key, None)
 
     def pose(self, key: int) -> Pose | None:
-        """Where they look from."""
+        """The viewer's pose, None if there is none."""
         watcher = self._watchers.get(key)
         return watcher.pose if watcher else None
 
     def look(self, key: int) -> Look:
-        """How they look at the model."""
+        """The viewer's look at the model."""
         watcher = self._watchers.get(key)
         return watcher.look if watcher else Look()
 
@@ -109,7 +109,7 @@ class Viewing:
             self._wake()
 
     def wait(self, most: float) -> None:
-        """Until there may be something to do, or for so many seconds."""
+        """Wait until there may be something to do, for at most `most` seconds."""
         with self._news:
             if self._told:
                 self._told = False
@@ -140,7 +140,8 @@ class Viewing:
         return bool(job or turn)
 
     def _turn(self, version: int, share: Share | None) -> tuple[int, Watcher, Level] | None:
-        """Who has waited longest among those for whom something is due."""
+        """The viewer that has waited longest of those for which a picture is due, with its key and the picture's
+        level."""
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):
             return None

@@ -155,7 +155,7 @@ def _none(kept: int) -> Gaussians:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Of `clsplat info`: encoding, comments, properties that are ignored."""
+    """The format's part of `clsplat info`: encoding, comments, properties that are ignored, and `near`."""
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
     vertex, _ = _vertex_element(header, path)
