@@ -27,7 +27,7 @@ def examples(names: Iterable[object], most: int = 3) -> str:
 
 
 def amount(nbytes: int) -> str:
-    """So many bytes for a line of text, in a unit that leaves two digits or more."""
+    """A number of bytes for a line of text, in a unit that leaves two digits or more."""
     for unit, name in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
         if nbytes >= 10 * unit or (unit == 2**30 and nbytes >= unit):
             return f"{nbytes / unit:,.1f} {name}" if unit == 2**30 else f"{nbytes / unit:,.0f} {name}"

@@ -115,7 +115,7 @@ def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Ite
             temporary.unlink()
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
-            # A full disk is found by `write`, which does not know the name; and nobody knows the temporary one.
+            # A full disk is found by `write`, which does not know the name; and the temporary one is unknown to users.
             raise write_error(path, error, written, needs) from None
         raise
     _sync_folder(target.parent)

@@ -100,7 +100,7 @@ class TrainProgress:
         assert self.last is not None
         rate = self.rate()
         left = f"  {duration((self.total - self.last.step) / rate)} left" if rate > 0 else ""
-        with suppress(OSError):  # nobody reads it any more: a training goes on, or comes to its checkpoint
+        with suppress(OSError):  # its reader has gone: a training goes on, or comes to its checkpoint
             print(f"{self._numbers()}{left}", file=self.stream, flush=True)
         self.printed_at, self.printed_step = self.clock(), self.last.step
 

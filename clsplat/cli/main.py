@@ -533,7 +533,7 @@ def _unboxed(report: str) -> str:
 
 
 def _tell(line: str) -> None:
-    """On standard error, if that takes it: the status says the same."""
+    """Print on standard error, if that takes it: the status says the same."""
     try:
         print(line, file=sys.stderr, flush=True)
     except OSError:  # what is left of it would make the interpreter end with a status of its own

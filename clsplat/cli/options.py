@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line of the verbs for what has been trained, as `clsplat.cli.main` has it for the others."""
+"""The command line of the verbs for what has been trained, beside those of `clsplat.cli.main`."""
 
 from __future__ import annotations
 

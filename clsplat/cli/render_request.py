@@ -125,7 +125,7 @@ def frames_there(job: Job) -> set[int]:
 
 
 def check_foreign(job: Job, there: Collection[int]) -> None:
-    """Raise InputError where a frame that is not `there` would take the place of somebody else's picture."""
+    """Raise InputError where a frame that is not `there` would replace another program's picture."""
     if job.verb.overwrite or job.is_video:
         return
     if others := workers.foreign([task for task in job.tasks if task.number not in there]):

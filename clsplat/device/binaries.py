@@ -63,7 +63,7 @@ def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[
     if hashlib.sha256(binary).digest() != content[:32]:
         return None
     with contextlib.suppress(OSError):
-        os.utime(path)  # the oldest is the one that nobody has used for longest
+        os.utime(path)  # the oldest is the one that was not used for longest
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)

@@ -233,7 +233,7 @@ _NO_PYTHON = (
 def python_module(module: str, *words: str) -> list[str]:
     """The command that runs a module of this package: this package, and nothing of the folder that we are in, as
     `python -m` would take modules from there. Raises DriverError where Python does not know its own file."""
-    if not sys.executable:  # as where another program has it built in
+    if not sys.executable:  # another program may have Python built in
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON}")
     root = str(Path(__file__).resolve().parents[2])
     code = (

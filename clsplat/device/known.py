@@ -44,7 +44,7 @@ class Entry:
 
 
 def cache_folder() -> Path:
-    """Our part of the user's cache; a place that takes nothing for a user without a home, as containers have them."""
+    """Our part of the user's cache; a place that takes nothing for a user without a home, such as a container's."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
     except RuntimeError:
@@ -128,7 +128,7 @@ def _add(saved: dict[str, Any], addition: _Addition) -> None:
 
 
 def entries(device: cl.Device) -> dict[str, Entry]:
-    """All of the driver, by LANESxITEMS."""
+    """All entries of the driver, by LANESxITEMS."""
     shapes = _read().get(driver_key(device))
     return {name: _entry(value) for name, value in shapes.items()} if isinstance(shapes, dict) else {}
 

@@ -66,8 +66,8 @@ def lpips_missing() -> str | None:
 
 @functools.cache
 def prepare_lpips() -> str | None:
-    """See to what LPIPS needs, in seconds but for the network's weights, which are fetched if they are not there: why
-    it cannot be had and what to do, None where it can. Loads nothing."""
+    """Prepare LPIPS, in seconds but for the network's weights, which are fetched if they are missing. Returns the
+    reason that it cannot be used and what to do about it, None where it can. Loads nothing."""
     for name in ("lpips", "torch"):
         if find_spec(name) is None:
             return f"the optional extra is not installed (no {name}): pip install 'clsplat[lpips]'"

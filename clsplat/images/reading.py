@@ -120,7 +120,7 @@ def cannot_be_searched(error: OSError) -> None:
 
 
 def require_images(paths: Iterable[Path], listed_in: Path) -> None:
-    """Raise InputError that names the files of `paths` that do not exist; `listed_in` is what lists them."""
+    """Raise InputError that names the files of `paths` that do not exist; `listed_in` names the list."""
     if missing := [path for path in paths if not is_file(path)]:
         raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {examples(missing)}")
 

@@ -79,7 +79,7 @@ def yuv420(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def rate_of(fps: float) -> Fraction:
-    """Frames a second as a file has them: those of television, which are said in two or three decimals, in 1001ths."""
+    """Frames a second for a file: those of television, which are said in two or three decimals, in 1001ths."""
     whole = round(fps * 1.001)
     ntsc = Fraction(1000 * whole, 1001)
     near = 5e-3 if whole % 24 == 0 or whole % 30 == 0 else 1e-4

@@ -24,7 +24,7 @@ FAR = 64.0
 """Distance from the origin, in a model's own sizes, beyond which a model that is moved counts from there (decision
 0017)."""
 SCALES = (1e-12, 1e12)
-"""Between these scales lie; beyond them float32's means would be 0 or infinite."""
+"""Smallest and largest scale; beyond them float32's means would be 0 or infinite."""
 _SIMILAR = 1e-6
 """Most that Q^T Q may differ from 1: matrices are typed with six digits, or float32's."""
 
@@ -43,19 +43,19 @@ def take(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.int64]) -> G
 
 
 def in_box(gaussians: Gaussians, low: Sequence[float], high: Sequence[float]) -> NDArray[np.bool_]:
-    """(n,) whose mean is in the box, its faces included; low, high (3,) in the world."""
+    """Mask (n,) of the Gaussians whose mean is in the box, its faces included; low, high (3,) in the world."""
     means = gaussians.means + gaussians.origin
     return np.asarray(((means >= low) & (means <= high)).all(axis=1))
 
 
 def in_sphere(gaussians: Gaussians, centre: Sequence[float], radius: float) -> NDArray[np.bool_]:
-    """(n,) whose mean is at most `radius` from the centre (3,) in the world."""
+    """Mask (n,) of the Gaussians whose mean is at most `radius` from the centre (3,) in the world."""
     offsets = gaussians.means + (gaussians.origin - np.asarray(centre, np.float64))
     return np.asarray(np.linalg.norm(offsets, axis=1) <= radius)
 
 
 def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
-    """(n,) whose opacity is at least `least`."""
+    """Mask (n,) of the Gaussians whose opacity is at least `least`."""
     if least >= 1:
         return np.zeros(len(gaussians), np.bool_)
     with np.errstate(divide="ignore"):  # at least 0: every one
@@ -63,7 +63,7 @@ def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
 
 
 def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
-    """Without SH beyond the degree; the same where there are none."""
+    """The model without SH beyond the degree; the same where there are none."""
     return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a run, as its files have them: nothing is measured again, and what is missing or damaged is noted."""
+"""The figures of a run, from its files: nothing is measured again, and what is missing or damaged is noted."""
 
 from __future__ import annotations
 

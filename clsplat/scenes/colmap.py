@@ -40,7 +40,7 @@ MAX_NUMBER = 1e30
 """Coordinates beyond it are damage; their squares are still finite."""
 WINDOW = 1 << 20
 NEWER = 60.0
-"""Seconds by which a text file is newer than its binary one where somebody has edited it since: tools that write both,
+"""Seconds by which a text file is newer than its binary one where it was edited since: tools that write both,
 and programs that copy them, are done with the second sooner."""
 ANNOUNCED = re.compile(r"# *Number of (?:cameras|images|points): *(\d{1,18})\b")
 POSE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
@@ -233,7 +233,7 @@ def _claimed_images(folder: Path) -> int:
 
 
 def _passed_over(folder: Path) -> list[str]:
-    """A warning where somebody has edited text that is not read, as a binary file goes before it."""
+    """A warning of edited text that is not read, as a binary file goes before it."""
     edited = []
     for stem in STEMS:
         binary, text = folder / f"{stem}.bin", folder / f"{stem}.txt"

@@ -70,7 +70,7 @@ def of_pictures(
 
 
 def spread(views: Sequence[View], count: int) -> list[View]:
-    """So many of them at most, spread evenly."""
+    """At most `count` of the views, spread evenly."""
     return [views[index] for index in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).astype(int))]
 
 

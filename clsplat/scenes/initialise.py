@@ -88,7 +88,7 @@ def from_points(
 
 
 def squared_floor(extent: float) -> float:
-    """Under the mean squared distance of a scene's points, world units squared."""
+    """Floor under the mean squared distance of a scene's points, world units squared."""
     low, high = ORDINARY_EXTENTS
     return MIN_SQUARED_DISTANCE * (extent / min(max(extent, low), high)) ** 2
 

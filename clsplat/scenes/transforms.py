@@ -2,7 +2,7 @@
 """Reading transforms.json of Blender synthetic (NeRF), nerfstudio and instant-ngp data sets.
 
 Poses there are `world_from_camera` with OpenGL's camera axes (x right, y up, z backward). Here the camera's axes
-become COLMAP's; the world stays as the file has it. So instant-ngp's `scale`, `offset` and `aabb_scale`, which place
+become COLMAP's; the world stays that of the file. So instant-ngp's `scale`, `offset` and `aabb_scale`, which place
 the scene in its own unit cube, touch no pose (they only bound the volume of random points), and nerfstudio's
 `applied_transform` is not undone: its sparse points have been through it as well.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every stage on frozen scenes against the float64 reference and stored digests: what of a driver can be trusted.
+"""Every stage on frozen scenes against the float64 reference and stored digests: a test of what a driver computes.
 
 As a program it is the child that `clsplat.selftest.trust` starts, as a driver may crash or hang: it says in lines of
 JSON what it is about to do and what came of it.

@@ -117,10 +117,10 @@ class Bench:
         return shown
 
     def splats(self) -> reference_project.Projected:
-        """The splats that the device made, as the reference has them."""
+        """The splats that the device made, in the reference's form."""
         visible = self.visible
         raw = self.projected.splats.get()
-        raw[~visible] = 1.0  # memory that nobody has written
+        raw[~visible] = 1.0  # memory that was never written
         splats = raw.astype(np.float64)
         field = {name: splats[:, index] for index, name in enumerate(SPLAT)}
         means = np.stack([field["PIXEL_X"] + field["SUB_X"], field["PIXEL_Y"] + field["SUB_Y"]], axis=1)

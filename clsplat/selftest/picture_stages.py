@@ -182,7 +182,7 @@ def _of_rays(bench: Bench, projection: Projection) -> Outcome:
 
 
 def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array) -> dict[str, tuple[Array, Array]]:
-    """Columns of the Gaussians that are shown, and what they are in float64."""
+    """Columns of the Gaussians that are shown, and their values in float64."""
 
     def column(*names: str) -> Array:
         return splats[:, [RAY.index(name) for name in names]]

@@ -43,7 +43,7 @@ def make_folders(tasks: Sequence[Task]) -> None:
 
 
 def remove_temporaries(tasks: Sequence[Task]) -> None:
-    """Remove what a killed job has left of these files, and nothing that somebody still writes."""
+    """Remove what a killed job has left of these files, and nothing that is still written."""
     for path in abandoned(task.path for task in tasks):
         with suppress(OSError):
             path.unlink()

@@ -129,7 +129,7 @@ def render_on_farm(
         results = _results(client, placed, scene, video)
         for record in encoded(placed, results, video):
             on_done(replace(record, path=names[record.frame]))
-    # Whoever was killed while it wrote has left a file, and nobody writes any more.
+    # A worker that was killed while it wrote has left a file; none writes any more.
     remove_temporaries(tasks)
 
 

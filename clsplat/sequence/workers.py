@@ -157,7 +157,7 @@ class _Line:
                 if task is None:
                     return
                 pool.submit(self._write, task, shader(task))
-        except BaseException as error:  # noqa: BLE001  # raised again by who waits for the frames
+        except BaseException as error:  # noqa: BLE001  # raised again in the thread that waits for the frames
             self._finished.put(error)
 
     def _write(self, task: Task, shaded: Shaded) -> None:

@@ -90,7 +90,7 @@ class DensityStatistics:
                 array.set(values[name])
 
     def forget_contributions(self) -> None:
-        """Nothing is known of what Gaussians contribute, until the next epoch is over."""
+        """Forget the Gaussians' contributions, until the next epoch is over."""
         for epoch in (self.current, self.whole):
             if epoch is not None:
                 epoch.totals.fill(np.inf)

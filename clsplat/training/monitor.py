@@ -40,7 +40,7 @@ class Remedy:
 class Watch:
     """found: what a pass reads back, in the last four what `adam` counts (`Rasterizer.found`); names: of the views.
 
-    incidents: those not told yet; patience: how much trouble there was.
+    incidents: those not told yet; patience: the count of trouble.
     """
 
     def __init__(self, found: DeviceArray, names: Sequence[str]) -> None:
@@ -71,7 +71,7 @@ class Watch:
         self._noticed = (self._last, stage, sum(refused))
 
     def look(self) -> None:
-        """Read what there is to notice, rather than wait for the next pass."""
+        """Read the counts now, rather than wait for the next pass."""
         self.notice([int(value) for value in self.found.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""At what size each training step works: low first, as there is nothing fine to fit yet. Policy only: no device."""
+"""Size of the pictures in each training step: low first, as nothing fine is fitted yet. Policy only: no device."""
 
 from __future__ import annotations
 

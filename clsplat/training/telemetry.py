@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image")
 SECONDS = 1.0
-"""So long the training views are looked at for contributions, beside the first."""
+"""Seconds in which training views are looked at for contributions, beside the first."""
 EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
 """Powers of ten of pixels, between the bins of contributions."""
 

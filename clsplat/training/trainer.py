@@ -382,7 +382,7 @@ class Trainer:
         self._rearrange(plan, densified=True)
 
     def _rearrange(self, plan: adaptive.Plan, *, densified: bool) -> None:
-        """Move the rows of everything as the plan has them."""
+        """Move the rows of everything to their places in the plan."""
         config, device = self.config.density, self.device
         if len(plan.rows) == 0:
             raise ClsplatError(
@@ -441,7 +441,7 @@ class Trainer:
         return arrays
 
     def restart(self) -> None:
-        """Begin again, as slowly as `watch.patience` has it."""
+        """Begin again, at the rates that `watch.patience` allows."""
         del self.parameters, self.first, self.second, self.gradients, self.statistics
         self.watch.forget()
         self._start()

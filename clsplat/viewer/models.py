@@ -39,7 +39,7 @@ class Model(Protocol):
     @property
     def pixels(self) -> int: ...
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        """(H, W, 3) uint8, and what there is to be said of it. Raises CapacityError and InputError."""
+        """The picture (H, W, 3) uint8, and a remark on it. Raises CapacityError and InputError."""
         ...
 
 

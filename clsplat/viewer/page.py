@@ -136,7 +136,7 @@ class ViserPage:
         shown.on_update(changed)
 
     def _clear(self, name: str) -> None:
-        """Remove what is under this name of the scene."""
+        """Remove the part of the scene under this name."""
         with self.client.atomic():
             self.client.scene.remove_by_name(name)
             self.client.scene.add_frame(name, show_axes=False)

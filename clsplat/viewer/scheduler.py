@@ -26,7 +26,7 @@ class Page(Protocol):
     """The page of a viewer."""
 
     def show(self, image: Image, level: Level, text: str) -> None:
-        """A picture (H, W, 3), and what there is to be said of it."""
+        """Show a picture (H, W, 3), with a remark on it."""
         ...
 
     def tell(self, message: str) -> None:
@@ -59,12 +59,12 @@ class Viewing:
         return len(self._watchers)
 
     def join(self, key: int, page: Page) -> None:
-        """Somebody has opened a page."""
+        """Take in a viewer that has opened a page."""
         with self._news:
             self._watchers[key] = Watcher(page, Refinement(self.clock()))
 
     def leave(self, key: int) -> None:
-        """And closed it."""
+        """Drop a viewer whose page is closed."""
         with self._news:
             self._watchers.pop(key, None)
 
@@ -79,7 +79,7 @@ class Viewing:
         return watcher.look if watcher else Look()
 
     def moved(self, key: int, pose: Pose) -> None:
-        """They look from somewhere else, or say once more that they do not."""
+        """Take the viewer's pose, a new one or once more the same."""
         with self._news:
             watcher = self._watchers.get(key)
             if watcher is not None and not pose.same(watcher.pose):
@@ -90,7 +90,7 @@ class Viewing:
                     self._changed(watcher)
 
     def looks(self, key: int, look: Look) -> None:
-        """They look at it in another way."""
+        """Take the viewer's look at the model."""
         with self._news:
             watcher = self._watchers.get(key)
             if watcher is not None and look != watcher.look:
@@ -153,7 +153,7 @@ class Viewing:
 
     def _show(self, key: int, watcher: Watcher, level: Level, begun: int, model: Model, share: Share | None) -> None:
         start, version, pose, look = self.clock(), model.version, watcher.pose, watcher.look
-        assert pose is not None, "only who has a pose has a turn"
+        assert pose is not None, "only a viewer with a pose has a turn"
         camera = pose.camera().resized(*fitted(pose.width, pose.height, level.scale, model.pixels))
         try:
             image, text = model.picture(camera, look, exact=level.exact)

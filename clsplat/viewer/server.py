@@ -114,7 +114,7 @@ class Server:
         import viser
 
         self.viewing, self.world, self.address = viewing, world, address
-        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # who has left is no news
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # viewers that left
         with _quiet(), _guarded(address):
             self._server: Any = viser.ViserServer(host=address.host, port=address.port, label="clsplat", verbose=False)
         server = self._server

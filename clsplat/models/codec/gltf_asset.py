@@ -34,7 +34,7 @@ from clsplat.models.formats import spz
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
 SPZ_EXTENSIONS = (SPZ_EXTENSION, "KHR_gaussian_splatting_compression_spz")
-"""The second is what the draft's own example calls it."""
+"""Names of the extension; the second is in the draft's own example."""
 UNDERSTOOD = {EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization", "KHR_materials_unlit"}
 COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bytes of SPZ's values, as the docstring of clsplat/models/formats/spz.py has them: arrays of a row for each
+"""The bytes of SPZ's values, described in clsplat/models/formats/spz.py: arrays of a row for each
 Gaussian."""
 
 from __future__ import annotations

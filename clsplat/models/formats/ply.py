@@ -302,7 +302,7 @@ def _local_means(
 def _count_from(
     origin: NDArray[np.float64], gaussians: Gaussians, local: NDArray[np.float32] | None, path: Path
 ) -> None:
-    """Have the means count from the origin: as they were written, unless somebody has moved the vertices since."""
+    """Have the means count from the origin: as they were written, unless the vertices were moved since."""
     world = gaussians.means.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         means = (world - origin).astype(np.float32)

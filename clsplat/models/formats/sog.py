@@ -298,7 +298,7 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
     largest = np.sqrt(np.maximum(0, 1 - np.square(three).sum(axis=1)))
     result = np.zeros((len(pixels), 4), np.float32)
-    result[tag < 0, 0] = 1  # no rotation, as the other reader has it
+    result[tag < 0, 0] = 1  # no rotation, like the other reader
     for index in range(4):
         chosen = tag == index
         result[np.ix_(chosen, [each for each in range(4) if each != index])] = three[chosen]

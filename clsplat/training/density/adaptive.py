@@ -194,6 +194,6 @@ def split_halves(
 
 
 def reset_opacities(config: DensityConfig, opacity_logits: Float32) -> Float32:
-    """At most `opacity_reset_to`."""
+    """Opacities of at most `opacity_reset_to`."""
     ceiling = np.log(config.opacity_reset_to / (1 - config.opacity_reset_to))
     return np.minimum(opacity_logits, np.float32(ceiling))
