@@ -33,7 +33,7 @@ def train(
     """Train on a scene; the model.
 
     config: the run's, or the defaults, where it is not given; a run is told of another one. device: open, or as
-    `clsplat devices` names it; max_device_mem: at most so much of its memory, such as "256MiB". run: a folder for
+    `clsplat devices` names it; max_device_mem: the most of its memory to use, such as "256MiB". run: a folder for
     metrics, checkpoints, held-out renders and the model, or None for none of them; resume: go on from the run's latest
     checkpoint, without which a run that has been trained is refused; on_step: called every
     REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes;

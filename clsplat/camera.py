@@ -27,9 +27,12 @@ LARGEST_FOCAL = 1e12
 
 @dataclass(frozen=True)
 class Window:
-    """Where a picture lies in a frame, in pixels: x, y of its first pixel, negative beyond the frame's left and upper
-    edge; width, height of the frame. clamp: how far beyond the frame's edges the projection's Jacobian still follows a
-    Gaussian's mean, in halves of the frame's size; more only for a picture that shows more."""
+    """Place of a picture in its frame, in pixels.
+
+    x, y: its first pixel, negative beyond the frame's left and upper edge; width, height: of the frame; clamp: how far
+    beyond the frame's edges the projection's Jacobian still follows a Gaussian's mean, in halves of the frame's size;
+    more only for a picture that shows more.
+    """
 
     x: int
     y: int

@@ -27,7 +27,7 @@ def examples(names: Iterable[object], most: int = 3) -> str:
 
 
 def amount(nbytes: int) -> str:
-    """So many bytes for a line of text, in a unit that leaves two digits or more."""
+    """A number of bytes for a line of text, in a unit that leaves two digits or more."""
     for unit, name in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
         if nbytes >= 10 * unit or (unit == 2**30 and nbytes >= unit):
             return f"{nbytes / unit:,.1f} {name}" if unit == 2**30 else f"{nbytes / unit:,.0f} {name}"
@@ -74,18 +74,18 @@ _REASONS = {
 
 
 def reason_of(error: OSError) -> str:
-    """Why the system refused, in plain words."""
+    """The system's reason for an error, in plain words."""
     return _REASONS.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
 
 
 def system_trouble(error: OSError) -> str:
-    """One line about an error of the system that nobody has said more about: the file, and why."""
+    """One line about an error of the system that has no message of ours: the file, and why."""
     names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
     return plain(": ".join([" to ".join(names), reason_of(error)] if names else [reason_of(error)]))
 
 
 def switched_on(variable: str) -> bool:
-    """Whether a variable of the environment is 1; unset, empty and 0 are no. Raises InputError for anything else."""
+    """True if a variable of the environment is 1; unset, empty and 0 are no. Raises InputError for anything else."""
     value = os.environ.get(variable, "")
     if value not in ("", "0", "1"):
         raise InputError(f"{variable}={value}: expected 1, or 0")

@@ -30,13 +30,13 @@ TEMPORARY_SUFFIX = ".clsplat-tmp"
 MAX_DOCUMENT = 32 << 20
 """Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
 ABANDONED = 600.0
-"""Seconds without a write after which a temporary file of another machine is nobody's any more."""
+"""Seconds without a write after which a temporary file of another machine counts as abandoned."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 PROBE = 1 << 16
 """Bytes that are written to find out whether a disk has room."""
 WINDOWS = os.name == "nt"
 IGNORES_CASE = sys.platform in ("win32", "darwin")
-"""Whether the system's usual file systems take A.png and a.png for one file, and an accented letter for its parts."""
+"""True if the system's usual file systems take A.png and a.png for one file, and an accented letter for its parts."""
 PATIENCE = 2.0
 """Seconds in which a file on Windows that another program has open is tried again: a virus scanner or an indexer lets
 go of a new file within one."""
@@ -115,7 +115,7 @@ def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Ite
             temporary.unlink()
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
-            # A full disk is found by `write`, which does not know the name; and nobody knows the temporary one.
+            # A full disk is found by `write`, which does not know the name; and the temporary one is unknown to users.
             raise write_error(path, error, written, needs) from None
         raise
     _sync_folder(target.parent)
@@ -139,7 +139,7 @@ def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, 
 
 
 def room_error(folder: Path) -> OSError | None:
-    """Why nothing more can be written to a folder, found out by doing it; for libraries that do not say."""
+    """The reason that nothing more can be written to a folder, found by trying; for libraries that do not tell."""
     probe = temporary_name(folder / "probe")
     try:
         with open(probe, "xb") as file:
@@ -208,12 +208,12 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextmanager
 def locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
-    """Inside, no other process is inside with this file, which need not be there: FILE.lock beside it says so. No lock
-    of the system's, as `locks.locked` has: those do not keep a process's own threads apart, and homes on a network,
-    where this is used, may have none.
+    """Inside, no other process is inside with this file, which need not be there: FILE.lock beside it says so.
 
-    One that is older than so many seconds is of a process that was killed, and is taken away. Whoever has waited for
-    twice as long goes on without. Raises OSError where the folder cannot be written.
+    It is no lock of the system's, unlike `locks.locked`: those do not keep a process's own threads apart, and homes on
+    a network, where this is used, may have none. A lock older than `seconds` is of a process that was killed, and is
+    taken away. After waiting for twice as long a process goes on without. Raises OSError where the folder cannot be
+    written.
     """
     lock, token = path.with_name(f"{path.name}.lock"), secrets.token_bytes(8)
     until = time.monotonic() + 2 * seconds
@@ -271,7 +271,8 @@ def _patiently(act: Callable[[], None], *, windows: bool = WINDOWS) -> None:
 
 
 def name_trouble(name: str, *, windows: bool = WINDOWS) -> str | None:
-    """Why no file below a folder can be called `name`, with its sub-folders before slashes; None where one can."""
+    """The reason that no file below a folder can be called `name`, with its sub-folders before slashes; None where one
+    can."""
     pure: PurePath = PureWindowsPath(name) if windows else PurePosixPath(name)
     if pure.anchor or ".." in pure.parts:
         return "leads out of the output folder"
@@ -350,7 +351,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def is_file(path: str | os.PathLike[str]) -> bool:
-    """Whether there is a regular file; False, and no exception, for a name that no file can have."""
+    """True if there is a regular file; False, and no exception, for a name that no file can have."""
     try:
         return stat.S_ISREG(Path(path).stat().st_mode)
     except (OSError, ValueError):
@@ -359,8 +360,11 @@ def is_file(path: str | os.PathLike[str]) -> bool:
 
 @contextmanager
 def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
-    """Open a file to read it; `expected` ends the message of the InputError for one that is missing, a folder, or
-    anything else that is no regular file, such as a pipe, which nobody may write to. Also where reading fails."""
+    """Open a file to read it.
+
+    `expected` ends the message of the InputError for one that is missing, a folder, or anything else that is no regular
+    file, such as a pipe, which may never be written to; and for one that cannot be read.
+    """
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):

@@ -97,7 +97,7 @@ LIMIT = 1e19
 
 
 def limit_of(group: str) -> float:
-    """What the magnitudes of a group's parameters have to be under."""
+    """The bound that the magnitudes of a group's parameters have to stay under."""
     return SH_LIMIT if group.startswith("sh_") else LIMIT
 
 

@@ -23,15 +23,17 @@ def apart() -> dict[str, Any]:
 
 
 def endings() -> tuple[signal.Signals, ...]:
-    """The signals beside Ctrl-C by which managers of jobs, and a terminal that goes, ask a process to end. On Windows
-    nobody sends SIGTERM: there it is Ctrl-Break. Those that are ignored, as under nohup, are left out."""
+    """The signals beside Ctrl-C by which managers of jobs, and a terminal that goes, ask a process to end.
+
+    Windows has no SIGTERM from outside: there it is Ctrl-Break. Signals that are ignored, as under nohup, are left out.
+    """
     names = ("SIGTERM", "SIGHUP", "SIGBREAK")
     found = [getattr(signal, name) for name in names if hasattr(signal, name)]
     return tuple(each for each in found if signal.getsignal(each) != signal.SIG_IGN)
 
 
 class Interrupted(KeyboardInterrupt):
-    """As a Ctrl-C, by the signal of this number."""
+    """A Ctrl-C, or the signal of this number in its place."""
 
     def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__()
@@ -39,7 +41,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def status_of(error: KeyboardInterrupt) -> int:
-    """The exit status of a process that was interrupted so, as shells have it: 130 for Ctrl-C."""
+    """The exit status of a process that was interrupted so, by the convention of shells: 130 for Ctrl-C."""
     return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
 
 

@@ -18,7 +18,7 @@ SMOOTHING = 0.1
 
 
 class StepReport(Protocol):
-    """What is shown of a training step, `clsplat.training.loop.StepReport` for one; seconds of training so far."""
+    """The figures shown of a training step, `clsplat.training.loop.StepReport` for one; seconds: of training so far."""
 
     @property
     def step(self) -> int: ...
@@ -100,15 +100,16 @@ class TrainProgress:
         assert self.last is not None
         rate = self.rate()
         left = f"  {duration((self.total - self.last.step) / rate)} left" if rate > 0 else ""
-        with suppress(OSError):  # nobody reads it any more: a training goes on, or comes to its checkpoint
+        with suppress(OSError):  # its reader has gone: a training goes on, or comes to its checkpoint
             print(f"{self._numbers()}{left}", file=self.stream, flush=True)
         self.printed_at, self.printed_step = self.clock(), self.last.step
 
 
 class StageProgress:
-    """For work in named stages: call it with the stage and the fraction done, or None where that is unknown.
+    """Progress of work in named stages: call it with the stage and the fraction done, or None where that is unknown.
 
-    after: seconds in which nothing is said, for work that is mostly quick."""
+    after: seconds in which nothing is said, for work that is mostly quick.
+    """
 
     def __init__(
         self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic, after: float = 0.0
@@ -129,7 +130,7 @@ class StageProgress:
 
 
 class FrameRecord(Protocol):
-    """What is shown of a frame, `clsplat.sequence.task.Record` for one; seconds that it took."""
+    """The figures shown of a frame, `clsplat.sequence.task.Record` for one; seconds: time that it took."""
 
     @property
     def name(self) -> str: ...

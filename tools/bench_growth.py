@@ -31,7 +31,7 @@ from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.stages.device_gaussians import upload_gaussians
 
 GAUSSIANS, WIDTH, HEIGHT = 200_000, 1024, 768
-"""What stays as it is while the other grows."""
+"""Sizes that stay as they are while the other grows."""
 FEWEST = 10_000
 MEGAPIXELS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 POINTS = 3
@@ -79,7 +79,7 @@ def growth(rows: list[Result], unit: str, x: Sequence[float]) -> Result:
 
 
 def table(part: Result) -> list[str]:
-    """Of one of the two growths."""
+    """Text table of one of the two growths."""
     rows: list[tuple[str, ...]] = [("Gaussians", "image", "tile pairs", "ms", "off the line")]
     for row in part["rows"]:
         size, off = f"{row['width']}x{row['height']}", f"{row['residual']:+.1%}"
@@ -89,7 +89,7 @@ def table(part: Result) -> list[str]:
 
 
 def panel(part: Result) -> Panel:
-    """Of one of the two growths."""
+    """Panel of one of the two growths."""
     measured = [(row["x"], row["ms"]) for row in part["rows"]]
     ends = np.geomspace(measured[0][0], measured[-1][0], 50).tolist()  # a line is curved where the axes are logarithmic
     fitted = [(x, part["ms_at_zero"] + part["ms_per_unit"] * x) for x in ends]

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""What it costs a training step to look for numbers that are not finite: with and without, in turn, in one process.
+"""Cost, for a training step, of looking for numbers that are not finite: with and without, in turn, in one process.
 
     python tools/bench_guards.py [RUN | MODEL.ply | SCENE] [--repeat 41] [--device DEVICE] [--json]
 

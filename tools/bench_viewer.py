@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How soon the viewer's first picture is on a page, and how many a second are while the camera moves.
+"""Time to the first picture on the viewer's page, and pictures a second while the camera moves.
 
 A run, a model file, or a made-up model of --gaussians is served by `clsplat view` and opened in a headless Chromium
 without a GPU, which draws the page on the same cores. Times count from when the page is asked for to when a picture has
@@ -36,7 +36,8 @@ FLAGS = {
     "mesa": ("--use-angle=gl-egl", "--ignore-gpu-blocklist"),
     "swiftshader": ("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 }
-"""What draws WebGL on processors: the system's llvmpipe, or the library that comes with Chromium."""
+"""Chromium's flags for drawing WebGL on processors: by the system's llvmpipe, or the library that comes with
+Chromium."""
 PLAIN = "--webgl-antialiasing-mode=none"
 """Without it each pixel of a page is four, which processors feel."""
 WATCH = """
@@ -59,7 +60,7 @@ new MutationObserver(() => {
 
 
 def made_up(count: int) -> Gaussians:
-    """Blobs in a ball of radius 1, about as large as in a trained model of so many, of SH degree 3."""
+    """Blobs in a ball of radius 1, about as large as in a trained model of `count`, of SH degree 3."""
     rng = np.random.default_rng(0)
     means = rng.normal(size=(count, 3))
     means *= (rng.uniform(0.05, 1, count) ** (1 / 3) / np.linalg.norm(means, axis=1))[:, None]
@@ -71,7 +72,7 @@ def made_up(count: int) -> Gaussians:
 
 
 def processor_seconds(process: int) -> float:
-    """Of a process and all that it started and that still runs, on Linux; 0 elsewhere."""
+    """Processor time of a process and all that it started and that still runs, on Linux; 0 elsewhere."""
     used, parents = {}, {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -140,7 +141,7 @@ def visit(browser: Any, url: str, server: int) -> dict[str, float]:
 
 
 def bench(model: Path, device: str | None, repeat: int, flags: tuple[str, ...]) -> list[dict[str, float]]:
-    """As many pages."""
+    """Measurements of `repeat` visits to a page, after one that does not count."""
     from playwright.sync_api import sync_playwright
 
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -44,7 +44,7 @@ PLANTED = {
     "races": {"planted_bounds": "Invalid write", "planted_race": "data race"},
     "uninitialised": {"planted_bounds": "Invalid write", "planted_uninitialised": "Uninitialized"},
 }
-"""What has to be found of memory_workload.PLANTED, for the check to be one."""
+"""Findings expected of memory_workload.PLANTED, for the check to be one."""
 
 ACCEPTED = (
     (
@@ -56,12 +56,13 @@ ACCEPTED = (
 
 
 STARTS = r"^(?=Invalid |Uninitialized |Controlflow |\S+-\S+ data race|Oclgrind|OCLGRIND|\S.*detected)"
-"""Where a finding begins in a log."""
+"""Pattern of the start of a finding in a log."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What Oclgrind says, with numbers that differ from run to run left out; kernel and place where it names them."""
+    """A finding of Oclgrind, with numbers that differ from run to run left out; kernel and place where it names
+    them."""
 
     message: str
     kernel: str = ""
@@ -106,7 +107,7 @@ def places(stem: str) -> list[str]:
 
 
 def findings(log: str, stems: dict[str, str]) -> tuple[Counter[Finding], Counter[str]]:
-    """What a log holds, and the reasons of what was accepted, each with how often."""
+    """Findings in a log, and the reasons of those that were accepted, each with its number."""
     found: Counter[Finding] = Counter()
     accepted: Counter[str] = Counter()
     for text in re.split(STARTS, log, flags=re.MULTILINE):
@@ -181,7 +182,7 @@ def report(result: Result, stems: dict[str, str]) -> bool:
 
 
 def report_planted(result: Result, check: str) -> bool:
-    """Whether every planted fault was found."""
+    """Print the planted faults that were missed; True if every one was found and the child ended well."""
     found, _ = findings(result.log, {})
     missing = [
         name

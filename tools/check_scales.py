@@ -36,7 +36,7 @@ BOUND = 0.3
 
 @dataclass(frozen=True)
 class Row:
-    """What came of the scene times `factor`, moved by `offset` along each axis."""
+    """Result for the scene times `factor`, moved by `offset` along each axis."""
 
     factor: float
     offset: float

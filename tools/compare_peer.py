@@ -42,7 +42,7 @@ from clsplat.training.trainer import Trainer
 
 @dataclass(frozen=True)
 class Peer:
-    """What the peer had, pixels and starting Gaussians, and its median seconds a step."""
+    """Work of the peer, pixels and starting Gaussians, and its median seconds a step."""
 
     width: int
     height: int
@@ -88,7 +88,7 @@ def step_ms(scene: Scene, device: Device) -> float:
 
 
 def limit_of(program: str) -> float:
-    """What the program says of this machine, in Gpairs/s, the best of LIMIT_RUNS. Raises InputError."""
+    """Limit of this machine that the program prints, in Gpairs/s, the best of LIMIT_RUNS. Raises InputError."""
     found = []
     for _ in range(LIMIT_RUNS):
         try:

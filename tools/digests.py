@@ -53,7 +53,7 @@ EXPECTED = {
     ("PoCL 3.1, cbs", "1x64"): UNKNOWN_METHOD,
     ("Rusticl", "8x1"): "llvmpipe's compiler does not come back from vectors of 8",
 }
-"""What cannot be had, with the reason. It is tried all the same."""
+"""Combinations that do not work, with the reason. They are tried all the same."""
 GRADIENT_BOUND = 1e-6
 """Relative, in norm, of each parameter group of each scene. Two orders of adding up 256 numbers differ by some
 sqrt(256) half ulp of what is added, 5e-7, where that does not cancel."""
@@ -82,13 +82,13 @@ class Row:
 
     @property
     def channels(self) -> str:
-        """Of all pictures' digests."""
+        """Digest of all pictures' digests."""
         return f"{zlib.crc32(json.dumps(self.pictures, sort_keys=True).encode()):08x}"
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a child is to do, and with which variables in its environment."""
+    """Work of a child, and the variables in its environment."""
 
     driver: str
     index: int
@@ -120,7 +120,7 @@ def main(arguments: list[str]) -> int:
 
 
 def jobs(folder: Path) -> list[Job]:
-    """Of every driver in every shape."""
+    """Jobs of every driver in every shape."""
     from opencl_drivers import use_every_driver
 
     use_every_driver()
@@ -141,7 +141,7 @@ def jobs(folder: Path) -> list[Job]:
 
 
 def _names() -> list[str]:
-    """Of the devices that are found, in order: PoCL and its version, or the platform's name."""
+    """Names of the devices that are found, in order: PoCL and its version, or the platform's name."""
     from clsplat.device.context import all_devices
 
     names = []
@@ -248,7 +248,7 @@ def _difference(got: Any, wanted: Any) -> float:
 
 
 def problems(rows: list[Row]) -> list[str]:
-    """What is not as it has to be, in words."""
+    """Rows that are not as they should be, in words."""
     found = []
     good = [row for row in rows if not row.trouble]
     for row in rows:
@@ -302,7 +302,7 @@ def other_channels(row: Row, first: Row) -> list[str]:
 
 
 def table(rows: list[Row]) -> str:
-    """In Markdown, which a terminal can show as well."""
+    """Table in Markdown, which a terminal can show as well."""
     lines = ["| driver | shape | frame | all channels | gradient | trained model |", "|---|---|---|---|---|---|"]
     first = next((row for row in rows if not row.trouble), None)
     for row in rows:
@@ -326,7 +326,7 @@ def table(rows: list[Row]) -> str:
 
 
 def summary(rows: list[Row]) -> str:
-    """As `table`, a row for each shape and what came of it, with all drivers of which that is so."""
+    """Table with a row for each shape and result, and all drivers that have it."""
     first = next(row for row in rows if not row.trouble)
     drivers: dict[tuple[str, ...], list[str]] = {}
     for row in rows:

@@ -259,7 +259,7 @@ def make_run(folder: Path) -> None:
 
 
 def make_bundle(folder: Path) -> None:
-    """What a training leaves that gives up, of five Gaussians."""
+    """Write the bundle, of five Gaussians, of a training that gives up."""
     shapes = group_shapes(5, 4)
     arrays = {
         f"{kind}/{g}": np.ones(shapes[g], np.float32) for kind in ("parameters", "first", "second") for g in shapes
@@ -301,7 +301,7 @@ def make_record(folder: Path) -> None:
 
 
 def read_model(path: Path) -> None:
-    """As `convert` and `info` do."""
+    """Read a model like `convert` and `info`."""
     model_info(path)
     formats.load(path).check()
 
@@ -333,7 +333,7 @@ def read_cameras(folder: Path, name: str) -> None:
 
 
 def inside(folder: Path, path: Path) -> None:
-    """Fails where a scene's picture is not below its folder, by its name: links were made by who owns the folder."""
+    """Fails where a scene's picture is not below its folder, by its name: links were made by the folder's owner."""
     if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder)):
         raise AssertionError(f"reads {path}, outside {folder}")
 
@@ -367,13 +367,13 @@ def read_checkpoint(folder: Path) -> None:
 
 
 def read_photos(folder: Path) -> None:
-    """What structure from motion does before it starts pycolmap."""
+    """Read photos like structure from motion, up to the start of pycolmap."""
     photos = sfm_photos.find_photos(folder / "photos").photos
     sfm_photos.stage_photos(folder / "photos", photos, folder / "staged", lambda _: None, 1)
 
 
 def read_record(folder: Path) -> None:
-    """Whether a result of structure from motion can be used again."""
+    """Look if a result of structure from motion can be used again."""
     sfm._is_finished(folder, folder / "photos", "0", overwrite=False)  # noqa: SLF001
     sfm.unregistered(folder)
 

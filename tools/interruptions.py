@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of every verb where a signal comes, a disk is full, a stream is closed, or another process is there.
+"""Ends of every verb where a signal comes, a disk is full, a stream is closed, or another process is there.
 
     python tools/interruptions.py [--verbs train,eval] [--events SIGINT,2>&-] [--markdown]
 
@@ -145,7 +145,7 @@ class Bench:
 
 
 def command(words: Sequence[str], verb: Verb | None = None, marker: Path | None = None) -> list[str]:
-    """Of a process; verb and marker: one that says there when it is at work."""
+    """Command line of a process; verb and marker: one that says there when it is at work."""
     if verb is None or verb.ready.startswith("/"):
         return [sys.executable, "-m", "clsplat", *words]
     return [sys.executable, "-c", WATCHED, str(marker), verb.ready, *words]
@@ -194,7 +194,7 @@ def full_disk(folder: Path, before: int) -> Iterator[tuple[Path, Callable[[], No
 
 
 def result_of(verb: Verb, event: str, done: tuple[int | None, str], out: Path, names: dict[str, str]) -> Outcome:
-    """Of a process that has ended: its status and its words."""
+    """Outcome of a process that has ended: its status and its words."""
     status, text = done
     lines = [line for line in text.splitlines() if line.strip()]
     told = lines[-1] if lines else ""
@@ -235,7 +235,7 @@ def start(verb: Verb, words: Sequence[str], out: Path, **options: object) -> sub
 
 
 def finish(verb: Verb, process: subprocess.Popen[str], out: Path) -> tuple[int | None, str]:
-    """As `wait`; a viewer is ended by Ctrl-C, as it says."""
+    """Wait for the process; a viewer is ended by Ctrl-C, as it says."""
     if verb.name == "view" and wait_until_at_work(verb, process, out):
         time.sleep(4.0)  # until its page is there
         process.send_signal(signal.SIGINT)

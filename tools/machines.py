@@ -4,8 +4,8 @@
 
     .venv/bin/python tools/machines.py [--list] [--only NAME,...] [--full NAME,...] [--jobs N] [--markdown]
 
-A machine is made of what is at hand: which drivers there are, what variables say, who the user is, where the home is.
-Its home is new, so that every driver is met for the first time. --list prints the names and --only runs some; --full
+A machine differs in the drivers that there are, the variables that are set, the user, and the place of the home. Its
+home is new, so that every driver is met for the first time. --list prints the names and --only runs some; --full
 runs all of tools/test on some; --jobs runs so many at once; --markdown prints the table as docs/machines.md has it.
 
 PyPI's PoCL and Intel's runtime are found in this environment, Debian's PoCL where CLSPLAT_DEBIAN_POCL names its
@@ -47,7 +47,7 @@ FULL_LIMIT = 1200
 TRAIN_LIMIT = 120
 """Seconds for ten steps on a tiny scene, whose kernels the self-test has built for the most part."""
 EMULATED = 4
-"""An emulated processor's limits are so many times as long: the short self-test takes 80 s of a core instead of 20."""
+"""Factor on an emulated processor's limits: the short self-test takes 80 s of a core instead of 20."""
 TAIL = 25
 """Lines of a failed step's output that are shown."""
 
@@ -94,8 +94,8 @@ class Step:
 @dataclass(frozen=True)
 class Machine:
     """A row. drivers: their .icd files by name, the folder of OCL_ICD_VENDORS; pypi: whether PyPI's PoCL is there too;
-    wrap: what each command is run by; missing: why it cannot be had, or nothing; prepare: given the machine's folder,
-    made ready before the first step; home, temporary: below that folder, unless absolute."""
+    wrap: the words before each command; missing: the reason that it cannot run, or nothing; prepare: given the
+    machine's folder, made ready before the first step; home, temporary: below that folder, unless absolute."""
 
     name: str
     purpose: str
@@ -121,7 +121,7 @@ class Result:
 
     @property
     def words(self) -> str:
-        """For the table."""
+        """Result for the table."""
         if self.machine.missing:
             return f"not run: {self.machine.missing}"
         return f"FAILED: {self.trouble}" if self.trouble else "passed"
@@ -204,7 +204,7 @@ _RUNNING: set[subprocess.Popen[bytes]] = set()
 
 
 def wrong(step: Step, status: int | None, errors: str, output: str) -> str:
-    """How a step's end differs from what was expected, or nothing; status None: it did not end."""
+    """Difference of a step's end from what was expected, or nothing; status None: it did not end."""
     if status is None:
         return f"did not end within {step.limit:g} s"
     if status != step.status:
@@ -229,8 +229,8 @@ def short_test(limit: float = SHORT_LIMIT) -> Step:
 
 
 OWN_SHAPE = "not 8x1-rusticl and not 1x1-rusticl"
-"""Of the smoke tests. Rusticl 22.3 runs work-groups of one item wrongly: the sort leaves its output as it was. It gets
-1x64, and the self-test refuses what is wrong where another is asked for."""
+"""Expression for the smoke tests that run. Rusticl 22.3 runs work-groups of one item wrongly: the sort leaves its
+output as it was. It gets 1x64, and the self-test refuses what is wrong where another is asked for."""
 
 
 def smoke() -> Step:
@@ -240,7 +240,8 @@ def smoke() -> Step:
 
 
 def full() -> Step:
-    """With the caller's binaries for Intel's runtime: the steps before build theirs, and all would take minutes."""
+    """The quick tests, with the caller's binaries for Intel's runtime: the steps before build theirs, and all would
+    take minutes."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     binaries = os.environ.get("CLSPLAT_BINARIES") or str(cache / "clsplat" / "binaries")
     command = ("env", f"CLSPLAT_BINARIES={binaries}", PYTHON, "tools/test", "--quiet")
@@ -272,7 +273,7 @@ class Found:
     mounts: tuple[str, ...]
     """The command that runs another with mounts of its own; none where that is not allowed."""
     stranger: tuple[str, ...]
-    """The command that runs another as a user who is not root, and can read this; none where that is not allowed."""
+    """The command that runs another as a user other than root that can read this; none where that is not allowed."""
 
 
 def look() -> Found:
@@ -431,7 +432,7 @@ def no_driver() -> tuple[Step, ...]:
 
 
 def read_only_home(found: Found, alone: Machine) -> Machine:
-    """With a mount that is read-only, which holds for root too; else a home that cannot be made, below a file."""
+    """A home on a mount that is read-only, which holds for root too; else a home that cannot be made, below a file."""
     machine = replace(alone, name="read-only-home", purpose="nothing can be written at home")
     if found.mounts:
         script = 'mount --bind "$1" "$1" && mount -o remount,ro,bind "$1" && shift && exec "$@"'
@@ -469,7 +470,8 @@ def _mounts() -> tuple[str, ...]:
 
 
 def _stranger() -> tuple[str, ...]:
-    """Nobody, who may read all if the checkout or Python lie in root's home: so nothing has to be copied."""
+    """The command prefix for user nobody, allowed to read all if the checkout or Python lie in root's home: so nothing
+    has to be copied."""
     nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
     reading = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
     # a child too: setpriv itself may still follow paths that its command may not

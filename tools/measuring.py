@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tools that measure have in common: sizes, what a result says of the machine, how trouble is told."""
+"""Helpers of the tools that measure: sizes, a result's record of the machine, messages of trouble."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Result = dict[str, Any]
 
 
 def options_parser(description: str | None) -> argparse.ArgumentParser:
-    """With the options that every one of the tools with a plot has; the description stands as it is written."""
+    """Parser with the options that every one of the tools with a plot has; the description stands as it is written."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
@@ -50,7 +50,7 @@ def require(condition: bool, message: str) -> None:
 
 
 def machine(device: Device, repeat: int) -> Result:
-    """What a figure has to have beside it."""
+    """Record of the machine that every figure needs beside it."""
     return {
         "device": device.name,
         "driver": device.driver,

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""What `tools/check_memory.py` runs in a child under Oclgrind: every kernel on scenes of a few tiles.
+"""Workload of `tools/check_memory.py` in a child under Oclgrind: every kernel on scenes of a few tiles.
 
     memory_workload.py planted|LANESxITEMS [plain]
 
-Prints the name of each kernel before it runs. `plain`: what the check of uninitialised reads wants of Oclgrind 21.10,
-see STAND_INS.
+Prints the name of each kernel before it runs. `plain`: with the replacements that the check of uninitialised
+reads needs with Oclgrind 21.10, see STAND_INS.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ STAND_INS = (
     "vectors made of shorter vectors are made of their elements, as its shadow of such a shuffle reads past the end",
     "the padding of an image gradient is masked by a choice in each lane, as its shadow of x & 0 is that of x",
 )
-"""Where the check of uninitialised reads does other than the product, and why. What is not replaced here is found:
-each is the cause of a crash or of findings."""
+"""Differences of the check of uninitialised reads from the product, and the reasons. What is not replaced here is
+found: each is the cause of a crash or of findings."""
 
 PLANTED = """
 __kernel void planted_bounds(__global float *out, const int n) { out[n + get_global_id(0)] = 1.0f; }
@@ -109,7 +109,7 @@ def frames(device: Device) -> None:
 
 
 def rendering(device: Device) -> None:
-    """What only rendering has: fewer SH bands by Gaussian, half floats."""
+    """Kernels that only rendering needs: fewer SH bands by Gaussian, half floats."""
     view = camera(20, 17)
     gaussians = cloud(27, view, 3)
     gaussians.sh[::2, 4:] = 0
@@ -118,7 +118,7 @@ def rendering(device: Device) -> None:
 
 
 def pictures(device: Device) -> None:
-    """What only pictures have: channels beside colour, slices by depth; cameras without an image plane."""
+    """Kernels that only pictures need: channels beside colour, slices by depth; cameras without an image plane."""
     flat = camera(33, 17)
     around = replace(flat, fx=33 / (2 * np.pi), fy=33 / (2 * np.pi), projection="equirectangular")
     gaussians = cloud(30, flat, 6)

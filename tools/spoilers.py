@@ -166,7 +166,7 @@ def _lines(data: bytes, rng: random.Random) -> bytes:
 
 
 def _text(data: bytes, rng: random.Random) -> bytes:
-    """What an editor or a bad transfer does to a text, and what is deeply nested or very long."""
+    """A text after an editor or a bad transfer, or made deeply nested or very long."""
     at = rng.randrange(len(data) + 1)
     kind = rng.randrange(11)
     if kind == 0:
@@ -231,7 +231,7 @@ def _json(data: bytes, rng: random.Random) -> bytes:
 
 
 class _Mark:
-    """What a pickle calls when it is loaded: a reader that does so is caught."""
+    """A pickle that calls a function when it is loaded: a reader that loads it is caught."""
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         return (_unpickled, ("a pickle was loaded",))

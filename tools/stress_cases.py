@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What hurts projection and its gradient: each stressor makes Gaussians before one camera, and says how far it went."""
+"""Stressors of projection and its gradient: each makes Gaussians before one camera, and says how far it went."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clsplat.gaussians import Gaussians
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 600.0
 DEGREE = 1
-"""Of the SH: enough for the gradient by the direction; the bands themselves are tested apart."""
+"""Degree of the SH: enough for the gradient by the direction; the bands themselves are tested apart."""
 
 
 @dataclass
@@ -32,7 +32,7 @@ class Cloud:
     scales: Float64 | None = None
 
     def gaussians(self) -> Gaussians:
-        """With the means in the world, as float32."""
+        """The Gaussians, with the means in the world, as float32."""
         camera = self.camera
         flat = (self.pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy) * self.depths[:, None]
         means = (np.column_stack([flat, self.depths]) - camera.translation) @ camera.rotation
@@ -68,7 +68,7 @@ def camera_of(rng: np.random.Generator) -> Camera:
 
 
 def cloud(rng: np.random.Generator, count: int) -> Cloud:
-    """As in a trained scene: axes of 0.3 to 30 pixels, opacities all over."""
+    """Gaussians like those of a trained scene: axes of 0.3 to 30 pixels, opacities all over."""
     return Cloud(
         camera=camera_of(rng),
         pixels=rng.uniform(-0.1, 1.1, (count, 2)) * (WIDTH, HEIGHT),
@@ -260,17 +260,18 @@ from its mean and 0.55 wide is off by 700 / 0.55 * 2^-24 = 8e-5 from that alone,
 to it. depth, opacity, colour: two to ten roundings of 6e-8. extent: of a budget log2(255 o) of 0.007 the rounding of
 log2 o, of size 8, leaves four digits."""
 GRADIENT_NORM, GRADIENT_TAIL = 1e-4, 1e-3
-"""In norm over a batch, and for the 99.9th percentile of Gaussians. The largest may be any: a gradient can vanish."""
+"""Bounds in norm over a batch, and for the 99.9th percentile of Gaussians. The largest may be any: a gradient can
+vanish."""
 
 FRAME_TAIL = 5e-3
-"""As GRADIENT_TAIL, for one kind of frames, of a few thousand Gaussians: there chance has more single numbers near
-zero, and needles have the error of their ends. All kinds together have to be within GRADIENT_TAIL."""
+"""GRADIENT_TAIL for one kind of frames, of a few thousand Gaussians: there chance has more single numbers near zero,
+and needles have the error of their ends. All kinds together have to be within GRADIENT_TAIL."""
 FRAME = 2e-5
-"""Of a pixel's colour outside the band, relative to the frame's brightest: a few dozen roundings of 6e-8, and the ends
-of needles, which are off as said of "offset", there by 64 / 0.55 * 2^-24 = 7e-6."""
+"""Bound of a pixel's colour outside the band, relative to the frame's brightest: a few dozen roundings of 6e-8, and the
+ends of needles, which are off as said of "offset", there by 64 / 0.55 * 2^-24 = 7e-6."""
 BAND_SHARE = 0.03
-"""Of the pixels, those with a decision within 1e-4 of its threshold: in "faint" some 100 Gaussians at each pixel have
-alphas spread evenly over about 1 / 255, of which 2e-4 each are in the band; elsewhere there are a few."""
+"""Largest share of the pixels with a decision within 1e-4 of its threshold: in "faint" some 100 Gaussians at each pixel
+have alphas spread evenly over about 1 / 255, of which 2e-4 each are in the band; elsewhere there are a few."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ SPOILING = 60
 
 @dataclass
 class Tally:
-    """What a reader's cases came to. slowest: seconds and number; peak: MiB beyond what the process had, and number."""
+    """Count of a reader's cases. slowest: seconds and number; peak: MiB beyond what the process had, and number."""
 
     cases: int = 0
     refused: int = 0
@@ -259,7 +259,7 @@ def keep(folder: Path, name: str, case: int, seed: int) -> Path:
 
 
 def table(tallies: dict[str, Tally]) -> str:
-    """For people, a line each."""
+    """Text table, a line each."""
     lines = [f"{'reader':14} {'cases':>8} {'refused':>8} {'slowest':>9} {'most memory':>12} {'failures':>9}"]
     for name, tally in tallies.items():
         lines.append(

@@ -33,21 +33,21 @@ Array = NDArray[Any]
 BATCH = 5000
 """Gaussians before one camera."""
 CASES_A_FRAME = 20_000
-"""For each frame of every kind as many cases in all."""
+"""Cases in all for each frame of every kind."""
 CASES_A_LARGE_FRAME = 500_000
-"""As CASES_A_FRAME, for what takes seconds: 10,000 Gaussians on a pixel, 7680 x 4320."""
+"""Cases in all for each frame that takes seconds: 10,000 Gaussians on a pixel, 7680 x 4320."""
 CASES_A_STAGE = 10_000
-"""As CASES_A_FRAME, for a pair of pictures, and for 200 Gaussians' steps of Adam; these are not counted."""
+"""Cases in all for each pair of pictures, and for 200 Gaussians' steps of Adam; these are not counted."""
 SLOW = ("one_pixel",)
 PLOTTED = {"shape": "whitening, largest", "position": "position (px), largest", "d log_scales": "d scales, 99.9 %"}
 STAGES = "stages"
 FLOOR = 1e-9
-"""Where no error at all is drawn."""
+"""Place of no error at all in a plot."""
 
 
 @dataclass
 class Tally:
-    """Of one stressor: cases, those shown, what broke by kind, every error by name, squares of gradients."""
+    """Count of one stressor: cases, those shown, what broke by kind, every error by name, squares of gradients."""
 
     cases: int = 0
     shown: int = 0
@@ -63,7 +63,7 @@ class Tally:
             self.norms[name] = (before[0] + off, before[1] + size)
 
     def add_errors(self, errors: Mapping[str, Array]) -> None:
-        """As float32, which is enough for an error."""
+        """Add errors as float32, which is enough for an error."""
         for name, values in errors.items():
             self.errors.setdefault(name, []).append(np.asarray(values, np.float32))
 
@@ -190,7 +190,7 @@ def panel(name: str, tally: Tally) -> Panel:
 
 
 def table(result: Result) -> list[str]:
-    """For people."""
+    """Text table of the result."""
     short = {"d means": "d mean", "d quaternions": "d quat", "d log_scales": "d scale", "d opacity_logits": "d opac"}
     forward = [name for name in ERRORS if not name.startswith("d ")]
     backward = [*short, "d sh"]

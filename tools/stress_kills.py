@@ -6,8 +6,8 @@
 
 The scene is a small one made on the spot: 40 points, 8 pictures of 48x40. Training writes a checkpoint every second
 step, so that many kills come while one is being written. A process is killed after a random time, anywhere from its
-start (imports, building of kernels, reading the checkpoint) to its end. One that gets to its end is compared with a
-training that nobody disturbed: model.ply byte for byte, and the steps in metrics.jsonl. Exit status 1 if one of them
+start (imports, building of kernels, reading the checkpoint) to its end. One that gets to its end is compared with an
+undisturbed training: model.ply byte for byte, and the steps in metrics.jsonl. Exit status 1 if one of them
 differs, or a process ends in any other way than by being killed or being done.
 """
 

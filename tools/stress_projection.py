@@ -81,7 +81,8 @@ def exact(gaussians: Gaussians) -> dict[str, Array]:
 def wanted_gradients(
     arrays: Mapping[str, Array], camera: Camera, wanted: Projected, sums: Array
 ) -> tuple[dict[str, Array], Array]:
-    """By the parameters and by the mean on the image, from the sums: eqs. (50), (29), then the twin's way back."""
+    """Gradients by the parameters and by the mean on the image, from the sums: eqs. (50), (29), then the twin's way
+    back."""
     g, gu, gv, uu, uv, vv = sums[:, :6].astype(np.longdouble).T
     l11, l12, l22 = wanted.whitening.T  # the sums are of u' = -k u
     k = np.sqrt(np.longdouble(WHITEN2))
@@ -121,7 +122,7 @@ def least_exponent(wanted: Projected, camera: Camera) -> Array:
 
 
 def limits_of_kernels(arrays: Mapping[str, Array], wanted: Projected) -> NDArray[np.bool_]:
-    """Where docs/gradients.md, section 10, has the kernels cull what the twin shows, or may, in float32."""
+    """Gaussians that the kernels cull, or may, in float32, and the twin shows (docs/gradients.md, section 10)."""
     norm2 = (arrays["quaternions"] ** 2).sum(axis=1)
     a, b, c = wanted.conics.T
     with np.errstate(all="ignore"):

@@ -72,7 +72,8 @@ def command(render: Sequence[str], folder: Path, extension: str) -> list[str]:
 
 
 def kill(line: Sequence[str], folder: Path, more: int, delay: float) -> int:
-    """Start it, kill it `delay` seconds after so many more frames are there; returns how many frames there are."""
+    """Start the command, kill it `delay` seconds after `more` further frames are there; returns the number of frames
+    there."""
     before = count(folder)
     process = subprocess.Popen(line, stdout=subprocess.DEVNULL, start_new_session=True)
     while process.poll() is None and count(folder) < before + more:

@@ -73,7 +73,7 @@ def _pictures(rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def losses(device: Device, rng: np.random.Generator, many: int) -> Result:
-    """Of many pairs of pictures: the loss's error, and its gradient's in norm."""
+    """Largest errors over many pairs of pictures: the loss's, and its gradient's in norm."""
     worst = {"loss": 0.0, "loss gradient": 0.0}
     work = Workspace(device)
 
@@ -98,7 +98,7 @@ def losses(device: Device, rng: np.random.Generator, many: int) -> Result:
 
 
 def steps(device: Device, rng: np.random.Generator, many: int) -> Result:
-    """Of steps of Adam with gradients of 1e-20 to 1e6, from moments of any size: the largest error, in steps."""
+    """Largest error, in steps, over steps of Adam with gradients of 1e-20 to 1e6, from moments of any size."""
     worst, count, rate = 0.0, 200, 1e-2
     shapes = group_shapes(count, 4)
     counts = upload(device, np.ones(count, np.uint32))

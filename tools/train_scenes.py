@@ -75,8 +75,8 @@ def main(arguments: list[str]) -> int:
 
 
 def measured(scene: Scene, config: TrainConfig, device: Device) -> dict[str, float]:
-    """Of one training: PSNR of the held-out views, number of Gaussians, and of those that are black or have a channel
-    at 0, by the constant coefficient."""
+    """Figures of one training: PSNR of the held-out views, number of Gaussians, and of those that are black or have a
+    channel at 0, by the constant coefficient."""
     model = train(scene, config, device=device)
     background, renderer = background_colour(config.background), Renderer(device)
     result = evaluate(

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which shape of the kernels is quickest on a device: each candidate in a process of its own, which a driver may abort.
+"""Search for the quickest shape of the kernels on a device.
 
-`clsplat tune` keeps the answer (device/shapes.py). It is not found out by itself at the first use: gradients have the
-same bits only within a shape, and a trial that another load disturbed would change what a seed gives.
+Each candidate runs in a process of its own, as a driver may abort. `clsplat tune` keeps the answer (device/shapes.py).
+The search does not start by itself at the first use: gradients have the same bits only within a shape, and a trial that
+another load disturbed would change what a seed gives.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ from clsplat.training.trainer import Trainer
 FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")
 """Stages that are measured in a frame; the others in a training step."""
 GAUSSIAN_BYTES = 4 * 59 * 4
-"""Of a Gaussian of SH degree 3 in a training step: parameters, gradients and two moments."""
+"""Bytes of a Gaussian of SH degree 3 in a training step: parameters, gradients and two moments."""
 
 
 def bench(
@@ -47,7 +47,8 @@ def bench(
     limits: Limits | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """What `clsplat bench --json` prints. The device's queue should have been made with profiling."""
+    """Measure every stage; returns what `clsplat bench --json` prints. The device's queue should have been made with
+    profiling."""
     say = progress or (lambda *_: None)
     config = config or RasterizerConfig()
     say("limits", None)
@@ -211,7 +212,7 @@ def held_kind(config: RasterizerConfig) -> tuple[object, ...]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """What `bench` measured, for people."""
+    """Text table of what `bench` measured."""
     stages, limit, pairs = result["stages"], result["limit"], result["pairs"]
     driver, size = result["driver"].split("  ")[0], f"{result['width']}x{result['height']}"
     arithmetic, gradient, copying = (

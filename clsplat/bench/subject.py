@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is measured: a made-up scene, a model or a run."""
+"""The subject of a measurement: a made-up scene, a model or a run."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ Progress = Callable[[str, float | None], None]
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What is measured: a model, a view of it, and the photograph (H, W, 3) uint8 that a training step compares with,
-    or None for one made up from the frame itself."""
+    """The subject of a measurement: a model, a view of it, and the photograph (H, W, 3) uint8 that a training step
+    compares with, or None for one made up from the frame itself."""
 
     name: str
     gaussians: Gaussians

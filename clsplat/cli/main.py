@@ -149,11 +149,11 @@ class Eval:
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None
     """Folder with the scene; the one the run was trained on if not given."""
     test_every: Annotated[int | None, arg(metavar="INT")] = None
-    """Every n-th view by name is held out, and measured. If not given: as the run has it, else 8."""
+    """Every n-th view by name is held out, and measured. If not given: the run's setting, else 8."""
     resolution: Annotated[int | None, arg(metavar="INT")] = None
-    """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: as the run has it, else 0."""
+    """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
-    """Background behind the Gaussians and behind images with alpha. If not given: as the run has it, else black."""
+    """Background behind the Gaussians and behind images with alpha. If not given: the run's setting, else black."""
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
@@ -174,9 +174,9 @@ class Render:
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
     nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
-    """Where the images go, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG; or the name of a
-    video of all frames, such as turn.mp4. {name} is the image's name without its extension, sub-folders included, or
-    else the frame's number; ####, %04d and {frame} are the frame's number."""
+    """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG; or the name
+    of a video of all frames, such as turn.mp4. {name} is the image's name without its extension, sub-folders included,
+    or else the frame's number; ####, %04d and {frame} are the frame's number."""
     path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
     """A path made from the cameras, in place of the cameras themselves: around what they look at, the same twice while
     rising and sinking, or through them in their order, smoothed. Its frames count from 1."""
@@ -188,7 +188,7 @@ class Render:
     usd_camera: Annotated[str | None, arg(metavar="PRIM")] = None
     """Path or name of the camera, for a USD stage that has several."""
     channels: Annotated[str, arg(metavar="NAME,...")] = "rgb"
-    """What the files hold: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion, count
+    """Channels of the files: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion, count
     and id (of Gaussians). docs/render.md has each."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
@@ -268,7 +268,7 @@ class Bench:
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
     """Size of the frame in pixels. If not given: the camera's, or 1024x768 for the made-up scene."""
     repeat: int = 5
-    """How often each kind of frame and step is measured; the median of these times is printed."""
+    """Measurements of each kind of frame and step; the median of their times is printed."""
     preset: Preset = "default"
     """Bundle of rasterizer settings: exact and default approximate nothing, fast does a little. A --rasterizer flag
     overrides it."""
@@ -533,7 +533,7 @@ def _unboxed(report: str) -> str:
 
 
 def _tell(line: str) -> None:
-    """On standard error, if that takes it: the status says the same."""
+    """Print on standard error, if that takes it: the status says the same."""
     try:
         print(line, file=sys.stderr, flush=True)
     except OSError:  # what is left of it would make the interpreter end with a status of its own
@@ -550,5 +550,5 @@ def one_line(error: BaseException) -> str:
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
-    """In place of `warnings.showwarning`, which would print the line of code as well."""
+    """Print a warning in one line, in place of `warnings.showwarning`, which would print the line of code as well."""
     print(f"clsplat: warning: {' '.join(str(message).split())}", file=sys.stderr)

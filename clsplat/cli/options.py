@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line of the verbs for what has been trained, as `clsplat.cli.main` has it for the others."""
+"""The command line of the verbs for what has been trained, beside those of `clsplat.cli.main`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class View:
     scene: Annotated[Path | None, arg(metavar="SCENE")] = None
     """Folder with the scene, for its cameras and photos; the one the run was trained on if not given."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
-    """Background behind the Gaussians. If not given: as the run has it, else black."""
+    """Background behind the Gaussians. If not given: the run's setting, else black."""
     host: Host = HOST
     """Address that the page is served at: this machine alone, unless another is given."""
     port: int = PORT

@@ -111,7 +111,7 @@ def _on_farm(job: Job, tasks: Sequence[Task], done: Callable[[Record], None], vi
 
 
 def _print_profile(records: Any, wall: float, devices: int) -> None:
-    """What part of the wall time the devices were at work."""
+    """Print the share of the wall time in which the devices were at work."""
     kernels, transfers = (
         sum(getattr(record, name) or 0.0 for record in records) / (10 * max(wall, 1e-9) * max(devices, 1))
         for name in ("kernel_ms", "transfer_ms")

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DevicePlan:
-    """How the memory of a device will do for the frame that needs most of it; strips: that a frame is rendered in."""
+    """The memory plan of a device for the frame that needs most of it; strips: number of strips that a frame is
+    rendered in."""
 
     device: str
     plan: Plan
@@ -106,7 +107,7 @@ def document(job: Job, there: set[int], plans: list[DevicePlan]) -> dict[str, An
 
 
 def plan_of(job: Job, selector: str | None) -> DevicePlan:
-    """For the device that `selector` names. Raises DeviceError and CapacityError."""
+    """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
     from clsplat.device.context import open_device
     from clsplat.frame.deep_exr import deep_rows
     from clsplat.frame.strips import strip_rows
@@ -138,7 +139,7 @@ def plan_of(job: Job, selector: str | None) -> DevicePlan:
 
 
 def _sizes(cameras: list[Camera]) -> list[str]:
-    """Of the pictures, and of the frames that they are a part of."""
+    """Sizes of the pictures, and of the frames that they are a part of."""
     sizes = set()
     for camera in cameras:
         window = camera.window

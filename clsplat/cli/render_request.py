@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a call of `clsplat render` asks for. What is wrong with it is found here, before a frame is rendered."""
+"""Checked meaning of a call of `clsplat render`. Mistakes in the call are found here, before a frame is rendered."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Job:
-    """What a call means. devices: selectors, None for the usual one; spaces: the model's colour space and that of the
-    pictures; video: how it is encoded, with its rate."""
+    """A call, read and checked. devices: selectors, None for the usual one; spaces: the model's colour space and that
+    of the pictures; video: its encoding, with the rate."""
 
     verb: Render
     options: RenderOptions
@@ -60,12 +60,12 @@ class Job:
 
     @property
     def is_video(self) -> bool:
-        """Whether all frames go into one file."""
+        """True if all frames go into one file."""
         return self.tasks[0].is_video
 
     @property
     def on_farm(self) -> bool:
-        """Whether others render."""
+        """True if other processes render: workers, or those of a Dask scheduler."""
         return self.verb.workers is not None or self.verb.scheduler is not None
 
 
@@ -125,7 +125,7 @@ def frames_there(job: Job) -> set[int]:
 
 
 def check_foreign(job: Job, there: Collection[int]) -> None:
-    """Raise InputError where a frame that is not `there` would take the place of somebody else's picture."""
+    """Raise InputError where a frame that is not `there` would replace another program's picture."""
     if job.verb.overwrite or job.is_video:
         return
     if others := workers.foreign([task for task in job.tasks if task.number not in there]):

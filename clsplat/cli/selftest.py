@@ -49,7 +49,7 @@ def name_of(info: DeviceInfo) -> str:
 
 
 def record(info: DeviceInfo, report: Report) -> dict[str, object]:
-    """For --json."""
+    """Entry of a device for --json."""
     stages = [{**asdict(result), "passed": result.passed} for result in report.results]
     return {
         **asdict(info),

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each verb of the command line does. What computes is imported when it is needed: --help must be quick."""
+"""Functions of the verbs of the command line. Modules that compute are imported when they are needed: --help must be
+quick."""
 
 from __future__ import annotations
 
@@ -144,7 +145,7 @@ def train(verb: Train) -> int:
 
 
 def _train_checked(verb: Train, held: ExitStack) -> int:
-    """As `train`; `held` takes the lock of a folder that is new."""
+    """Do the work of `train`; `held` takes the lock of a folder that is new."""
     from clsplat.device.context import open_device
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
@@ -369,7 +370,8 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 
 def _check_scene(scene: Scene) -> None:
-    """What would end a training later on: no views to train on, a view too small to measure, a picture that is cut."""
+    """Raise InputError for a scene that would end a training later on: no views to train on, a view too small to
+    measure, a picture that is cut."""
     from clsplat.evaluation.metrics import SSIM_WINDOW
 
     scene.require_training_views()

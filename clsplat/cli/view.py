@@ -87,7 +87,8 @@ def training_view(verb: Train) -> Callable[[Scene], AbstractContextManager[Train
 
 
 def _scene(path: Path | None, config: TrainConfig, *, given: bool) -> Scene | None:
-    """For its cameras and photos. One that only the run names may be gone by now."""
+    """The scene, for its cameras and photos. One that only the run names may be gone by now: then a warning, and
+    None."""
     from clsplat.scenes.scene import load_scene
 
     if path is None:

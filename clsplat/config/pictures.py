@@ -15,7 +15,7 @@ Filter = Literal["box", "blackman-harris"]
 STRIP_PIXELS = 1 << 24
 """Pixels that are on the host at once, before filtering: about a gigabyte with every layer."""
 DEEP_STRIP_FLOATS = 1 << 26
-"""Of the slices of a deep picture's strip: 256 MiB."""
+"""Floats for the slices of a deep picture's strip: 256 MiB."""
 _MOST_SUPERSAMPLES = 64
 _MOST_SAMPLES = 4096
 _MOST_BINS = 256
@@ -24,7 +24,7 @@ _PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "s
 
 @dataclass(frozen=True)
 class ColourConfig:
-    """Which colour space pictures are written in."""
+    """Colour spaces of the pictures and of the model."""
 
     colorspace: str = ""
     """Colour space of the pictures, a name of the OpenColorIO configuration such as ACEScg; '' is the model's own."""
@@ -36,7 +36,7 @@ class ColourConfig:
 
 @dataclass(frozen=True)
 class FramingConfig:
-    """Which pixels are rendered, and how finely."""
+    """The pixels to render: overscan, region, supersampling."""
 
     overscan: str = "0"
     """Pixels beyond each edge of the frame, or a share of its width and height such as 5%. EXR files keep the frame as
@@ -45,11 +45,11 @@ class FramingConfig:
     """Part of the frame to render alone, X,Y,WIDTH,HEIGHT in pixels from its top left corner; '' renders all of it. In
     EXR files it is the data window."""
     supersample: int = 1
-    """Samples of a pixel across and down: the frame is rendered so many times larger, and made smaller in linear light.
-    1 does without."""
+    """Samples of a pixel across and down: the frame is rendered this many times larger, and made smaller in linear
+    light. 1 does without."""
     filter: Filter = "box"
-    """How --supersample makes a pixel. box: the mean over it; blackman-harris: a window three pixels wide, which is
-    smoother."""
+    """Filter that makes a pixel of --supersample's samples. box: the mean over it; blackman-harris: a window three
+    pixels wide, which is smoother."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
@@ -63,7 +63,7 @@ class FramingConfig:
 
     @property
     def on(self) -> bool:
-        """Whether anything is other than the plain frame."""
+        """True if anything differs from the plain frame."""
         return bool(self.region) or self.supersample > 1 or parse_overscan(self.overscan) != (0, 0.0)
 
 
@@ -99,10 +99,10 @@ class SamplingConfig:
     """Motion blur: how long the shutter is open, half before the frame and half after it, in degrees of which 360 are
     from frame to frame; 0 is none."""
     shutter_open: float | None = None
-    """When the shutter opens, in frames from the frame, such as -0.25; in place of --shutter-angle, with
+    """Opening of the shutter, in frames from the frame, such as -0.25; in place of --shutter-angle, with
     --shutter-close."""
     shutter_close: float | None = None
-    """When the shutter closes, in frames from the frame, such as 0.25."""
+    """Closing of the shutter, in frames from the frame, such as 0.25."""
     f_stop: float | None = None
     """Depth of field: the f-number of a lens, such as 2.8, its focal length that of the camera on a sensor of
     --sensor-width. If neither this nor --aperture is given, everything is in focus. Wants --focus."""
@@ -147,30 +147,30 @@ class SamplingConfig:
 
     @property
     def shutter(self) -> tuple[float, float]:
-        """When it opens and closes, in frames from the frame."""
+        """Opening and closing of the shutter, in frames from the frame."""
         if self.shutter_open is not None and self.shutter_close is not None:
             return self.shutter_open, self.shutter_close
         return -self.shutter_angle / 720, self.shutter_angle / 720
 
     @property
     def moves(self) -> bool:
-        """Whether the camera is looked at at more than one time."""
+        """True if the shutter stays open for a time, so that the camera is looked at more than once."""
         return self.shutter[1] > self.shutter[0]
 
     @property
     def has_lens(self) -> bool:
-        """Whether it is more than a pinhole."""
+        """True if the camera is more than a pinhole."""
         return self.aperture > 0 or self.f_stop is not None
 
     @property
     def on(self) -> bool:
-        """Whether a frame is more than one sample."""
+        """True if a frame is more than one sample."""
         return self.moves or self.has_lens
 
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """What is made of a frame, beside its channels."""
+    """Settings of a picture beside its channels: colour, framing, sampling."""
 
     colour: ColourConfig = field(default_factory=ColourConfig)
     framing: FramingConfig = field(default_factory=FramingConfig)
@@ -216,7 +216,7 @@ FPS = 24.0
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """How a video is encoded."""
+    """Encoding of a video."""
 
     fps: float | None = None
     """Frames a second; if not given the rate of the cameras' file, or 24 where that has none. 23.976, 29.97 and
@@ -224,7 +224,7 @@ class VideoConfig:
     crf: int = 18
     """Quality: 0 is the best, 51 the worst, 18 about the least that shows no loss."""
     preset: str = "medium"
-    """How long the encoder looks for a smaller file, from ultrafast to veryslow."""
+    """Effort of the encoder for a smaller file, from ultrafast to veryslow."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
@@ -244,7 +244,7 @@ Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwa
 
 @dataclass(frozen=True)
 class Encoding:
-    """How pictures are encoded. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
+    """Encoding of pictures. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
 
     depth: ExrDepth = EXR_DEPTH
     parts: Parts = "one"

@@ -21,10 +21,10 @@ error of zero; fast: approximations that are worth their error (docs/performance
 
 
 def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
-    """What `clsplat train --schedule` starts from.
+    """Settings that `clsplat train --schedule` starts from.
 
     paper: the defaults, made for 30,000 steps, whatever `iterations` is. short: for runs of about 7000 steps, in which
-    the paper's rates leave a model unfinished: colours, opacities and rotations learn faster, SH degrees come twice as
+    the paper's rates leave a model unfinished. Colours, opacities and rotations learn faster, SH degrees come twice as
     fast, the means' rate has fallen at the end, density control ends at five sevenths, and the last seventh cools down
     (docs/decisions/0013-a-short-schedule.md).
     """
@@ -47,12 +47,12 @@ def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
 
 
 def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> TrainConfig:
-    """What `clsplat train --preset --schedule --iterations` start from.
+    """Settings that `clsplat train --preset --schedule --iterations` start from.
 
-    fast trains less: on pictures of a quarter of the size for a fourteenth of the steps and of half the size until two
-    sevenths, with fewer Gaussians, those dropped that add less than a tenth of a pixel to every view, the rates of the
-    short schedule with those of means, scales and rotations up to four times higher, and the higher SH bands in every
-    second step (docs/decisions/0015-the-fast-preset.md).
+    fast trains less. Pictures are a quarter of the size for a fourteenth of the steps and half the size until two
+    sevenths. There are fewer Gaussians; those that add less than a tenth of a pixel to every view are dropped. The
+    rates are those of the short schedule, those of means, scales and rotations up to four times higher. The higher SH
+    bands are updated in every second step (docs/decisions/0015-the-fast-preset.md).
     """
     config = scheduled(schedule or ("short" if preset == "fast" else "paper"), iterations)
     config = replace(config, rasterizer=PRESETS[preset])

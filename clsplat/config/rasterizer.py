@@ -11,26 +11,25 @@ from clsplat.config.checks import Rule, check_kinds, check_rules
 
 @dataclass(frozen=True)
 class RasterizerConfig:
-    """What the rasterizer skips. Only settings that are marked as approximate change a picture; the others change no
-    bit of a frame, and are there to be measured.
+    """Work that the rasterizer skips. Only settings that are marked as approximate change a picture; the others change
+    no bit of a frame, and are there to be measured.
 
     sh-tolerance and sh-storage are of frames of a model that is held on the device (render, eval), not of training.
     docs/performance.md has the error of each setting, and the time that it buys.
     """
 
     extent: Literal["opacity", "constant", "3sigma"] = "opacity"
-    """How far a Gaussian reaches. opacity: to where its alpha is alpha-min; constant: as far as an opaque one would,
-    whatever its opacity; 3sigma: three standard deviations, which cuts what is visible of opaque ones (approximate)."""
+    """Reach of a Gaussian. opacity: to where its alpha is alpha-min; constant: as far as an opaque one would, whatever
+    its opacity; 3sigma: three standard deviations, which cuts what is visible of opaque ones (approximate)."""
     tile_test: Literal["ellipse", "box", "square"] = "ellipse"
-    """In which tiles of 16 x 16 pixels a Gaussian is listed. ellipse: those that its ellipse reaches, or all of its
+    """Tiles of 16 x 16 pixels that a Gaussian is listed in. ellipse: those that its ellipse reaches, or all of its
     bounding box where that has at most 16; box: all of its bounding box; square: those that the square of its longest
     half axis reaches, as in the code of Kerbl et al."""
     depth_sort: Literal["visible", "pairs"] = "visible"
-    """What is sorted. visible: the visible Gaussians by depth, then their pairs with tiles, stably, by tile; pairs: all
-    pairs by tile and depth, as in the code of Kerbl et al."""
+    """Order of the sorts. visible: the visible Gaussians by depth, then their pairs with tiles, stably, by tile; pairs:
+    all pairs by tile and depth, as in the code of Kerbl et al."""
     key_bits: Literal["needed", "all"] = "needed"
-    """Which bits are sorted by. needed: those in which the depths of the frame and its tiles differ; all: 32 of
-    each."""
+    """Bits that are sorted by. needed: those in which the depths of the frame and its tiles differ; all: 32 of each."""
     row_skip: bool = True
     """Visit only the rows of a tile that a Gaussian's bounding box reaches."""
     column_skip: bool = True

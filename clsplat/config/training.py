@@ -43,10 +43,10 @@ class OptimiserConfig:
     sparse: bool = False
     """Leave Gaussians that a step's view does not show as they are, Adam's moments too (approximate)."""
     sh_rest_every: int = 1
-    """Update the higher SH bands in every so many steps (approximate above 1)."""
+    """Steps from one update of the higher SH bands to the next (approximate above 1)."""
     cooldown: int = 0
-    """Over the last so many steps every learning rate falls, by the same factor every step, to the part cooldown-to of
-    itself; 0: none falls."""
+    """Number of last steps over which every learning rate falls, by the same factor every step, to the part cooldown-to
+    of itself; 0: none falls."""
     cooldown_to: float = 0.1
     """Part of every learning rate that is left after the cooldown's last step, more than 0, at most 1."""
     beta1: float = 0.9
@@ -121,8 +121,8 @@ class DensityConfig:
     """Steps after which the Gaussians that contribute least are pruned, as many as prune-fraction says."""
     prune_fraction: float = 0.0
     """Share of the Gaussians, 0 to 1, that is pruned at each step of prune-at: those that contribute least over an
-    epoch (Speedy-Splat). Not counted are those whose contribution is not known, as of all for two epochs after an
-    opacity reset."""
+    epoch (Speedy-Splat). Gaussians whose contribution is not known are not counted; after an opacity reset that is all
+    of them, for two epochs."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""

@@ -5,6 +5,6 @@ from __future__ import annotations
 
 TEST_EVERY = 8
 HOST, PORT = "127.0.0.1", 8080
-"""Where the viewer listens."""
+"""Address and port that the viewer listens on."""
 DEMO_ITERATIONS = 2000
 """Steps of `clsplat demo`, about a minute of two cores."""

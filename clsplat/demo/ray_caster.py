@@ -406,7 +406,7 @@ def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32
 
 
 def ignore_progress(text: str, fraction: float | None) -> None:
-    """Where nobody listens."""
+    """Do nothing: progress that nobody reads."""
 
 
 def write_jpeg(path: Path, image: Float32) -> None:

@@ -63,7 +63,7 @@ def claim(output: Path) -> None:
 
 
 def _run_demo(output: Path, *, device: str | None, iterations: int, frames: int) -> dict[str, Any]:
-    """As `run_demo`, alone in the folder."""
+    """Do the work of `run_demo`, alone in the folder."""
     start = time.monotonic()
     # before minutes of work: is there a device of that name?
     opened = open_device(device)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is alive in a device's memory, and what may be."""
+"""Account of a device's memory: bytes in use, and the limit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Memory:
         self.peak = 0
 
     def check(self, nbytes: int) -> None:
-        """Raise CapacityError where so many more would be too many."""
+        """Raise CapacityError if `nbytes` more would pass the limit."""
         if self.limit is None or self.used + nbytes <= self.limit:
             return
         gc.collect()  # what an exception's traceback or a cycle still holds is not in use

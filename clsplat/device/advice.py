@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How to come by an OpenCL driver: the end of the message that there is none."""
+"""Advice on installing an OpenCL driver: the end of the message that there is none."""
 
 from __future__ import annotations
 

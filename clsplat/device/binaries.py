@@ -24,7 +24,7 @@ from clsplat.device.quirks import wants_cache
 from clsplat.files import atomic_write
 
 MOST_BYTES = 256 << 20
-"""Of all files together; the oldest go. A binary takes 30 to 500 KB, all tests together 90 MB."""
+"""Limit of all files together; the oldest go. A binary takes 30 to 500 KB, all tests together 90 MB."""
 TARGET = "CL_CONFIG_"
 """Variables that begin so tell Intel's runtime which processor to build for, and how."""
 
@@ -63,7 +63,7 @@ def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[
     if hashlib.sha256(binary).digest() != content[:32]:
         return None
     with contextlib.suppress(OSError):
-        os.utime(path)  # the oldest is the one that nobody has used for longest
+        os.utime(path)  # the oldest is the one that was not used for longest
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arrays in device memory: a shape and a dtype over a buffer, and a workspace of named ones that grow.
 
-Debug mode: with CLSPLAT_POISON=1 every array is full of NaN (as integers 2143289344) when it is handed out, with
-CLSPLAT_POISON=0xff800000 or another number of 32 bits of that. What reads memory that nobody has written then shows.
+Debug mode: with CLSPLAT_POISON=1 every array is full of NaN (as integers 2143289344) when it is handed out; with
+CLSPLAT_POISON=0xff800000 or another number of 32 bits it is full of that. Reads of memory that was never written then
+show.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class DeviceArray:
 
 
 def _poison() -> NDArray[np.uint32] | None:
-    """What new memory is full of, or None for whatever is there. Raises InputError."""
+    """Word that new memory is filled with, or None to leave it as it is. Raises InputError."""
     value = os.environ.get("CLSPLAT_POISON", "")
     if value in ("", "0"):
         return None
@@ -96,7 +97,7 @@ def _poison() -> NDArray[np.uint32] | None:
 
 
 def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nbytes: int) -> None:
-    """Of the buffer's first `nbytes` what whole words there are, and the rest by its last byte."""
+    """Fill the buffer's first `nbytes`: whole words, and the rest by the word's last byte."""
     whole = nbytes // 4 * 4
     if whole:
         cl.enqueue_fill_buffer(device.queue, buffer, word, 0, whole)

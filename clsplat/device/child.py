@@ -62,7 +62,7 @@ def tell(**values: object) -> None:
 
 
 def end_with_parent() -> None:
-    """In a child that is told nothing: end when the parent has gone, even where a driver hangs."""
+    """End when the parent has gone, even where a driver hangs: for a child that is told nothing."""
 
     def wait() -> None:
         while os.read(0, 1 << 10):
@@ -158,8 +158,8 @@ class Child:
             self._process.stdin.flush()
 
     def receive(self, seconds: float) -> dict[str, Any] | None:
-        """The next message; None where the process has ended. Raises TimeoutError after so many seconds without one,
-        and ends the process, and TrialInterrupted."""
+        """The next message; None where the process has ended. Raises TrialInterrupted; and after `seconds` without a
+        message ends the process and raises TimeoutError."""
         until = time.monotonic() + seconds
         while True:
             try:
@@ -178,7 +178,8 @@ class Child:
         return message
 
     def ending(self, where: str = "") -> str:
-        """How the process ended, for a sentence that begins with it: where, if that is known, and its last words."""
+        """The end of the process in words, for a sentence that begins with it: its status, where it was, if that is
+        known, and its last words."""
         status = self._process.wait()
         self._readers[1].join(timeout=5)
         words = [line for line in self._errors if line]
@@ -198,7 +199,7 @@ class Child:
         return self._process.wait() == -KILL
 
     def abandon(self) -> None:
-        """End the process without waiting for that; who waits for an answer gets TrialInterrupted."""
+        """End the process without waiting for that; a thread that waits for an answer gets TrialInterrupted."""
         self._abandoned = True
         self._process.kill()
 
@@ -232,7 +233,7 @@ _NO_PYTHON = (
 def python_module(module: str, *words: str) -> list[str]:
     """The command that runs a module of this package: this package, and nothing of the folder that we are in, as
     `python -m` would take modules from there. Raises DriverError where Python does not know its own file."""
-    if not sys.executable:  # as where another program has it built in
+    if not sys.executable:  # another program may have Python built in
         raise DriverError(f"sys.executable is empty, {_NO_PYTHON}")
     root = str(Path(__file__).resolve().parents[2])
     code = (

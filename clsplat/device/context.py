@@ -31,7 +31,7 @@ from clsplat.errors import DeviceError
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """What `clsplat devices` lists."""
+    """Entry of a device in `clsplat devices`."""
 
     index: int
     name: str
@@ -149,7 +149,7 @@ class Device:
 
     @property
     def is_another(self) -> bool:
-        """Whether this shape was taken as the driver had failed in the one that is wanted."""
+        """True if this shape was taken because the driver had failed in the one that is wanted."""
         return bool(self._why_another)
 
     @property
@@ -158,7 +158,7 @@ class Device:
         return self._switches
 
     def switched(self, *names: str) -> bool:
-        """Whether kernels are built with any of these switches."""
+        """True if kernels are built with any of these switches."""
         return any(name in self._switches for name in names)
 
     def with_memory_limit(self, limit: int | None) -> Device:
@@ -174,8 +174,8 @@ class Device:
 
     @property
     def row_alignment(self) -> int:
-        """Rows of four bytes or more that can be cut off an array in place: OpenCL has sub-buffers begin at multiples
-        of so many; and whole vectors of lanes."""
+        """Alignment, in rows of four bytes or more, of a part that is cut off an array in place: OpenCL has sub-buffers
+        begin at multiples of it; and whole vectors of lanes."""
         return max(int(self.cl_device.mem_base_addr_align) // 32, self.shape.lanes, 32)
 
     def finish(self) -> None:
@@ -183,7 +183,8 @@ class Device:
         self.queue.finish()
 
     def _probe_fma(self) -> dict[str, object]:
-        """Whether the compiler fuses a lone a*b + c in vectors: then that is the fast way to fma's bits.
+        """The define FMA_BY_CONTRACTION if the compiler fuses a lone a*b + c in vectors: then that is the fast way to
+        fma's bits.
 
         Not without vectors: Intel's runtime, which vectorises loops by itself, then fuses here and not there.
         """
@@ -226,7 +227,7 @@ def select(selector: str | None) -> cl.Device:
 
 
 def find_device(selector: str | None) -> DeviceInfo:
-    """What is listed of the device that `selector` names (see `select`). Raises DeviceError."""
+    """The entry of the device that `selector` names (see `select`). Raises DeviceError."""
     chosen = select(selector)
     return list_devices()[all_devices().index(chosen)]
 

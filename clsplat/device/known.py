@@ -25,8 +25,8 @@ from clsplat.errors import reason_of
 from clsplat.files import atomic_write, locked, parse_json
 
 BREAK = "CLSPLAT_BREAK_KERNEL"
-"""For the tests of `clsplat selftest` alone: STEM: WORDS => WORDS replaces words of one kernel's text, as a driver that
-miscompiles an operation would."""
+"""Variable for the tests of `clsplat selftest` alone: STEM: WORDS => WORDS replaces words of one kernel's text, as a
+driver that miscompiles an operation would."""
 MOST = 16
 """Drivers and versions that are remembered, the latest: each takes a few KiB."""
 
@@ -44,7 +44,7 @@ class Entry:
 
 
 def cache_folder() -> Path:
-    """Our part of the user's cache; a place that takes nothing for a user without a home, as containers have them."""
+    """Our part of the user's cache; a place that takes nothing for a user without a home, such as a container's."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
     except RuntimeError:
@@ -70,7 +70,7 @@ def driver_key(device: cl.Device) -> str:
 
 
 def _entry(value: object) -> Entry:
-    """An entry of the file. What is none of ours counts as not there."""
+    """An entry of the file. One that clsplat did not write counts as not there."""
     if not isinstance(value, dict):
         return Entry()
     stages, kernels, failed = value.get("stages", []), value.get("kernels", {}), value.get("failed", "")
@@ -84,7 +84,7 @@ def _entry(value: object) -> Entry:
 
 @dataclass(frozen=True)
 class _Addition:
-    """What `remember` adds to the entry of a driver and shape."""
+    """The part of an entry, of a driver and shape, that `remember` adds."""
 
     driver: str
     shape: str
@@ -95,7 +95,7 @@ class _Addition:
 
 
 _unwritten: dict[Path, list[_Addition]] = {}
-"""By file: what could not be written yet."""
+"""Additions that could not be written yet, by file."""
 
 
 def _read() -> dict[str, Any]:
@@ -128,7 +128,7 @@ def _add(saved: dict[str, Any], addition: _Addition) -> None:
 
 
 def entries(device: cl.Device) -> dict[str, Entry]:
-    """All of the driver, by LANESxITEMS."""
+    """All entries of the driver, by LANESxITEMS."""
     shapes = _read().get(driver_key(device))
     return {name: _entry(value) for name, value in shapes.items()} if isinstance(shapes, dict) else {}
 
@@ -142,8 +142,8 @@ def remember(
     failed: str | None = None,
     trial: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add to what is known of the driver in a shape, LANESxITEMS. failed: None leaves as it is what is said of it;
-    trial: as `Entry` has it.
+    """Add to what is known of the driver in a shape, LANESxITEMS. failed: None keeps the recorded failure; trial: see
+    `Entry`.
 
     A folder that cannot be written is a warning; while it cannot, everything is tried anew by the next process.
     """

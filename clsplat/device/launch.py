@@ -38,7 +38,7 @@ def only_tried(device: Device) -> Iterator[None]:
 
 
 def _value(argument: Any) -> Any:
-    """As the kernel gets it: whole numbers as the 32 bits that they have with or without a sign."""
+    """The argument that the kernel gets: whole numbers as their 32 bits, with or without a sign."""
     if isinstance(argument, DeviceArray):
         return argument.buffer
     return argument & _WORD if isinstance(argument, int) else argument
@@ -93,7 +93,7 @@ _UPDATED = {
     "contribution_statistics": 2,
     "add_slots": 1,
 }
-"""Kernels that read and write some arrays in place: so many of their last ones."""
+"""Kernels that read and write some arrays in place: how many of their last ones."""
 
 
 def _enqueue(

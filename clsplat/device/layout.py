@@ -52,19 +52,19 @@ SLOT_PLAIN = SLOT.index("ABSX")
 
 @dataclass(frozen=True)
 class SlotFields:
-    """What a slot has beside the plain gradients: absolute ones (AbsGS), the contribution to the image."""
+    """Fields of a slot beside the plain gradients: absolute ones (AbsGS), the contribution to the image."""
 
     absolute: bool = False
     contributions: bool = False
 
     @property
     def floats(self) -> int:
-        """From one slot to the next."""
+        """Floats from one slot to the next."""
         return (len(SLOT) if self.absolute else SLOT_PLAIN) + self.contributions
 
     @property
     def defines(self) -> dict[str, object]:
-        """For the kernels that write and read slots; none for the plain ones."""
+        """Defines for the kernels that write and read slots; none for the plain ones."""
         wanted = {"ABSOLUTE_GRADIENTS": self.absolute, "CONTRIBUTIONS": self.contributions}
         return {name: True for name, on in wanted.items() if on}
 

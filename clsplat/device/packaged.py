@@ -14,7 +14,7 @@ from pathlib import Path
 
 VARIABLE = "OCL_ICD_FILENAMES"
 INTEL = Path("Library", "bin", "intelocl64.dll")
-"""Where intel-opencl-rt puts its driver, below `sys.prefix`, with the libraries that it needs beside it."""
+"""Path of intel-opencl-rt's driver, below `sys.prefix`, with the libraries that it needs beside it."""
 
 
 def offer(

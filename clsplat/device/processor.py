@@ -28,7 +28,7 @@ BY_FEATURES = (
 LIMIT = 2048
 """Bytes of PoCL's record of a device in which the name is looked for; PoCL 3.0 has it at 640."""
 _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
-"""By address of a device: the text that its record points to."""
+"""Texts that the devices' records point to, by address of a device."""
 
 
 def features(path: Path = Path("/proc/cpuinfo")) -> frozenset[str]:

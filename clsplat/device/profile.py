@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each stage costs: kernels, milliseconds, launches and bytes, recorded while `clsplat bench` asks for it."""
+"""Costs of the stages: kernels, milliseconds, launches and bytes, recorded while `clsplat bench` asks for them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What drivers do differently, by their names."""
+"""Differences between drivers, by the drivers' names."""
 
 from __future__ import annotations
 

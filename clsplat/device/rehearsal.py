@@ -27,10 +27,10 @@ from clsplat.errors import DriverError
 IDLE = 20.0
 """Seconds after which the process is ended: its device memory is worth more than its start, which takes half of one."""
 MOST_BYTES = 2 << 30
-"""Of a launch's arrays: beyond that the kernel is built only, as there might not be room for them twice."""
+"""Bytes of a launch's arrays beyond which the kernel is built only, as there might not be room for them twice."""
 MOST_ITEMS = 1 << 17
-"""Of a launch along each axis: enough for PoCL to make of it what it makes of any number (it has other code for less
-than 65,536), and few enough to take no time."""
+"""Items of a launch along each axis: enough for PoCL to compile it as for any number (it has other code for less than
+65,536), and few enough to take no time."""
 
 
 class _Process:
@@ -208,8 +208,8 @@ class Rehearsal:
 
 
 def again(index: int, trial: Mapping[str, Any]) -> str:
-    """Try once more what failed (`known.Entry.trial`) on the `index`-th device; how it fails now, or nothing. Raises
-    what a trial that is none of ours raises."""
+    """Try once more what failed (`known.Entry.trial`) on the `index`-th device; its failure now, in words, or nothing.
+    Raises whatever a trial raises that clsplat did not write."""
     given = trial["build"]
     variant = Variant(given["stem"], text_of(given["stem"]), tuple(given["options"]))
     message = {"build": _text(variant), **{key: trial[key] for key in ("launch",) if key in trial}}
@@ -226,7 +226,7 @@ def _text(variant: Variant) -> dict[str, Any]:
 
 
 def _few(size: tuple[int, ...], local: tuple[int, ...] | None) -> list[int]:
-    """As many items as are launched, or MOST_ITEMS, in whole groups."""
+    """The size of the launch along each axis, at most MOST_ITEMS, in whole groups."""
     groups = local or tuple(1 for _ in size)
     return [min(n, max(MOST_ITEMS // group, 1) * group) for n, group in zip(size, groups, strict=True)]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How kernels are shaped for a device: by rule, as `clsplat tune` found it, or as CLSPLAT_SHAPE says."""
+"""Shapes of the kernels for a device: by rule, from `clsplat tune`, or from CLSPLAT_SHAPE."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LANES = (1, 4, 8, 16)
 
 @dataclass(frozen=True)
 class Shape:
-    """How kernels are shaped for a device.
+    """The shape of the kernels for a device.
 
     lanes: pixels per vector in the blend kernels (1 on GPUs); items: work-items per work-group in kernels that
     co-operate (1 on CPUs, where a group is one sequential loop); chunks: pieces that a scan or sort is cut into at
@@ -37,7 +37,7 @@ class Shape:
 
     @property
     def label(self) -> str:
-        """As CLSPLAT_SHAPE has it."""
+        """LANESxITEMS, the form that CLSPLAT_SHAPE takes."""
         return f"{self.lanes}x{self.items}"
 
     @property
@@ -112,7 +112,7 @@ def wanted_shape(device: cl.Device) -> Shape:
 
 
 def failures(device: cl.Device) -> dict[str, str]:
-    """By shape, LANESxITEMS: how the driver failed in it, as far as is known. Empty with CLSPLAT_TRUST_DRIVER=1."""
+    """Known failures of the driver by shape, LANESxITEMS. Empty with CLSPLAT_TRUST_DRIVER=1."""
     if regardless():
         return {}
     return {label: entry.failed for label, entry in known.entries(device).items() if entry.failed}
@@ -136,7 +136,7 @@ def why_another(device: cl.Device, shape: Shape) -> str:
 
 
 def shape_text(device: cl.Device) -> str:
-    """As devices are listed: the shape, or that the device cannot take what CLSPLAT_SHAPE asks for."""
+    """The shape in the list of devices, or that the device cannot take what CLSPLAT_SHAPE asks for."""
     try:
         shape = shape_of(device)
     except DeviceError:
@@ -179,12 +179,12 @@ def _parsed(text: str, default: Shape) -> Shape | None:
 
 
 def saved_path() -> Path:
-    """Where `clsplat tune` keeps what it found."""
+    """The file in which `clsplat tune` keeps its answers."""
     return known.cache_folder() / "shapes.json"
 
 
 def saved_shapes() -> dict[str, str]:
-    """LANESxITEMS by device and driver. A file that is none of ours is passed over with a warning."""
+    """LANESxITEMS by device and driver. A file of another form is passed over with a warning."""
     path = saved_path()
     try:
         saved = parse_json(path.read_bytes())

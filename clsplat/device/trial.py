@@ -30,7 +30,7 @@ def _given(context: cl.Context, queue: cl.CommandQueue, kind: str, value: Any) -
 
 
 class _Stage:
-    """Where the child tries kernels: a device with a queue, and what has been built on it."""
+    """A device with a queue on which the child tries kernels, and what has been built on it."""
 
     def __init__(self, device: cl.Device) -> None:
         self._device, self._context = device, cl.Context([device])
@@ -74,7 +74,7 @@ class _Stage:
 
 
 def _serve(index: int) -> None:
-    """The child: answer until the parent has gone; end by itself where a driver hangs and nobody is left to see it."""
+    """The child: answer until the parent has gone; end by itself if a driver hangs and no parent is left to see it."""
     stage = None
     for line in sys.stdin:
         message = json.loads(line)

@@ -20,7 +20,7 @@ from clsplat.images.writing import write_image
 
 
 class EvaluatedView(Protocol):
-    """What is asked of a view, `clsplat.scenes.scene.View` for one."""
+    """The members of a view that evaluation uses, `clsplat.scenes.scene.View` for one."""
 
     @property
     def name(self) -> str: ...

@@ -16,7 +16,7 @@ from clsplat.files import atomic_writer, is_file
 from clsplat.progress import StageProgress
 
 URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
-"""Of VGG-16, about 530 MB. The name has the first digits of the file's SHA-256."""
+"""Address of VGG-16's weights, about 530 MB. The name has the first digits of the file's SHA-256."""
 VARIABLE = "CLSPLAT_LPIPS_TIMEOUT"
 LONGEST = 300.0
 """Seconds that the weights may take to come, unless VARIABLE says otherwise."""
@@ -25,7 +25,7 @@ SILENCE = 20.0
 
 
 def place() -> Path:
-    """Where torch looks for the file."""
+    """The path at which torch looks for the file."""
     home = os.environ.get("TORCH_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "torch"
     return Path(home).expanduser() / "hub" / "checkpoints" / URL.rpartition("/")[2]
 
@@ -66,7 +66,7 @@ def fetch() -> None:
 
 
 class _Transfer:
-    """What the thread does, and how far it is."""
+    """The download that the thread does, and its progress."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.cancelled = path, False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How close a render is to its photograph: PSNR, SSIM, and LPIPS where the optional extra is installed.
+"""Closeness of a render to its photograph: PSNR, SSIM, and LPIPS where the optional extra is installed.
 
 Images are (H, W, 3), clamped to [0, 1] and compared in float64.
 """
@@ -59,15 +59,15 @@ def lpips(image: Image, truth: Image) -> float | None:
 
 
 def lpips_missing() -> str | None:
-    """Why there is no LPIPS, in a few words; None where there is."""
+    """The reason that there is no LPIPS, in a few words; None where there is."""
     model = _lpips_model()
     return model if isinstance(model, str) else None
 
 
 @functools.cache
 def prepare_lpips() -> str | None:
-    """See to what LPIPS needs, in seconds but for the network's weights, which are fetched if they are not there: why
-    it cannot be had and what to do, None where it can. Loads nothing."""
+    """Prepare LPIPS, in seconds but for the network's weights, which are fetched if they are missing. Returns the
+    reason that it cannot be used and what to do about it, None where it can. Loads nothing."""
     for name in ("lpips", "torch"):
         if find_spec(name) is None:
             return f"the optional extra is not installed (no {name}): pip install 'clsplat[lpips]'"

@@ -80,7 +80,7 @@ def flattened(slices: Float32) -> Float32:
 
 
 def deep_rows(device: Device, camera: Camera, bins: int) -> int:
-    """Rows of the strips that a deep picture of so many slices is rendered in, whole tiles of them."""
+    """Rows of the strips, in whole tiles, that a deep picture of `bins` slices is rendered in."""
     floats = DEEP_FLOATS * bins
     pixels = min(DEEP_STRIP_FLOATS // floats, frame_pixels(device, planes=4 * floats))
     return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with what fills the first and last tile

@@ -23,7 +23,7 @@ Draw = Callable[[Camera, Collection[str]], Layers]
 """(camera, names of layers) -> those layers, (height, width) or (height, width, channels); rgb over the background,
 so over black it is associated with alpha."""
 COLOUR = ("rgb", "alpha")
-"""What light is added up in; of the other layers there is no mean."""
+"""Layers that light is added up in; the other layers have no mean."""
 _FEATURES = {"normals": "normal", "position": "position", "motion": "motion"}
 
 
@@ -33,9 +33,11 @@ def drawn_by(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     after: Camera | None = None,
 ) -> Draw:
-    """A Draw by the kernels; after: the camera of a whole frame that motion goes to. Motion is turned over: in files v
-    is up, and docs/channels.md has y down. Layers need not be contiguous: what puts them in order is left to who
-    encodes them, which may be another thread."""
+    """A Draw by the kernels; after: the camera of a whole frame that motion goes to.
+
+    Motion is turned over: in files v is up, and docs/channels.md has y down. Layers need not be contiguous: the
+    encoder, which may be another thread, puts them in order.
+    """
 
     def draw(camera: Camera, names: Collection[str]) -> Layers:
         camera, rows, columns = on_tiles(camera)
@@ -63,5 +65,5 @@ def drawn_by(
 
 
 def renderer_channels(names: Collection[str]) -> tuple[str, ...]:
-    """What `Renderer.render_channels` calls those of the layers that it makes only when asked."""
+    """Names, in `Renderer.render_channels`, of those layers that it makes only when asked."""
     return tuple(own for name, own in _FEATURES.items() if name in names)

@@ -62,7 +62,7 @@ class Pictures:
         return strip_rows(self._renderer.device, camera, names, self.config.framing)
 
     def drawn(self, at: Callable[[float], Camera], after: Camera | None = None) -> Draw:
-        """What draws a frame's layers, of a camera that says size and window (`camera`, or a strip of it).
+        """The Draw of a frame's layers, of a camera that says size and window (`camera`, or a strip of it).
 
         at: the camera of the whole frame, in its final size, at a time in frames from the frame: 0 if nothing moves;
         after: that of the next frame, for motion.
@@ -93,7 +93,7 @@ class Pictures:
         return made, lambda layers: in_space(layers, colours, space, colours.output)
 
     def is_blank(self, layers: Layers) -> bool | None:
-        """Whether layers of `unfinished` show nothing but the background, None where none of them tells."""
+        """True if layers of `unfinished` show nothing but the background, None where none of them tells."""
         for name in ("alpha", "count", "depth"):
             if name in layers:
                 return not layers[name].any()

@@ -40,7 +40,7 @@ def lens_points(count: int) -> Float64:
 
 
 def lens_radius(camera: Camera, config: SamplingConfig) -> float:
-    """In the scene's units; camera: of a whole frame."""
+    """Radius of the lens in the scene's units; camera: of a whole frame."""
     if config.f_stop is None:
         return config.aperture
     focal_length = camera.fx * config.sensor_width / camera.width / 1000 / config.metres

@@ -38,9 +38,10 @@ def _margin(config: FramingConfig) -> int:
 
 
 def finer(camera: Camera, config: FramingConfig) -> Camera:
-    """What is drawn for a picture that is supersampled: larger, with what its filter looks at around it.
+    """The camera that a supersampled picture is drawn with: larger, with the margin that its filter looks at.
 
-    Raises InputError for a panorama, which has nothing around it, where the filter looks beyond a pixel."""
+    Raises InputError for a panorama, which has nothing around it, where the filter looks beyond a pixel.
+    """
     margin, samples = _margin(config), config.supersample
     if margin == 0:
         return camera.resized(camera.width * samples, camera.height * samples)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pixels of a frame are rendered, and how finely: overscan, region of interest, supersampling.
+"""Windows of a frame, the pixels that are rendered of it: overscan, region of interest, supersampling.
 
-A `Draw` makes the named layers of a camera's picture; what is here takes one and gives another. A picture is a window
-of its frame (`Camera.window`), and its pixels have the bits that the frame's have there (docs/pictures.md).
+A `Draw` makes the named layers of a camera's picture; the functions here take one and give another. A picture is a
+window of its frame (`Camera.window`), and its pixels have the bits that the frame's have there (docs/pictures.md).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a rendered frame is written as: layers of channels in EXR, one part or several, or a plain picture.
+"""Files of rendered frames: layers of channels in EXR, one part or several, or a plain picture.
 
 EXR names follow the OpenEXR documentation ("Technical introduction", layers): R G B A Z, N.x N.y N.z, P.x P.y P.z,
 forward.u forward.v. Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
@@ -55,7 +55,7 @@ _PNG_LEVEL, _PNG_FILTER = 1, 0x40
 """Each pixel from the mean of the two beside it, rather than the best of five filters for each row. A fifth of the time
 of level 6, which can be more than a CPU device takes for the frame, for a file that is a tenth larger at most."""
 _EXR_LEVEL = 1
-"""Of zip and zips: two thirds of the time of the usual 4, for 2 to 7 % more bytes."""
+"""Level of zip and zips: two thirds of the time of the usual 4, for 2 to 7 % more bytes."""
 _LARGEST_FLOAT_INDEX = 2**24
 _BLOCK, _ROWS = 1 << 12, 64
 """Bytes of a disk's block; rows that are decoded at a time to see whether they are whole."""
@@ -128,11 +128,11 @@ def is_whole(
     *,
     deep: bool = False,
 ) -> bool:
-    """Whether a file is there that holds these channels, as `write_layers` would have them, in a picture of that size,
-    with no other values of these attributes, and that decodes to its last row, with a block of zeros in it in all rows.
-    A file that was cut short does not.
+    """True if the file holds these channels as `write_layers` writes them, and is whole.
 
-    deep: whether it is to be a deep picture, whose channels are DEEP.
+    It has to have that size and no other values of these attributes, and to decode to its last row; with a block of
+    zeros in it every row is decoded. A file that was cut short fails. deep: expect a deep picture, whose channels are
+    DEEP.
     """
     channels = [name for name in LAYERS if name in set(channels)]
     exr = path.suffix.lower() == ".exr"
@@ -173,14 +173,14 @@ def is_whole(
 
 
 def _has_hole(path: Path) -> bool:
-    """Whether a block of the disk in the file is all zeros, as where a machine stopped before it was written."""
+    """True if a block of the disk in the file is all zeros, as where a machine stopped before it was written."""
     empty = bytes(_BLOCK)
     with open(path, "rb") as file:
         return any(empty in block for block in iter(lambda: file.read(_BLOCK << 8), b""))
 
 
 def _decodes(source: Any, part: int) -> bool:
-    """Whether every row of the part does."""
+    """True if every row of the part decodes."""
     spec = source.spec()
     for first in range(spec.y, spec.y + spec.height, _ROWS):
         of = (part, 0, first, min(first + _ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
@@ -191,7 +191,7 @@ def _decodes(source: Any, part: int) -> bool:
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether a file is a picture that clsplat has not made."""
+    """True if a file is a picture that clsplat has not made."""
     source = oiio.ImageInput.open(native_name(path))
     if source is None:
         oiio.geterror()
@@ -294,7 +294,7 @@ def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
 
 
 def deep_spec(width: int, height: int, header: Header) -> Any:
-    """Of a deep EXR, its channels and their formats left to say."""
+    """The spec of a deep EXR, without its channels and their formats."""
     spec = oiio.ImageSpec(width, height, 1, oiio.FLOAT)
     spec.deep = True
     _add_header(spec, header)

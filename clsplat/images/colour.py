@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colour spaces: the one that a model was trained in, light in linear values, and what a picture is written in.
+"""Colour spaces: the one that a model was trained in, light in linear values, and the one that a picture is written in.
 
 Gaussians are blended in the space of the photographs, as they were trained. Everything that adds up light (filters,
-shutter, lens) works on linear values, and the way out goes through OpenColorIO's configuration, as OpenImageIO has it
-built in. sRGB's curve is done here: OpenColorIO's own is a quick approximation, off by up to 3e-4.
+shutter, lens) works on linear values. The way out goes through OpenColorIO's configuration, the one built into
+OpenImageIO. sRGB's curve is done here: OpenColorIO's own is a quick approximation, off by up to 3e-4.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _NAMES = {
     SRGB: ("srgb_texture", "sRGB - Texture", "srgb_tx", "sRGB", "Utility - sRGB - Texture"),
     LINEAR: ("lin_rec709", "Linear Rec.709 (sRGB)", "lin_srgb", "Utility - Linear - sRGB", "lin_rec709_scene"),
 }
-"""What configurations call these two."""
+"""Names of these two in configurations."""
 INTEROP = {
     SRGB: "srgb_rec709_scene",
     LINEAR: "lin_rec709_scene",
     "ACEScg": "lin_ap1_scene",
     "ACES2065-1": "lin_ap0_scene",
 }
-"""What EXR's attribute colorInteropID calls spaces (Color Interop Forum, "Color Space Encodings for Texture Assets",
+"""Names of spaces in EXR's attribute colorInteropID (Color Interop Forum, "Color Space Encodings for Texture Assets",
 https://github.com/AcademySoftwareFoundation/ColorInterop)."""
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
 _ACES_WHITE, _D65 = (0.32168, 0.33767), (0.3127, 0.3290)
@@ -76,7 +76,7 @@ def recorded_space(path: str | os.PathLike[str]) -> str:
 
 
 def photos_space(paths: Iterable[str | os.PathLike[str]]) -> str:
-    """What a model that is trained from these pictures is in: linear where every one is a float EXR or HDR."""
+    """The space of a model that is trained from these pictures: linear if every one is a float EXR or HDR."""
     endings = {Path(path).suffix.lower() for path in paths}
     return LINEAR if endings and endings <= set(_LINEAR_PHOTOS) else SRGB
 
@@ -121,11 +121,11 @@ class Colours:
             self._ocio_name(LINEAR)
 
     def is_linear(self, space: str) -> bool:
-        """Whether one of the job's spaces has no curve."""
+        """True if one of the job's spaces has no curve."""
         return space == LINEAR or (space != SRGB and bool(self._config.isColorSpaceLinear(space)))
 
     def has_rec709(self, space: str) -> bool:
-        """Whether one of the job's spaces has Rec.709's primaries and white, whatever its curve is."""
+        """True if one of the job's spaces has Rec.709's primaries and white, whatever its curve is."""
         if space in _NAMES:
             return True
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]], np.float32)
@@ -171,7 +171,7 @@ class Colours:
         return str(found)
 
     def _ocio_name(self, space: str) -> str:
-        """What the configuration calls it. Raises InputError where it has no linear Rec.709."""
+        """The space's name in the configuration. Raises InputError where it has no linear Rec.709."""
         for name in _NAMES.get(space, (space,)):
             if self._config.getColorSpaceIndex(self._config.resolve(name)) >= 0:
                 return str(self._config.resolve(name))

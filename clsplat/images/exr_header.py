@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a picture's header says beside its pixels."""
+"""The header of a picture: attributes, matrices, window and chromaticities."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from clsplat.camera import Camera, Window
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """What goes into the file beside pixels; window: None where the picture is the display window; chromaticities: x
-    and y of red, green, blue and white, none where they are not known; is_srgb: whether the colours are sRGB's."""
+    """Contents of a file beside pixels; window: None where the picture is the display window; chromaticities: x and y
+    of red, green, blue and white, none where they are not known; is_srgb: True if the colours are sRGB's."""
 
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
     matrices: Mapping[str, Float64] = field(default_factory=dict)

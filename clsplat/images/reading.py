@@ -29,19 +29,19 @@ from clsplat.files import (
 from clsplat.images.alpha import associate, unassociate
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
-"""What counts as a picture when a folder is searched, in lower case. Named files may be anything OpenImageIO reads."""
+"""Extensions of pictures when a folder is searched, in lower case. Named files may be anything OpenImageIO reads."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_PIXELS = 1 << 28
 FREE_FLOATS, FLOATS_A_BYTE = 48 << 20, 4096
-"""A picture may have so many channel values whatever its file's length is, and so many for each byte of it: more than
-any real picture, compressed, as deflate makes at most 1032 bytes of one."""
+"""Channel values that a picture may have whatever its file's length is, and for each byte of it. Both are more than any
+real picture has, compressed, as deflate makes at most 1032 bytes of one."""
 MAX_FILE_BYTES, FREE_FILE_BYTES = 1 << 30, 1 << 26
 SIGNATURES = (
     *(PNG_SIGNATURE, b"\xff\xd8\xff", b"\x76\x2f\x31\x01", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"#?"),
     *(b"RIFF", b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"PF", b"Pf"),
 )
-"""How pictures begin that are larger than FREE_FILE_BYTES: some decoders read the whole of what is not theirs."""
+"""First bytes of pictures larger than FREE_FILE_BYTES: some decoders read the whole of a file that is not theirs."""
 # libjpeg's notes about data that it can do without; every other message means that pixels are lost
 HARMLESS = ("extraneous bytes",)
 
@@ -59,9 +59,9 @@ _COLOUR = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE)
 def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) -> set[Path]:
     """Those of `paths` that go with one of the pictures and are none: masks, depths, normals and the like.
 
-    By name: a picture's own with such a word behind it (r_0_depth_0001.png) or before it (mask_r_0.png), in place of
-    "color" (frame-1.color.jpg, frame-1.depth.png), or with .png behind its extension (COLMAP's masks); and whatever is
-    in a sub-folder of `folder` that is called by such a word.
+    They are told by name: a picture's own with such a word behind it (r_0_depth_0001.png) or before it (mask_r_0.png),
+    in place of "color" (frame-1.color.jpg, frame-1.depth.png), or with .png behind its extension (COLMAP's masks); and
+    whatever is in a sub-folder of `folder` that is called by such a word.
     """
     pictures = list(pictures)
 
@@ -114,13 +114,13 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
 
 
 def cannot_be_searched(error: OSError) -> None:
-    """For `os.walk`, which else passes over a folder that it cannot read. Raises InputError."""
+    """Raise InputError: handed to `os.walk`, which else passes over a folder that it cannot read."""
     why = reason_of(error)
     raise InputError(f"{error.filename}: cannot be searched for pictures: {why}; make it readable or move it away")
 
 
 def require_images(paths: Iterable[Path], listed_in: Path) -> None:
-    """Raise InputError that names the files of `paths` that do not exist; `listed_in` is what lists them."""
+    """Raise InputError that names the files of `paths` that do not exist; `listed_in` names the list."""
     if missing := [path for path in paths if not is_file(path)]:
         raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {examples(missing)}")
 
@@ -225,7 +225,7 @@ def open_image(path: Path, hints: Any = None) -> Any:
 
 
 def error_of(source: Any) -> str:
-    """What OpenImageIO says went wrong."""
+    """OpenImageIO's message about what went wrong."""
     try:
         return str(source.geterror())
     except UnicodeDecodeError:
@@ -243,7 +243,8 @@ def _orientation(spec: Any) -> int:
 
 
 def _reorient(image: Float32, orientation: int) -> Float32:
-    """What EXIF orientations 1 to 8 mean: from 5 on rows and columns change places, then the axes are flipped."""
+    """The image turned by EXIF orientations 1 to 8: from 5 on rows and columns change places, then the axes are
+    flipped."""
     if orientation >= 5:
         image = image.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):
@@ -291,7 +292,7 @@ def _check_png_is_whole(path: Path) -> None:
 
 
 def png_is_whole(path: Path) -> bool:
-    """Whether the chunks lead to the last one."""
+    """True if the chunks lead to the last one."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         position = len(PNG_SIGNATURE) if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE else size

@@ -22,11 +22,11 @@ from clsplat.images.channels import VIDEO
 
 _LUMA = (0.2126, 0.7152, 0.0722)
 _BLUE, _RED = np.float32(2 * (1 - 0.0722)), np.float32(2 * (1 - 0.2126))
-"""What B - Y and R - Y reach, from end to end."""
+"""Ranges of B - Y and R - Y, from end to end."""
 
 
 def video_missing() -> str:
-    """Why no video can be written, in one line; '' if it can."""
+    """The reason that no video can be written, in one line; '' if it can."""
     try:
         import av  # noqa: F401
     except ImportError:
@@ -79,7 +79,7 @@ def yuv420(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def rate_of(fps: float) -> Fraction:
-    """Frames a second as a file has them: those of television, which are said in two or three decimals, in 1001ths."""
+    """Frames a second for a file: those of television, which are said in two or three decimals, in 1001ths."""
     whole = round(fps * 1.001)
     ntsc = Fraction(1000 * whole, 1001)
     near = 5e-3 if whole % 24 == 0 or whole % 30 == 0 else 1e-4
@@ -130,7 +130,7 @@ class VideoWriter:
         self.add_planes(frame_planes(image))
 
     def add_planes(self, planes: NDArray[np.uint8]) -> None:
-        """As `add`, of what `frame_planes` gives."""
+        """Add a frame from what `frame_planes` gives."""
         size = planes.shape[0] * 2 // 3, planes.shape[1]
         if self.frames and size != self._size:
             raise ValueError(f"frame {size}: expected {self._size}, the size of the first")

@@ -96,7 +96,7 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
 
 
 def _is_whole(path: Path, kind: str, parts: int) -> bool:
-    """Whether the end of a picture that has been written is there: the last chunk of a PNG, the last row of others."""
+    """True if the end of a picture that has been written is there: the last chunk of a PNG, the last row of others."""
     if kind == "png":
         return png_is_whole(path)
     source = oiio.ImageInput.open(native_name(path))
@@ -138,7 +138,7 @@ class Output:
         return native_name(self.temporary)
 
     def take(self, done: bool) -> None:
-        """What the file's methods give. Raises WriteError or ClsplatError where that is failure."""
+        """Take what the file's methods return. Raises WriteError or ClsplatError where that is failure."""
         if not done:
             self.fail(self.file.geterror())
 

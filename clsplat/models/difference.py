@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a model is from another that it should equal, row by row: what a format has lost."""
+"""Difference of a model from another that it should equal, row by row: the loss of a format."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be done to a model without a device: cut, move, thin out, put together. Nothing is changed in place.
+"""Edits of a model without a device: cut, move, thin out, put together. Nothing is changed in place.
 
 A similarity (4, 4) takes the world to a new one: x' = s Q x + t, where Q is a rotation or one with a mirror. A Gaussian
 N(m, R S S R^T) becomes N(s Q m + t, Q R s S s S R^T Q^T), its colour f, a function of the direction of view, becomes
@@ -21,15 +21,16 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import sh_basis
 
 FAR = 64.0
-"""A model that is moved farther from the origin than so many of its own sizes counts from there (decision 0017)."""
+"""Distance from the origin, in a model's own sizes, beyond which a model that is moved counts from there (decision
+0017)."""
 SCALES = (1e-12, 1e12)
-"""Between these scales lie; beyond them float32's means would be 0 or infinite."""
+"""Smallest and largest scale; beyond them float32's means would be 0 or infinite."""
 _SIMILAR = 1e-6
 """Most that Q^T Q may differ from 1: matrices are typed with six digits, or float32's."""
 
 
 def take(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
-    """Those rows, (n,) booleans or indices."""
+    """The Gaussians of those rows, (n,) booleans or indices."""
     return Gaussians(
         gaussians.means[rows],
         gaussians.quaternions[rows],
@@ -42,19 +43,19 @@ def take(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.int64]) -> G
 
 
 def in_box(gaussians: Gaussians, low: Sequence[float], high: Sequence[float]) -> NDArray[np.bool_]:
-    """(n,) whose mean is in the box, its faces included; low, high (3,) in the world."""
+    """Mask (n,) of the Gaussians whose mean is in the box, its faces included; low, high (3,) in the world."""
     means = gaussians.means + gaussians.origin
     return np.asarray(((means >= low) & (means <= high)).all(axis=1))
 
 
 def in_sphere(gaussians: Gaussians, centre: Sequence[float], radius: float) -> NDArray[np.bool_]:
-    """(n,) whose mean is at most `radius` from the centre (3,) in the world."""
+    """Mask (n,) of the Gaussians whose mean is at most `radius` from the centre (3,) in the world."""
     offsets = gaussians.means + (gaussians.origin - np.asarray(centre, np.float64))
     return np.asarray(np.linalg.norm(offsets, axis=1) <= radius)
 
 
 def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
-    """(n,) whose opacity is at least `least`."""
+    """Mask (n,) of the Gaussians whose opacity is at least `least`."""
     if least >= 1:
         return np.zeros(len(gaussians), np.bool_)
     with np.errstate(divide="ignore"):  # at least 0: every one
@@ -62,7 +63,7 @@ def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
 
 
 def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
-    """Without SH beyond the degree; the same where there are none."""
+    """The model without SH beyond the degree; the same where there are none."""
     return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a model file holds, in numbers. A PLY goes by in blocks, and may hold values that are not finite."""
+"""Figures of a model file. A PLY goes by in blocks, and may hold values that are not finite."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BLOCK = 1 << 16
 
 
 def model_info(path: Path) -> dict[str, Any]:
-    """What `clsplat info --json` prints. Raises InputError for a file that no format reads."""
+    """Figures that `clsplat info --json` prints. Raises InputError for a file that no format reads."""
     path = model_path(path)
     module = format_of(path)
     tell_kind(path, module)
@@ -60,7 +60,7 @@ def _ply_blocks(path: Path) -> tuple[NDArray[np.float64], Iterator[Gaussians]]:
 
 
 def _blocks(model: Gaussians) -> Iterator[Gaussians]:
-    """Of a whole model, in the world."""
+    """Blocks of a whole model, in the world."""
     for start in range(0, len(model), _BLOCK):
         rows = slice(start, start + _BLOCK)
         yield Gaussians(

@@ -92,7 +92,8 @@ def render(
 def _alphas(
     gaussians: Gaussians, arrays: dict[str, Float64], camera: Camera
 ) -> tuple[Projected | Tangents, Callable[[int], Float64]]:
-    """What is projected, and a function of a Gaussian: opacity times falloff at each pixel (P,), not yet clamped."""
+    """The projected Gaussians, and a function of a Gaussian: opacity times falloff at each pixel (P,), not yet
+    clamped."""
     pixels = pixel_grid(camera)
     if camera.projection in ("equirectangular", "fisheye"):
         t = tangents(gaussians, camera)

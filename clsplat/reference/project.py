@@ -47,9 +47,9 @@ class Projected:
 
 @dataclass(frozen=True, eq=False)
 class _Geometry:
-    """What projection and its gradient share: p (N, 3) in the camera, ratios (N, 2) clamped x/z and y/z,
-    unclamped (N, 2) bool, jacobian (N, 2, 3), rotations (N, 3, 3) and scales (N, 3) of the Gaussians, and
-    half (N, 2, 3) = M of eq. (5)."""
+    """Intermediate values that projection and its gradient share: p (N, 3) in the camera, ratios (N, 2) clamped x/z and
+    y/z, unclamped (N, 2) bool, jacobian (N, 2, 3), rotations (N, 3, 3) and scales (N, 3) of the Gaussians, and half (N,
+    2, 3) = M of eq. (5)."""
 
     p: Float64
     ratios: Float64
@@ -253,8 +253,8 @@ def project_grad_covariances(
     d_opacities: Float64,
     d_colors: Float64,
 ) -> dict[str, Float64]:
-    """As `project_grad`, from what `project` made and the gradient by the covariances (N, 3): xx, xy, yy of (28). Of
-    perspective cameras alone."""
+    """The gradient of `project_grad`, from what `project` made and the gradient by the covariances (N, 3): xx, xy, yy
+    of (28). For perspective cameras alone."""
     assert camera.projection == "perspective"
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which tiles a Gaussian reaches, by looking at every pixel: float64 twin of the tile test in kernels/."""
+"""Tiles that a Gaussian reaches, by looking at every pixel: float64 twin of the tile test in kernels/."""
 
 from __future__ import annotations
 
@@ -34,17 +34,18 @@ def touched_tiles(
 
 
 def tile_counts(projected: Projected, width: int, height: int, tile: int = 16) -> Int64:
-    """How many tiles each Gaussian reaches, (N,); a lower bound for the kernels' counts."""
+    """Number of tiles that each Gaussian reaches, (N,); a lower bound for the kernels' counts."""
     return np.array([len(tiles) for tiles in touched_tiles(projected, width, height, tile)], np.int64)
 
 
 def square_tiles(
     projected: Projected, width: int, height: int, tile: int = 16, slack: float = 0.0, threshold: float = ALPHA_MIN
 ) -> list[Int64]:
-    """As `touched_tiles`, those that have a pixel centre in the square of the longest half axis of the ellipse where
-    alpha is `threshold`, made wider by `slack` pixels: what Kerbl et al.'s code lists, but for its extent of 3 sigma.
+    """Tiles that have a pixel centre in a square around each Gaussian, like `touched_tiles`.
 
-    The kernels' set with tile_test "square" lies between those of slack 0 and of a little more.
+    The square is that of the longest half axis of the ellipse where alpha is `threshold`, made wider by `slack` pixels:
+    what Kerbl et al.'s code lists, but for its extent of 3 sigma. The kernels' set with tile_test "square" lies between
+    those of slack 0 and of a little more.
     """
     tiles_x, tiles_y = -(-width // tile), -(-height // tile)
     result = []

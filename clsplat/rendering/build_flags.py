@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From RasterizerConfig to the kernels' build defines. The default has none: its kernels are the plain text."""
+"""Build defines of the kernels for a RasterizerConfig. The default has none: its kernels are the plain text."""
 
 from __future__ import annotations
 

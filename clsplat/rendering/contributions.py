@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each Gaussian adds to the pictures of given cameras: the statistic that density control prunes by."""
+"""Contributions of each Gaussian to the pictures of given cameras: the statistic that density control prunes by."""
 
 from __future__ import annotations
 

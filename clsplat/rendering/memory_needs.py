@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What frames and training steps need of a device's memory: the sizes of the stages' arrays, for the plan."""
+"""Device memory that frames and training steps need: the sizes of the stages' arrays, for the plan."""
 
 from __future__ import annotations
 
@@ -29,15 +29,16 @@ def plan_frame(
     features: int = 0,
     planes: int = 0,
 ) -> Plan:
-    """Of rendering alone; floats: parameters of a Gaussian (`ShStorage.floats`); features: floats of each Gaussian's
-    that go into channels beside colour; planes: bytes of a pixel in further planes. Raises CapacityError."""
+    """Memory plan of a frame, without training. floats: parameters of a Gaussian (`ShStorage.floats`); features: floats
+    of each Gaussian's that go into channels beside colour; planes: bytes of a pixel in further planes. Raises
+    CapacityError."""
     beside = {"slot": 0, "statistics": 0, "features": features, "more": planes}
     return _plan(device, gaussians, floats, [camera], config, training=False, **beside)
 
 
 def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:
-    """How many pixels a frame may have, for its planes to leave three quarters of the device's memory to the model and
-    its pairs, and to be allocated at all."""
+    """Pixels that a frame may have, for its planes to leave three quarters of the device's memory to the model and its
+    pairs, and to be allocated at all."""
     each = 21 + (4 * (features + 4) if features else 0) + planes
     largest = max(12, 4 * (features + 2) if features else 0, planes)
     return min(device.budget // (4 * each), device.max_allocation // largest)
@@ -53,7 +54,7 @@ def plan_step(
     fields: SlotFields,
     agreement: bool,
 ) -> Plan:
-    """Of a training step, from any of the cameras. agreement: whether agreeing views are counted. Raises
+    """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted. Raises
     CapacityError."""
     floats = 11 + 3 * coefficients
     statistics = 4 * (5 * fields.contributions + agreement)  # contributions and two epochs of two statistics each

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much device memory may be used, and what is worked on in pieces because of it. Policy only: no OpenCL."""
+"""The limit of device memory, and the pieces that work is cut into because of it. Policy only: no OpenCL."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def mebibytes(nbytes: int) -> str:
 
 @dataclass(frozen=True)
 class Need:
-    """What a frame, or a training step, asks of the device's memory, in bytes unless said otherwise.
+    """Device memory that a frame, or a training step, needs, in bytes unless said otherwise.
 
-    gaussians: how many; floats: parameters of one; models: arrays of so many parameters, 1 for a frame and 4 for a
-    step; slot: floats of a pair's slot, 0 for a frame; planes: all that is as large as the image; loss: of which the
-    loss's scratch memory; scratch: whatever is left over; sorts_pairs: whether all pairs are sorted by depth; extra: of
-    each Gaussian, what switches and statistics add.
+    gaussians: their number; floats: parameters of one; models: arrays of `floats` parameters, 1 for a frame and 4 for a
+    step; slot: floats of a pair's slot, 0 for a frame; planes: all that is as large as the image; loss: the loss's
+    scratch memory, a part of that; scratch: whatever is left over; sorts_pairs: True if all pairs are sorted by depth;
+    extra: bytes of each Gaussian that switches and statistics add.
     """
 
     gaussians: int
@@ -35,7 +35,7 @@ class Need:
 
     @property
     def row(self) -> int:
-        """Of each Gaussian, beside its parameters: splat, counts, scans, sort by depth; screen and statistics."""
+        """Bytes of each Gaussian, beside its parameters: splat, counts, scans, sort by depth; screen and statistics."""
         return 64 + 12 + 36 + (20 if self.slot else 0) + self.extra
 
     @property
@@ -45,12 +45,12 @@ class Need:
 
     @property
     def model(self) -> int:
-        """Of each Gaussian's parameters, gradients and moments."""
+        """Bytes of each Gaussian's parameters, gradients and moments."""
         return 4 * self.floats * self.models
 
     @property
     def pair(self) -> int:
-        """Of each pair: keys, sort, lists; slot and cells where there is a gradient."""
+        """Bytes of each pair: keys, sort, lists; slot and cells where there is a gradient."""
         gradient = 4 * self.slot + 4 if self.slot else 0
         return 36 + (24 if self.sorts_pairs else 0) + gradient
 
@@ -61,7 +61,7 @@ class Need:
 
     @property
     def total(self) -> int:
-        """With everything on the device at once."""
+        """Bytes with everything on the device at once."""
         return self.planes + self.scratch + self.gaussians * (self.row + self.model) + self.pairs * self.pair
 
 
@@ -73,11 +73,11 @@ _MAX_PAIRS = 2**31 - 1024
 
 @dataclass(frozen=True)
 class Plan:
-    """How the work goes through the memory.
+    """Division of the work, so that it fits the memory.
 
-    rows: Gaussians whose parameters, gradients and moments are on the device at once; streamed: not all of them;
-    pairs: most (tile, Gaussian) pairs at once; channels: of the loss, at once; gathers: rows move on the device;
-    needed and allowed: bytes, the first estimated; groups: of tiles, estimated too.
+    rows: Gaussians whose parameters, gradients and moments are on the device at once; streamed: not all of them; pairs:
+    most (tile, Gaussian) pairs at once; channels: of the loss, at once; gathers: rows move on the device; needed and
+    allowed: bytes, the first estimated; groups: of tiles, estimated too.
     """
 
     gaussians: int
@@ -92,12 +92,12 @@ class Plan:
 
     @property
     def pieces(self) -> tuple[bool, bool, bool]:
-        """What is done in pieces: parameters, image, loss."""
+        """True for each that is done in pieces: parameters, image, loss."""
         return self.streamed, self.groups > 1, self.channels < 3
 
     @property
     def tight(self) -> bool:
-        """Whether there is no room to spare."""
+        """True if there is no room to spare."""
         return any(self.pieces) or not self.gathers
 
     def __str__(self) -> str:

@@ -43,12 +43,12 @@ PROJECTION_DEFINES: dict[str, dict[str, object]] = {
     "equirectangular": {"RAYS": 1},
     "fisheye": {"RAYS": 2},
 }
-"""What the kernels are built with for a camera that is no pinhole."""
+"""Defines of the kernels for a camera that is no pinhole."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What is listed and blended together: a band of tiles and its pairs."""
+    """The unit of listing and blending: a band of tiles and its pairs."""
 
     band: Band
     counted: Counted
@@ -75,20 +75,20 @@ class Frame:
 
     @property
     def pairs(self) -> Pairs:
-        """Of all tiles, if there is one band."""
+        """Pairs of all tiles, if there is one band."""
         return self.part.pairs
 
     @property
     def lists(self) -> TileLists:
-        """Of all tiles, if there is one band."""
+        """Lists of all tiles, if there is one band."""
         return self.part.lists
 
 
 class Rasterizer:
     """The pipeline on one device, with the memory that it works in, which can be another's.
 
-    capacity: most (tile, Gaussian) pairs that are worked on together; the plan of who owns the rasterizer; found (8,)
-    uint32: what a pass reads back, and in the last four what `adam` counts.
+    capacity: most (tile, Gaussian) pairs that are worked on together; the rasterizer's owner plans it; found (8,)
+    uint32: values that a pass reads back, and in the last four the counts of `adam`.
     """
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
@@ -147,13 +147,13 @@ class Rasterizer:
         return Frame(camera, camera_array, background, projected, bands, part, blended, counted.beside)
 
     def part(self, frame: Frame, band: Band) -> Part:
-        """What the band lists; where there are several bands it takes the memory of the one before."""
+        """The band with its pairs and lists; where there are several bands it takes the memory of the one before."""
         if len(frame.bands) == 1:
             return frame.part
         return self._part(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
     def channels(self, gaussians: AnyGaussians, frame: Frame, wanted: Features, after: DeviceArray) -> Channels:
-        """What the frame has beside colour; after: the packed camera that motion goes to."""
+        """The frame's channels beside colour; after: the packed camera that motion goes to."""
         device, work, projected = self.device_of(frame.camera), self.work, frame.projected
         rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected)
         found = None

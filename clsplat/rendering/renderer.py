@@ -49,8 +49,8 @@ class ChannelResult:
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
-    """What the settings keep of the SH of a model that is held to be rendered. Raises InputError where a coefficient
-    is more than a half holds."""
+    """The part of the SH that the settings keep of a model that is held to be rendered. Raises InputError where a
+    coefficient is more than a half holds."""
     half = config.sh_storage == "half"
     if half:
         check_half(gaussians.sh)
@@ -108,10 +108,10 @@ class Renderer:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         contiguous: bool = True,
     ) -> tuple[RenderResult, ChannelResult]:
-        """As `render`, with what the view has beside colour (docs/channels.md).
+        """Render a view with channels beside colour (docs/channels.md).
 
-        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None.
-        Raises InputError for motion from one projection to another.
+        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None. The
+        rest is like `render`. Raises InputError for motion from one projection to another.
         """
         of = Features.of(wanted)
         after = after or camera

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which spherical harmonics of a model matter, and what can be stored of them. Policy only: no OpenCL."""
+"""The spherical harmonics of a model that matter, and the part of them to store. Policy only: no OpenCL."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
 
 
 def coefficients_in_use(degrees: NDArray[np.uint8]) -> tuple[int, bool]:
-    """Of each channel, by the Gaussian that has the most; and whether enough of the others' are left out that it is
-    worth while to look at each one's degree."""
+    """Coefficients of each channel, by the Gaussian that has the most; and True if enough of the others' are left out
+    that it is worth while to look at each one's degree."""
     coefficients = (int(degrees.max(initial=0)) + 1) ** 2
     if coefficients == 1:
         return 1, False

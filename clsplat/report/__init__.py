@@ -8,4 +8,4 @@ is what training notes for them.
 from __future__ import annotations
 
 NAME = "report.html"
-"""In a run's folder."""
+"""File name of the report in a run's folder."""

@@ -32,13 +32,13 @@ class Comparison:
 
     @property
     def differing(self) -> dict[str, list[Any]]:
-        """By flag the values of each run, where they are not all the same."""
+        """Values of each run by flag, where they are not all the same."""
         settings = [dict(settings_of(each.run.config)) for each in self.runs]
         return {name: [each[name] for each in settings] for name in settings[0]
                 if any(each[name] != settings[0][name] for each in settings)}  # fmt: skip
 
     def document(self) -> dict[str, Any]:
-        """For --json and for the page's data."""
+        """The comparison for --json and for the page's data."""
         runs = [
             {
                 "run": label,
@@ -141,7 +141,7 @@ def charts(found: Comparison) -> list[Markup]:
 
 
 def view_rows(found: Comparison) -> list[tuple[str, list[float | None], float | None]]:
-    """Of the views that two runs or more have: name, PSNR in each, and the best of them."""
+    """Rows of the views that two runs or more have: name, PSNR in each, and the best of them."""
     of = [
         {v["name"]: v.get("psnr") for v in each.evaluation["views"]} if each.evaluation else {} for each in found.runs
     ]
@@ -155,7 +155,7 @@ def view_rows(found: Comparison) -> list[tuple[str, list[float | None], float | 
 
 
 def comparison_table(found: Comparison) -> str:
-    """For the terminal."""
+    """Text table for the terminal."""
     columns = [
         name for name in SCORES if any(each.evaluation and name in each.evaluation["mean"] for each in found.runs)
     ]

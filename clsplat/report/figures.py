@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a run, as its files have them: nothing is measured again, and what is missing or damaged is noted."""
+"""The figures of a run, from its files: nothing is measured again, and what is missing or damaged is noted."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ Record = dict[str, Any]
 
 SCORES = ("psnr", "ssim", "lpips")
 CURVES = ("step", "loss", "psnr", "gaussians", "seconds")
-"""Of metrics.jsonl, every record has them."""
+"""Keys that every record of metrics.jsonl has."""
 MAX_NAME = 200
 """Characters of a name of a view, a stage or a device that are shown."""
 MAX_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
-"""What is kept of a file that has more, as none of ours does: the last."""
+"""Entries that are kept of a file that has more, as none of ours does: the last."""
 LARGEST = 1e30
 
 
 @dataclass
 class Figures:
-    """What a run's files say.
+    """Figures from a run's files.
 
     curves: equally long lists by the names of CURVES; stages: step and milliseconds by stage; evaluations: held-out
     scores on the way and at the end, by step; evaluation: eval.json; model: of model.ply, without its Gaussians;
@@ -58,13 +58,13 @@ class Figures:
 
     @property
     def seconds(self) -> float | None:
-        """Of training, so far."""
+        """Seconds of training, so far."""
         known = self.evaluation["seconds"] if self.evaluation else None
         return known if known is not None else next(reversed(self.curves["seconds"]), None)
 
     @property
     def gaussians(self) -> int | None:
-        """In the model, as it or eval.json says, or at the last step."""
+        """Number of Gaussians in the model, as it or eval.json says, or at the last step."""
         if self.model is not None:
             return int(self.model["gaussians"])
         if self.evaluation is not None and self.evaluation["gaussians"] is not None:
@@ -138,7 +138,7 @@ def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]
 
 
 def default_settings() -> dict[str, Any]:
-    """What every setting is unless it is asked for."""
+    """Default of every setting, by name."""
     return dict(settings_of(TrainConfig()))
 
 

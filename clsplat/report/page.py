@@ -125,7 +125,7 @@ def render_page(name: str, **values: Any) -> str:
 
 
 def summary(figures: Figures) -> list[tuple[str, str, str]]:
-    """What comes first: label, text and figure."""
+    """The figures at the top of the page: label, text and exact value."""
     mean = figures.evaluation["mean"] if figures.evaluation else {}
     rows = [(TITLES[name], score(mean[name], name), repr(mean[name])) for name in SCORES if name in mean]
     if figures.gaussians is not None:
@@ -185,7 +185,7 @@ def stage_chart(figures: Figures) -> Markup:
 
 
 def stage_rows(figures: Figures) -> list[tuple[str, float, float, float]]:
-    """Of each stage its median and last milliseconds, and its share of the last step; the largest first."""
+    """Rows of the stages: name, median and last milliseconds, share of the last step; the largest first."""
     if not figures.stages:
         return []
     last = figures.stages[-1]["ms"]
@@ -224,7 +224,7 @@ def setting_rows(figures: Figures) -> list[tuple[str, str, str, bool]]:
 
 
 def setting_text(value: object) -> str:
-    """For people, lists with spaces, so that they can be wrapped."""
+    """Text of a setting for people, lists with spaces, so that they can be wrapped."""
     if isinstance(value, tuple):
         return ", ".join(map(str, value)) or "none"
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -272,12 +272,12 @@ def duration(seconds: float | None) -> str:
 
 
 def score(value: float, name: str) -> str:
-    """With the digits that mean something."""
+    """A score with the digits that mean something."""
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
 
 
 def count(value: float) -> str:
-    """With thousands."""
+    """A count with thousands' commas."""
     return f"{value:,.0f}"
 
 
@@ -292,7 +292,7 @@ def _bars(histogram: dict[str, Any]) -> list[tuple[float, float]]:
 
 
 def _data(figures: Figures) -> dict[str, Any]:
-    """What the page holds for programs: the figures, unrounded."""
+    """The page's data for programs: the figures, unrounded."""
     length = len(figures.curves["step"])
     every = -(-length // MAX_RECORDS) or 1
     kept: Sequence[int] = sorted({*range(0, length, every), *([length - 1] if length else [])})
@@ -315,5 +315,5 @@ def _hash(text: str) -> str:
 
 
 def json_text(value: object) -> str:
-    """For --json."""
+    """Text for --json."""
     return json.dumps(value, indent=2, allow_nan=False)

@@ -34,8 +34,8 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """From the value low to high, to pixels from start to end; ticks: value and label. power: values are powers of ten
-    of what the labels say."""
+    """The axis from values low to high, to pixels from start to end; ticks: value and label. power: values are powers
+    of ten of what the labels say."""
 
     low: float
     high: float
@@ -96,7 +96,7 @@ def chart(
 
 
 def short(value: float) -> str:
-    """For people: 235k, 1.2M, 0.025."""
+    """A short number for people: 235k, 1.2M, 0.025."""
     size = abs(value)
     for limit, factor, unit in ((1e9, 1e-9, "G"), (1e6, 1e-6, "M"), (1e4, 1e-3, "k")):
         if size >= limit:

@@ -36,7 +36,7 @@ WHITE_ERROR = 0.25
 RAMP = np.array(
     [(0, 0, 0), (40, 11, 84), (101, 21, 110), (159, 42, 99), (212, 72, 66), (245, 125, 21), (250, 193, 39)], np.float32
 )
-"""From no error to WHITE_ERROR and more, in even steps of lightness, as matplotlib's inferno has them."""
+"""Colours from no error to WHITE_ERROR and more, in even steps of lightness: matplotlib's inferno."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Shown:
 
     @property
     def small(self) -> bool:
-        """Whether its pixels are few."""
+        """True if its pixels are few."""
         return max(self.width, self.height) <= SMALL
 
 
@@ -74,7 +74,8 @@ def scene_of(run: Run) -> Scene | str:
 
 
 def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
-    """Which views to show, at most `limit`: the worst, the best, and evenly between, in the order that they have."""
+    """Indices of the views to show, at most `limit`: the worst, the best, and evenly between, in the order that they
+    have."""
     if len(scores) <= limit:
         return list(range(len(scores)))
     order = sorted(range(len(scores)), key=lambda index: (scores[index] is None, scores[index] or 0.0, index))
@@ -135,7 +136,7 @@ def data_uri(image: NDArray[Any]) -> str:
 
 
 def _is_within(path: Path, folder: Path) -> bool:
-    """Whether the file is in the folder, wherever its name and links lead."""
+    """True if the file is in the folder, wherever its name and links lead."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError):

@@ -25,7 +25,7 @@ NPY_HEADER = re.compile(
     r"\{'descr': '([<>|][biufc]\d{1,2})', 'fortran_order': (False|True), "
     r"'shape': \(((?:\d{1,18}(?:, \d{1,18}){0,7},?)?)\), \} *\n"
 )
-"""What np.save writes before an array of numbers."""
+"""The text that np.save writes before an array of numbers."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -39,7 +39,7 @@ class Checkpoint:
 
 
 def digest_of(array: NDArray[Any]) -> str:
-    """Of what an array is and holds."""
+    """Digest of an array's dtype, shape and values."""
     digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
     digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()

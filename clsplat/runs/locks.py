@@ -19,9 +19,10 @@ from clsplat.errors import InputError, plain
 from clsplat.files import parse_json
 
 NAME = ".clsplat-lock"
-"""The file in the folder that is locked, as long as somebody writes there. It says who."""
+"""The file in the folder that is locked, as long as a process writes there. It names the process."""
 _FAR = 1 << 30
-"""Windows locks bytes, and nobody else may read those: this one is behind all that the file holds."""
+"""Place of the byte that is locked. On Windows no other process may read a locked byte: this one is behind all that the
+file holds."""
 _TAKEN = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL, errno.EIO)
 _held: dict[str, int] = {}
@@ -32,8 +33,8 @@ _held: dict[str, int] = {}
 def locked(folder: Path, verb: str) -> Iterator[None]:
     """Be the only process that writes to a folder, which has to exist; inside, the same process may do so again.
 
-    Raises InputError that names who has it, OSError where no file can be made there. A file system without locks is a
-    warning, and nobody is kept out.
+    Raises InputError that names the process that has it, OSError where no file can be made there. On a file system
+    without locks there is a warning, and no other process is kept out.
     """
     key = os.path.realpath(folder)
     if key in _held:
@@ -91,7 +92,7 @@ def try_lock(file: IO[bytes]) -> None:
 
 
 def _sign(file: IO[bytes], verb: str) -> None:
-    """Write who we are; what cannot be written, as on a full disk, is no reason to stop."""
+    """Write which process this is; failing to, as on a full disk, is no reason to stop."""
     text = json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "verb": verb, "since": time.time()})
     with suppress(OSError):
         file.seek(0)

@@ -237,7 +237,7 @@ def model_file(path: Path) -> Path:
 
 
 def is_run(path: Path) -> bool:
-    """Whether the folder holds a config.toml that clsplat wrote."""
+    """True if the folder holds a config.toml that clsplat wrote."""
     try:
         text = read_document(path / "config.toml", "the settings of a run", MAX_SETTINGS)
     except InputError:

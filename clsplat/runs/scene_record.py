@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run knows of its scene, scene.json: names, sizes and cameras of the views, a digest of each photograph."""
+"""The record that a run keeps of its scene, scene.json: names, sizes and cameras of the views, a digest of each
+photograph."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ _EXPECTED = "what a run knows of its scene"
 
 
 def record_of(scene: Scene, resolution: int) -> dict[str, Any]:
-    """What scene.json holds; resolution: the setting. Reads every photograph, if that has not been done."""
+    """Contents of scene.json; resolution: the setting. Reads every photograph, if that has not been done."""
     points = hashlib.blake2b(np.ascontiguousarray(scene.points, "<f8").tobytes(), digest_size=16)
     points.update(np.ascontiguousarray(scene.point_colors, "<f4").tobytes())
     digests = scene.digests
@@ -62,7 +63,7 @@ def write(run: Run, scene: Scene) -> None:
 
 
 def read(run: Run) -> dict[str, Any] | None:
-    """What scene.json holds; None where there is none, as in runs of earlier versions. Raises InputError."""
+    """Contents of scene.json; None where there is none, as in runs of earlier versions. Raises InputError."""
     path = run.path / NAME
     if not path.exists():
         return None
@@ -84,8 +85,8 @@ def read(run: Run) -> dict[str, Any] | None:
 
 
 def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """How a scene differs from the one that a run has begun with, in few words each. With another --resolution sizes
-    may differ, and files of another size stand in."""
+    """Differences between a scene and the one that a run has begun with, in few words each. With another --resolution
+    sizes may differ, and files of another size stand in."""
     was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
     told = [
         _listed("not there any more", [name for name in was if name not in new]),
@@ -154,7 +155,8 @@ def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
 
 
 def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
-    """Why scores of these views are not those of held-out photographs of the scene that the run has begun with."""
+    """Reasons that scores of these views are not those of held-out photographs of the scene that the run has begun
+    with."""
     try:
         record = read(run)
     except InputError:
@@ -179,7 +181,7 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
 
 
 def _close(a: list[float], b: list[float]) -> bool:
-    """Of vectors: relative to the largest number, as a scene may be of any size."""
+    """True if two vectors are equal to SAME of their largest number, as a scene may be of any size."""
     one, other = np.array(a), np.array(b)
     return bool(np.abs(one - other).max() <= SAME * max(np.abs(one).max(), np.abs(other).max()))
 

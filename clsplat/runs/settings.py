@@ -56,7 +56,8 @@ def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
 
 
 def parse_config(text: str, path: Path, *, tell: bool = True) -> tuple[TrainConfig, Path | None]:
-    """As `read_config`, of the file's text; tell: warn of settings that there are no more."""
+    """The configuration and the scene's path from the file's text (see `read_config`). tell: warn of settings that
+    there are no more."""
     try:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -99,7 +100,7 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str, *, tell: bool)
 
 
 def _meant(key: str, where: str) -> str:
-    """Where a setting of that name, or one like it, belongs."""
+    """Hint at the table in which a setting of that name, or one like it, belongs."""
     tables = {"train": TrainConfig} | {
         f"train.{name}": kind for name, kind in get_type_hints(TrainConfig).items() if is_dataclass(kind)
     }

@@ -40,7 +40,7 @@ MAX_NUMBER = 1e30
 """Coordinates beyond it are damage; their squares are still finite."""
 WINDOW = 1 << 20
 NEWER = 60.0
-"""Seconds by which a text file is newer than its binary one where somebody has edited it since: tools that write both,
+"""Seconds by which a text file is newer than its binary one where it was edited since: tools that write both,
 and programs that copy them, are done with the second sooner."""
 ANNOUNCED = re.compile(r"# *Number of (?:cameras|images|points): *(\d{1,18})\b")
 POSE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
@@ -129,7 +129,7 @@ def read_cameras(folder: Path) -> dict[str, Camera]:
 
 
 def safe_name(name: str) -> bool:
-    """Whether a name from a file stays inside the folder it is relative to."""
+    """True if a name from a file stays inside the folder it is relative to."""
     path, windows = PurePosixPath(name), PureWindowsPath(name)
     inside = not path.is_absolute() and not windows.anchor and ".." not in windows.parts
     return bool(path.parts) and inside and name.isprintable()
@@ -146,7 +146,7 @@ class _Binary:
         self.doing = "its header"
 
     def _at(self, size: int) -> int:
-        """Where in the window the position is; `size` bytes from there on are in it, as far as the file has them."""
+        """Index in the window of the position; `size` bytes from there on are in it, as far as the file has them."""
         if not self.start <= self.position <= self.position + size <= self.start + len(self.window):
             self.file.seek(self.position)
             self.window, self.start = self.file.read(max(size, WINDOW)), self.position
@@ -222,7 +222,7 @@ def _require(folder: Path, stem: str) -> Path:
 
 
 def _claimed_images(folder: Path) -> int:
-    """How many images a model says it has; -1 if that cannot be read."""
+    """Number of images that a model says it has; -1 if that cannot be read."""
     path = _file(folder, "images")
     if path is None:
         return -1
@@ -233,7 +233,7 @@ def _claimed_images(folder: Path) -> int:
 
 
 def _passed_over(folder: Path) -> list[str]:
-    """A warning where somebody has edited text that is not read, as a binary file goes before it."""
+    """A warning of edited text that is not read, as a binary file goes before it."""
     edited = []
     for stem in STEMS:
         binary, text = folder / f"{stem}.bin", folder / f"{stem}.txt"
@@ -338,7 +338,7 @@ def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
 
 
 def _are_observations(line: str) -> bool:
-    """Whether a line is of numbers in threes; the first line of a pair ends with a name."""
+    """True if a line is of numbers in threes; the first line of a pair ends with a name."""
     words = line.split()
     try:
         float(words[-1])

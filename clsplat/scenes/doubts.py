@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makes a training fail without an error: looked for in the scene before the first step, and in the pictures after
-some. A line each, which says what to do."""
+"""Doubts about a scene: what makes a training fail without an error. They are looked for in the scene before the first
+step, and in the pictures after some. A line each, which says what to do."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ LOOK_AT = 100
 LOOKED_AT = 8
 """Views that are looked at, spread evenly."""
 SMALLER = 4
-"""The pictures are looked at in a size so many times smaller."""
+"""Factor by which the pictures are made smaller to be looked at."""
 COINCIDENT = 0.05
 """Part of the points that may lie where another one does."""
 BEYOND = 0.5
 """Widths, or heights, of the picture that a principal point may lie beyond its edge."""
 WHITE, BLACK = 0.98, 0.02
-"""From there, and up to there, a channel is taken for white and black."""
+"""A channel is taken for white from the first on, and for black up to the second."""
 BORDER = 0.9
 """Part of the pictures' border that is the background, where it is one."""
 
 
 def of_scene(scene: Scene, background: Background) -> list[str]:
-    """What is wrong with the scene's points, cameras and photographs, or with the background for them."""
+    """Doubts about the scene's points, cameras and photographs, or about the background for them."""
     lenses = absurd([(view.name, view.lens) for view in scene.views])
     found = (
         _coincident(scene),
@@ -52,8 +52,8 @@ def of_scene(scene: Scene, background: Background) -> list[str]:
 def of_pictures(
     draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: Sequence[View], kind: str = "training"
 ) -> str:
-    """What is wrong with a model's pictures of these views, or nothing. draw: image (H, W, 3) and alpha (H, W) of a
-    camera; kind: what the views are called."""
+    """A doubt about a model's pictures of these views, or nothing. draw: image (H, W, 3) and alpha (H, W) of a camera;
+    kind: the name of the views in the message."""
     looked = spread(views, LOOKED_AT)
     drawn = [draw(_small(view.camera)) for view in looked]
     if not any(alpha.any() for _, alpha in drawn):
@@ -70,7 +70,7 @@ def of_pictures(
 
 
 def spread(views: Sequence[View], count: int) -> list[View]:
-    """So many of them at most, spread evenly."""
+    """At most `count` of the views, spread evenly."""
     return [views[index] for index in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).astype(int))]
 
 
@@ -84,7 +84,7 @@ def _pixels(view: View) -> NDArray[np.float32]:
 
 
 def _is_flat(image: NDArray[Any]) -> bool:
-    """Whether no pixel differs by a step of 8 bits from another."""
+    """True if no pixel differs by a step of 8 bits from another."""
     return bool(np.ptp(image.reshape(-1, image.shape[2]), axis=0).max() < 1 / 255)
 
 

@@ -30,7 +30,7 @@ NEIGHBOURS = 3
 
 
 def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
-    """Those of degree 0 of the scene's points, or of so many random ones where it has none."""
+    """Gaussians of degree 0 at the scene's points, or at `random_count` random ones where it has none."""
     points: NDArray[Any] = scene.points
     colors: NDArray[Any] = scene.point_colors
     if len(points) == 0:
@@ -88,7 +88,7 @@ def from_points(
 
 
 def squared_floor(extent: float) -> float:
-    """Under the mean squared distance of a scene's points, world units squared."""
+    """Floor under the mean squared distance of a scene's points, world units squared."""
     low, high = ORDINARY_EXTENTS
     return MIN_SQUARED_DISTANCE * (extent / min(max(extent, low), high)) ** 2
 

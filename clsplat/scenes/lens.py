@@ -59,7 +59,7 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether pictures can be used as they are; distorted models whose coefficients are all 0 count too."""
+        """True if pictures can be used as they are; distorted models whose coefficients are all 0 count too."""
         if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
             return True
         camera = self._camera()
@@ -150,8 +150,8 @@ def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
 
 
 def _bends(lens: Lens) -> bool:
-    """Whether the lens moves what a pinhole camera of its focal length has at the picture's edge by a large part of it.
-    Fisheyes and the like are meant to."""
+    """True if the lens moves what a pinhole camera of its focal length has at the picture's edge by a large part of it.
+    Fisheyes and the like are meant to, and count as False."""
     if lens.is_pinhole or lens.model in ("FOV", "EUCM") or "FISHEYE" in lens.model:
         return False
     pinhole = lens.pinhole(np.eye(3), np.zeros(3))

@@ -22,7 +22,7 @@ UNSEEN = 0.5
 
 
 def is_colourless(scene: Scene) -> bool:
-    """Whether all points are of one colour, as those of clouds without colours are read."""
+    """True if all points are of one colour, as those of clouds without colours are read."""
     colors = scene.point_colors
     return len(colors) > 1 and bool((colors == colors[0]).all())
 

@@ -33,12 +33,12 @@ T = TypeVar("T")
 MAX_SIZE = 1600
 """Longest side in pixels where no resolution is asked for."""
 FAR = 64.0
-"""Where a scene is farther from the world's origin than so many of its own sizes, its means count from its middle:
-float32 there knows places to 64 * 2^-24 of the size, a hundredth of a pixel of 2600 across the scene."""
+"""Distance of a scene from the world's origin, in its own sizes, beyond which its means count from its middle: float32
+there knows places to 64 * 2^-24 of the size, a hundredth of a pixel of 2600 across the scene."""
 ROUNDING = 1e-12
 """Cameras that are nearer than this to each other, as a part of how far they are from the origin, are in one place."""
 BLENDER_CUBE = 1.3
-"""Half the side of the cube that the synthetic scenes lie in, as the authors' code has it for random points."""
+"""Half the side of the cube that the synthetic scenes lie in, for random points: the authors' value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class View:
 
 @dataclass(eq=False)
 class Scene:
-    """What is trained on.
+    """A scene to train on.
 
     name: the folder's; views sorted by name; points (N, 3) float64 in the world, N may be 0; point_colors (N, 3)
     float32 in [0, 1]; bounds: corners (low, high), each (3,) float64, world units, of the box for random initial
@@ -135,7 +135,7 @@ class Scene:
 
     @cached_property
     def digests(self) -> dict[str, str | None]:
-        """Of each view's file, by the view's name."""
+        """Digest of each view's file, by the view's name."""
         return self._of_each(lambda view: short_digest(view.path))
 
     def _of_each(self, work: Callable[[View], T]) -> dict[str, T]:
@@ -147,7 +147,8 @@ class Scene:
 
     @cached_property
     def origin(self) -> Float64:
-        """Where the means of a model of this scene should count from, (3,) in the world: 0 unless the scene is far off.
+        """Point that the means of a model of this scene should count from, (3,) in the world: 0 unless the scene is far
+        off.
 
         The middle of the cameras, in whole steps of about the scene's size.
         """
@@ -171,7 +172,7 @@ class Scene:
 
     @cached_property
     def in_one_place(self) -> bool:
-        """Whether all training cameras are, but for rounding."""
+        """True if all training cameras are in one place, but for rounding."""
         centres = np.stack([view.camera.position for view in self.train_views or self.views])
         return self._spread[1] <= ROUNDING * float(np.abs(centres).max())
 
@@ -194,7 +195,7 @@ class Scene:
 
 
 def detect(path: Path) -> Kind:
-    """What layout a scene's folder (or transforms.json) has. Raises InputError if none, naming what was looked for."""
+    """Layout of a scene's folder (or transforms.json). Raises InputError if it has none, naming what was looked for."""
     path = Path(path)
     if path.is_file():
         if path.suffix.lower() != ".json":
@@ -407,7 +408,7 @@ def _view(frame: Frame, split: Split, resolution: int, smaller: list[Path]) -> V
 
 
 def _stands_in(path: Path, width: int, height: int, lens: Lens) -> bool:
-    """Whether a smaller picture has just the size that is wanted; tools round the shorter side up or down."""
+    """True if a smaller picture has just the size that is wanted; tools round the shorter side up or down."""
     size = image_size(path, orient=False)
     near = abs(size[0] - width) <= 1 and abs(size[1] - height) <= 1
     return near and max(size) == max(width, height) and max(size) < max(lens.width, lens.height)

@@ -153,7 +153,7 @@ def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], 
 
 
 def _ignore(text: str, fraction: float | None) -> None:
-    """Where nobody listens to the progress."""
+    """Do nothing: progress that nobody reads."""
 
 
 def unregistered(output: Path) -> list[str]:
@@ -165,7 +165,7 @@ def unregistered(output: Path) -> list[str]:
 
 
 def _record(output: Path) -> dict[str, Any]:
-    """What a result was made from. Raises InputError."""
+    """The record of what a result was made from. Raises InputError."""
     path, expected = output / RECORD, "the record of a result of sfm"
     try:
         record = parse_json(read_document(path, expected))
@@ -177,7 +177,7 @@ def _record(output: Path) -> dict[str, Any]:
 
 
 def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: bool) -> bool:
-    """Whether output is the result wanted. Raises InputError where it is something that must not be replaced."""
+    """True if output is the result wanted. Raises InputError where it is something that must not be replaced."""
     if not output.exists():
         return False
     if not output.is_dir():

@@ -23,7 +23,7 @@ from clsplat.images.reading import cannot_be_searched, companions, error_of, ope
 from clsplat.images.writing import jpeg_room
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-"""What pycolmap's wheel reads and writes; its OpenImageIO has no WebP, JPEG 2000 or HEIF."""
+"""Extensions that pycolmap's wheel reads and writes; its OpenImageIO has no WebP, JPEG 2000 or HEIF."""
 READABLE = frozenset({"jpeg", "png", "tiff", "bmp"})
 """OpenImageIO's names of these: what a file is, whatever it is called."""
 OTHER_IMAGES = frozenset({".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"})
@@ -166,7 +166,7 @@ def _stage(folder: Path, target: Path, path: Path) -> Photo:
 
 
 def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
-    """Whether a picture (H, W, C) is not opaque everywhere; alpha_channel: -1 for none."""
+    """True if a picture (H, W, C) is not opaque everywhere; alpha_channel: -1 for none."""
     if alpha_channel < 0:
         return False
     opaque = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
@@ -174,7 +174,7 @@ def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
 
 
 def has_alpha(path: Path) -> bool:
-    """Whether an image file has an alpha channel; reads its header alone."""
+    """True if an image file has an alpha channel; reads its header alone."""
     source = oiio.ImageInput.open(native_name(path))
     if source is None:
         return False

@@ -24,7 +24,7 @@ import pycolmap
 
 
 class Task(TypedDict):
-    """What the parent asks for. photos, work: folders; groups: names of the photos that share a camera."""
+    """The parent's request. photos, work: folders; groups: names of the photos that share a camera."""
 
     photos: str
     work: str
@@ -40,8 +40,8 @@ class Task(TypedDict):
 DETERMINISTIC_PHOTOS = 80
 """Up to here the mapping runs on one thread, which makes it repeat bit by bit and costs little."""
 OPENCV_PHOTOS = 20
-"""From here on a camera's photos carry the eight parameters of OPENCV; on the distorted photos of a phone its
-reprojection error is 0.477 px against 0.493 px of SIMPLE_RADIAL."""
+"""Number of a camera's photos from which they carry the eight parameters of OPENCV; on the distorted photos of a phone
+its reprojection error is 0.477 px against 0.493 px of SIMPLE_RADIAL."""
 OVERLAP = 12
 """Neighbours on each side that sequential matching pairs a photo with, beside those 2, 4, 8, ... photos away."""
 
@@ -188,7 +188,7 @@ class Worker:
         shutil.rmtree(flat)
 
     def evidence(self) -> dict[str, Any]:
-        """What there was to go on, for the message that says why no model could be built."""
+        """Counts of features and matches, for the message that says why no model could be built."""
         with sqlite3.connect(self.database) as connection:
             features = [row[0] for row in connection.execute("SELECT rows FROM keypoints")]
             matches = [row[0] for row in connection.execute("SELECT rows FROM two_view_geometries")]

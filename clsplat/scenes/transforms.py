@@ -2,7 +2,7 @@
 """Reading transforms.json of Blender synthetic (NeRF), nerfstudio and instant-ngp data sets.
 
 Poses there are `world_from_camera` with OpenGL's camera axes (x right, y up, z backward). Here the camera's axes
-become COLMAP's; the world stays as the file has it. So instant-ngp's `scale`, `offset` and `aabb_scale`, which place
+become COLMAP's; the world stays that of the file. So instant-ngp's `scale`, `offset` and `aabb_scale`, which place
 the scene in its own unit cube, touch no pose (they only bound the volume of random points), and nerfstudio's
 `applied_transform` is not undone: its sparse points have been through it as well.
 """
@@ -61,7 +61,7 @@ class Frame:
 
 @dataclass(eq=False)
 class Transforms:
-    """What the files say. points (N, 3) and colors (N, 3) in [0, 1] are nerfstudio's sparse points, if any.
+    """Contents of the files. points (N, 3) and colors (N, 3) in [0, 1] are nerfstudio's sparse points, if any.
 
     box: instant-ngp's volume, the corners (low, high), world units, or None.
     """
@@ -190,7 +190,7 @@ def _contradictions(path: Path, readers: list[Keys], frames: list[Frame]) -> lis
 
 
 def _shutter(value: object) -> bool:
-    """Whether a rolling shutter does anything."""
+    """True if a rolling shutter does anything."""
     return any(value) if isinstance(value, list) else bool(value)
 
 
@@ -241,7 +241,7 @@ class Keys:
         return float(value)
 
     def require(self, key: str) -> float:
-        """As `number`; InputError also where there is none."""
+        """The number of `key`; InputError for what `number` refuses, and where there is none."""
         value = self.number(key)
         if value is None:
             raise InputError(f"{self.where}: has no '{key}', expected a number")

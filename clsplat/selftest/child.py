@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every stage on frozen scenes against the float64 reference and stored digests: what of a driver can be trusted.
+"""Every stage on frozen scenes against the float64 reference and stored digests: a test of what a driver computes.
 
 As a program it is the child that `clsplat.selftest.trust` starts, as a driver may crash or hang: it says in lines of
 JSON what it is about to do and what came of it.
@@ -36,12 +36,12 @@ BUILT_WITH: dict[str, dict[str, object]] = {
     "deep": {"DEEP_SIZE": DEEP_FLOATS},
     "project_rays": {"LANES": 1, "RAYS": 1},
 }
-"""Of the kernels that are not built without."""
+"""Defines of the kernels that are not built without."""
 
 
 @cache
 def stored_digests() -> dict[str, Any]:
-    """By scene and stage: of all drivers and shapes, or by shape where the order of sums is the shape's."""
+    """Digests by scene and stage: of all drivers and shapes, or by shape where the order of sums is the shape's."""
     found: dict[str, Any] = json.loads(DIGESTS.read_text())["digests"]
     return found
 

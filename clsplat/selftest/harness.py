@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the stages of the self-test share: a frozen scene on a device, errors and digests."""
+"""Harness of the self-test's stages: a frozen scene on a device, errors and digests."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ there a rounding decides. It is a hundred times what rounding moves them by."""
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one stage on one scene: arrays that the digest is of, errors by the name of what was compared, absolute and in
-    ulp; trouble in words; otherwise: operations that round in another way than IEEE 754's."""
+    """The outcome of one stage on one scene: arrays that the digest is of, errors by the name of what was compared,
+    absolute and in ulp; trouble in words; otherwise: operations that round in another way than IEEE 754's."""
 
     arrays: Sequence[Array]
     errors: dict[str, tuple[float, float]]
@@ -67,7 +67,7 @@ def worst(parts: dict[str, tuple[Array, Array]]) -> dict[str, tuple[float, float
 
 
 def wrong_counts(**counts: int) -> str:
-    """In words, what is wrong; nothing where every count is 0."""
+    """The counts that are not 0, in words; nothing where every count is 0."""
     return ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in counts.items() if count)
 
 
@@ -117,10 +117,10 @@ class Bench:
         return shown
 
     def splats(self) -> reference_project.Projected:
-        """The splats that the device made, as the reference has them."""
+        """The splats that the device made, in the reference's form."""
         visible = self.visible
         raw = self.projected.splats.get()
-        raw[~visible] = 1.0  # memory that nobody has written
+        raw[~visible] = 1.0  # memory that was never written
         splats = raw.astype(np.float64)
         field = {name: splats[:, index] for index, name in enumerate(SPLAT)}
         means = np.stack([field["PIXEL_X"] + field["SUB_X"], field["PIXEL_Y"] + field["SUB_Y"]], axis=1)

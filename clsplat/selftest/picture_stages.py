@@ -33,14 +33,14 @@ ALL = Features.of(WIDTHS)
 SIDEWAYS = 1e-4
 """Cosine between a normal and the direction to the camera under which a rounding decides which side is seen."""
 DOUBT = 1e-5
-"""As `harness.MARGIN`, of the light that is left to one half, and of the two largest weights."""
+"""Margin like `harness.MARGIN`, of the light that is left to one half, and of the two largest weights."""
 
 FEW = 500
 """Gaussians whose picture around the camera the reference has in a second: it has each at every pixel."""
 
 
 def _after(camera: Camera) -> Camera:
-    """Where motion goes to: a step aside, up and back, with a longer lens."""
+    """The camera that motion goes to: a step aside, up and back, with a longer lens."""
     return replace(camera, translation=camera.translation + np.array([-0.0625, 0.03125, 0.125]), fx=camera.fx + 2.0)
 
 
@@ -127,7 +127,8 @@ def _rays(bench: Bench) -> Outcome:
 
 
 def _amid(camera: Camera, projection: Projection) -> Camera:
-    """In the middle of what the frozen scenes show: all around there is something, at the poles and on the seam."""
+    """A camera in the middle of what the frozen scenes show: all around there is something, at the poles and on the
+    seam."""
     middle = np.array([0.25, -0.125, 4.0])
     rotation = camera.rotation
     translation = -(rotation[:, 0] * middle[0] + rotation[:, 1] * middle[1] + rotation[:, 2] * middle[2])
@@ -181,7 +182,7 @@ def _of_rays(bench: Bench, projection: Projection) -> Outcome:
 
 
 def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array) -> dict[str, tuple[Array, Array]]:
-    """Columns of the Gaussians that are shown, and what they are in float64."""
+    """Columns of the Gaussians that are shown, and their values in float64."""
 
     def column(*names: str) -> Array:
         return splats[:, [RAY.index(name) for name in names]]

@@ -6,19 +6,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 FORWARD = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend")
-"""What a frame needs."""
+"""Stages that a frame needs."""
 CHANNELS = ("features", "channels")
-"""What a frame with more than colour and alpha needs beside that."""
+"""Stages that a frame with more than colour and alpha needs beside FORWARD."""
 DEEP = ("deep",)
 """A frame in slices by depth."""
 RAYS = ("rays",)
 """A frame of an equirectangular or a fisheye camera."""
 BACKWARD = ("loss", "blend_grad", "project_grad", "adam", "statistics")
-"""What training needs beside a frame."""
+"""Stages that training needs beside a frame's."""
 TRAINING = (*FORWARD, *BACKWARD)
 STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *BACKWARD)
 INDICES = ("project", "duplicate", "sort", "ranges")
-"""Those by whose counts and lists the next ones find their way."""
+"""Stages by whose counts and lists the next ones find their way."""
 
 BOUNDS: dict[str, tuple[float, str]] = {
     "arithmetic": (3.01, "what OpenCL 1.2 allows a square root, 3 ulp; a division may have 2.5"),
@@ -37,17 +37,18 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "adam": (32, "2 found; one root and one division"),
     "statistics": (32, "1 found; one root"),
 }
-"""Ulp that a stage may be off, and why: what is found where every operation is rounded as IEEE 754 has it, with room
-for a GPU whose divisions and roots are not. A wrong operation is off by thousands."""
+"""Ulp that a stage may be off, and why. Each bound is the error found where every operation is rounded as in IEEE 754,
+with room for a GPU whose divisions and roots are not. A wrong operation is off by thousands."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a stage came to, over all frozen scenes: the worst error as it is and in ulp; the bound in ulp; whether the
-    bits are those of the stored digest (None: none is stored for this shape); ms of all scenes; and in words what is
-    wrong beside the error, or empty.
+    """The result of a stage over all frozen scenes: the worst error, absolute and in ulp; the bound in ulp; same_bits:
+    True if the bits are those of the stored digest (None: none is stored for this shape); ms of all scenes; trouble: in
+    words what is wrong beside the error, or empty.
 
-    where: what the worst error in ulp is of; otherwise: operations that round in another way than IEEE 754's."""
+    where: the place of the worst error in ulp; otherwise: operations that round in another way than IEEE 754's.
+    """
 
     stage: str
     absolute: float
@@ -61,5 +62,5 @@ class Result:
 
     @property
     def passed(self) -> bool:
-        """Whether the stage can be trusted. Other bits alone do not condemn it."""
+        """True if the stage can be trusted. Other bits alone do not condemn it."""
         return not self.trouble and self.ulp <= self.bound

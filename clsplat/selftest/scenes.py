@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the self-test feeds the kernels with: numbers that are the same on every machine, to the last bit.
+"""Frozen scenes of the self-test: numbers that are the same on every machine, to the last bit.
 
 All come from one integer hash and are multiples of a power of two, so that neither NumPy's generators nor a
-mathematical library has a say in them. The digests in selftest.json are of these and no others.
+mathematical library has a say in them. The digests in digests.json are of these and no others.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def evenly(seed: int, shape: tuple[int, ...], low: float, high: float, steps: in
 
 
 def keys(seed: int, count: int, bits: int) -> NDArray[np.uint32]:
-    """(count,) keys of so many bits to sort, each some three times."""
+    """Keys (count,) of `bits` bits to sort, each some three times."""
     pool = (hashed(seed, count // 3 + 1) >> np.uint64(64 - bits)).astype(np.uint32)
     return pool[(hashed(seed + 1, count) % np.uint64(len(pool))).astype(np.int64)]
 
@@ -103,7 +103,7 @@ def wall(name: str = "wall", count: int = 64, width: int = 40, height: int = 36)
 
 
 def scenes(*, quick: bool) -> list[Frozen]:
-    """What the stages are run on."""
+    """The frozen scenes that the stages are run on."""
     few = [cloud("cloud", 240, 70, 45, 1), wall()]
     return few if quick else [*few, cloud("crowd", 1500, 120, 75, 41)]
 
@@ -118,7 +118,7 @@ def _gaussians(*arrays: NDArray[np.float64]) -> Gaussians:
 
 
 def _rotation() -> NDArray[np.float64]:
-    """By the quaternion (15, 2, -3, 1): every entry is one division of whole numbers."""
+    """The rotation of the quaternion (15, 2, -3, 1): every entry is one division of whole numbers."""
     w, x, y, z = 15.0, 2.0, -3.0, 1.0
     rows = [
         [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -212,7 +212,7 @@ def _loss(bench: Bench) -> Outcome:
     sides = (camera.width, camera.height)
     found, arrays, ms, trouble = bench.twice(
         lambda: loss(device, bench.work, image, photograph, *sides, 0.2),
-        lambda found: [found.gradient.get()[:, : camera.height]],  # nobody writes the rows below
+        lambda found: [found.gradient.get()[:, : camera.height]],  # the rows below are not written
     )
     x, y = (_pixels(bench, planes) for planes in (image.get(), bench.frozen.photograph))
     value, gradient = reference_loss.l1_dssim(x, y)
@@ -273,7 +273,7 @@ def _slot_sums(bench: Bench, slots: Array) -> Float64:
 
 
 def _moments(splats: reference_project.Projected, wanted: reference_blend.BlendGradients) -> Float64:
-    """(n, 6) moments as a slot has them, docs/gradients.md (49), from the gradients of eqs. (25) to (29)."""
+    """(n, 6) moments in the form of a slot, docs/gradients.md (49), from the gradients of eqs. (25) to (29)."""
     l11, l12, l22 = (WHITEN * splats.whitening).T
     gx, gy = -(WHITEN**2) * wanted.means2d.T
     u = gx / l11
@@ -285,7 +285,8 @@ def _moments(splats: reference_project.Projected, wanted: reference_blend.BlendG
 
 
 def _project_grad(bench: Bench) -> Outcome:
-    """From slots that are made up, so that an error of blending's gradient is not counted here."""
+    """The gradient of projection, from slots that are made up, so that an error of blending's gradient is not counted
+    here."""
     device, n = bench.device, bench.model.count
     coefficients = bench.model.coefficients
     values = evenly(33, (bench.counted.pairs, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)

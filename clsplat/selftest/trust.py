@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a driver computes what it is asked to: the self-test in a process of its own, which a driver may take down,
-and the memory of what has passed it.
+"""Trust in a driver: the self-test in a process of its own, which a driver may take down, and the memory of what has
+passed it.
 
-What is remembered counts for one device, driver, kernel shape and set of kernels; `clsplat selftest` asks
-nothing of it: it tests, and forgets a failure where the test passes.
+What is remembered counts for one device, driver, kernel shape and set of kernels; `clsplat selftest` asks nothing of
+it: it tests, and forgets a failure where the test passes.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from clsplat.selftest.result import FORWARD, STAGES, TRAINING, Result
 
 @dataclass
 class Report:
-    """What became of a device. build_seconds: None where the kernels were not built first; end: how the process ended
-    before its work was done, in words, or empty; crashed: whether that was the driver's doing; kernels: those that were
-    built and launched, as `device.rehearsal` has them; remembered: a failure in this shape that has not been seen to
+    """The test of a device. build_seconds: None where the kernels were not built first; end: the end of the process
+    before its work was done, in words, or empty; crashed: True if that was the driver's doing; kernels: those that were
+    built and launched, in the form of `device.rehearsal`; remembered: a failure in this shape that has not been seen to
     be gone, in words, or empty."""
 
     results: list[Result] = field(default_factory=list)
@@ -38,7 +38,7 @@ class Report:
 
     @property
     def failure(self) -> str:
-        """Why the driver cannot be trusted, or nothing."""
+        """The reason that the driver cannot be trusted, or nothing."""
         for result in self.results:
             if result.trouble:
                 return f"{result.stage}: {result.trouble}"
@@ -143,8 +143,8 @@ def _has_passed(device: Device, stages: Sequence[str]) -> bool:
 
 
 def _short_test(device: Device, stages: Sequence[str]) -> str:
-    """How the driver aborted or hung in the device's shape, or nothing; what passed is remembered. Raises DriverError
-    where the test itself could not be made, and DeviceError as `require`."""
+    """The driver's abort or hang in the device's shape, in words, or nothing; what passed is remembered. Raises
+    DriverError where the test itself could not be made, and DeviceError like `require`."""
     wanted = [name for name in STAGES if name in FORWARD or name in stages]
     report = examine(all_devices().index(device.cl_device), device.shape, wanted, quick=True)
     if report.crashed:
@@ -185,7 +185,7 @@ def examine_device(index: int) -> Report:
 
 
 def _still(index: int, entry: known.Entry, report: Report) -> str:
-    """Why a failure is not forgotten, or nothing."""
+    """The reason that a failure is not forgotten, or nothing."""
     name, build = entry.trial.get("name"), entry.trial.get("build")
     if not entry.trial or name in report.kernels:  # a stage of the test, or a kernel that it has launched
         return ""

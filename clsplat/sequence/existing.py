@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is there already: frames of an earlier job, folders, temporary files."""
+"""Files that are there already: frames of an earlier job, folders, temporary files."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def make_folders(tasks: Sequence[Task]) -> None:
 
 
 def remove_temporaries(tasks: Sequence[Task]) -> None:
-    """Remove what a killed job has left of these files, and nothing that somebody still writes."""
+    """Remove what a killed job has left of these files, and nothing that is still written."""
     for path in abandoned(task.path for task in tasks):
         with suppress(OSError):
             path.unlink()
 
 
 def is_complete(task: Task, options: RenderOptions) -> bool:
-    """Whether the frame's file is there: of its size, channels, model and settings, and readable to its end."""
+    """True if the frame's file is there: of its size, channels, model and settings, and readable to its end."""
     told = {name: value for name, value in options.attributes.items() if name in WHAT_IT_IS}
     told[SETTINGS] = settings_digest(task, options)
     camera, deep = picture_camera(task, options), options.deep is not None
@@ -68,14 +68,14 @@ def complete(tasks: Sequence[Task], options: RenderOptions) -> set[int]:
 
 
 def untold(tasks: Sequence[Task]) -> list[Path]:
-    """Those of the tasks' files that do not say with which settings they were made."""
+    """The tasks' files that do not say with which settings they were made."""
     with ThreadPoolExecutor(MOST_WRITERS) as pool:
         said = pool.map(lambda task: layers.attribute(task.path, SETTINGS), tasks)
         return [task.path for task, value in zip(tasks, said, strict=True) if value is None]
 
 
 def stamp(path: Path) -> tuple[int, ...] | None:
-    """What tells a file from one that takes its place; None for no file."""
+    """Mark that tells a file from one that takes its place; None for no file."""
     try:
         found = path.stat()
     except OSError:

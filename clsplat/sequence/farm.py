@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from clsplat.images.video import VideoWriter
 
 THREADS = 2
-"""Of a local worker: one frame is encoded while the next is rendered."""
+"""Threads of a local worker: one frame is encoded while the next is rendered."""
 HELD = 3
 """Frames that a worker holds at once, whatever threads it has."""
 PATIENCE = 20
@@ -39,7 +39,8 @@ PATIENCE = 20
 
 @dataclass(frozen=True)
 class Scene:
-    """What a worker has to load. model: an absolute path, with the SHA-256 of its content; version: of clsplat."""
+    """Everything that a worker has to load. model: an absolute path, with the SHA-256 of its content; version: of
+    clsplat."""
 
     model: str
     digest: str
@@ -84,8 +85,8 @@ _HELD = _Held()
 
 
 def render_frame(task: Task, scene: Scene) -> Result | Failure:
-    """What a worker does: the frame's file, unless a worker that was lost since has finished it; of a video the frame,
-    which goes to who encodes it."""
+    """Render a frame in a worker and write its file, unless a worker that was lost since has finished it; a frame of a
+    video is returned, for the process that encodes it."""
     try:
         if scene.version != clsplat.__version__:
             raise InputError(f"a worker has clsplat {clsplat.__version__}, expected {scene.version}")
@@ -128,12 +129,12 @@ def render_on_farm(
         results = _results(client, placed, scene, video)
         for record in encoded(placed, results, video):
             on_done(replace(record, path=names[record.frame]))
-    # Whoever was killed while it wrote has left a file, and nobody writes any more.
+    # A worker that was killed while it wrote has left a file; none writes any more.
     remove_temporaries(tasks)
 
 
 def _results(client: Any, tasks: Sequence[Task], scene: Scene, video: VideoWriter | None = None) -> Iterator[Result]:
-    """What `render_frame` gives as the frames are done; a window of tasks is with the scheduler, and not a million. Of
+    """Results of `render_frame` as the frames are done; a window of tasks is with the scheduler, and not a million. For
     a video the window begins with the frame that is to be encoded next, as those that come early wait here."""
     from distributed import CancelledError, KilledWorker, as_completed
 

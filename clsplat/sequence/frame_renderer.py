@@ -36,10 +36,9 @@ def as_it_is(layers: Layers) -> Layers:
 
 @dataclass(frozen=True)
 class Shaded:
-    """A frame before it is encoded. layers: None for one that was written strip by strip; seconds: that it took;
-    kernel_ms, transfer_ms: the device's, None if not asked for; blank: whether nothing of the model is in it,
-    None where that was not looked at; finish: what is left to do to the layers, for who
-    encodes them, in another thread."""
+    """A frame before it is encoded. layers: None for one that was written strip by strip; seconds: time that it took;
+    kernel_ms, transfer_ms: the device's, None if not asked for; blank: True if nothing of the model is in it, None
+    where that was not looked at; finish: the rest of the work on the layers, which the encoding thread does."""
 
     layers: Layers | None
     seconds: float

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 SETTINGS = "clsplat:settings"
 """The attribute of EXR and PNG files that holds it."""
 _ENCODED = {".exr": ("depth", "parts", "compression"), ".png": ("bits",)}
-"""Which of the encoding's settings a file of that extension depends on."""
+"""Settings of the encoding that a file of that extension depends on."""
 
 
 def plain(value: Any) -> Any:
-    """For JSON: of a dataclass what differs from its defaults, so that a setting that is added later changes nothing;
-    floats to 12 digits, as processors differ in the last ones."""
+    """A value in the form of JSON. A dataclass becomes its differences from the defaults, so that a setting that is
+    added later changes nothing. Floats have 12 digits, as processors differ in the last ones."""
     if is_dataclass(value) and not isinstance(value, type):
         found = {}
         for each in fields(value):

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Record:
-    """What became of a frame. seconds: of rendering and writing it, without waiting; skipped: it was there; blank:
-    nothing of the model is in it, None where nobody looked; kernel_ms, transfer_ms: the device's, where that was asked
-    for."""
+    """Record of a frame that is done. seconds: of rendering and writing it, without waiting; skipped: it was there;
+    blank: nothing of the model is in it, None where that was not looked at; kernel_ms, transfer_ms: the device's, where
+    that was asked for."""
 
     name: str
     frame: int
@@ -41,7 +41,7 @@ class Record:
     transfer_ms: float | None = None
 
     def document(self) -> dict[str, Any]:
-        """For JSON; without what was not measured."""
+        """The record for JSON, without what was not measured."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -71,15 +71,15 @@ class Task:
 
     @property
     def is_video(self) -> bool:
-        """Whether the file holds other frames too."""
+        """True if the file holds other frames too."""
         return self.path.suffix.lower() == VIDEO
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What every frame of a job has in common. channels: of `images.channels.LAYERS`; attributes: of the file's header;
-    pictures: what is made of a frame; recorded: the model's colour space; deep: slices of a deep picture, or None;
-    drawn: digest of the rasterizer's settings."""
+    """Options that all frames of a job share. channels: of `images.channels.LAYERS`; attributes: of the file's header;
+    pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a deep
+    picture, or None; drawn: digest of the rasterizer's settings."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -107,7 +107,7 @@ def camera_after(task: Task, options: RenderOptions) -> Camera | None:
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
-    """Of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer."""
+    """Digest of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer."""
     extension, pictures = task.path.suffix.lower(), options.pictures
     cameras = [picture_camera(task, options)]
     if "motion" in options.channels and (after := camera_after(task, options)) is not None:
@@ -122,7 +122,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
 
 
 def _content(source: str) -> str:
-    """What a file of OpenColorIO's says, as its SHA-256; of another configuration its name."""
+    """SHA-256 of a file of OpenColorIO's; the name of another configuration."""
     path = Path(source)
     return _digest_at(source, path.stat().st_mtime_ns) if source and is_file(path) else source
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sequence of frames as a job: which are rendered, to which files, and the loop. No OpenCL here.
+"""A sequence of frames as a job: the frames to render, their files, and the loop. No OpenCL here.
 
 Each device has a thread that renders; a few threads encode and write meanwhile. A frame is written to a temporary name
-and renamed, so a file that is there is complete, whenever the job was killed. Of a video they prepare the frames, and
-who waits for them encodes them in their order.
+and renamed, so a file that is there is complete, whenever the job was killed. The frames of a video are prepared by
+these threads and encoded in their order by the thread that waits for them.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ Planes = NDArray[np.uint8]
 HOST_BYTES = 1 << 30
 """Main memory for frames that wait to be written, as a guide: three are held in any case."""
 COPIES = 3
-"""Of a frame, while it is encoded: as it was rendered, put together, converted."""
+"""Copies of a frame, while it is encoded: as it was rendered, put together, converted."""
 
 
 def foreign(tasks: Sequence[Task]) -> list[Path]:
-    """Those of the tasks' files that are pictures of others than clsplat."""
+    """The tasks' files that are pictures of other programs than clsplat."""
     there = [task.path for task in tasks if is_file(task.path)]
     with ThreadPoolExecutor(MOST_WRITERS) as pool:
         return [path for path, others in zip(there, pool.map(layers.is_foreign, there), strict=True) if others]
@@ -102,11 +102,12 @@ def run_tasks(
     on_done: Callable[[Record], None],
     video: VideoWriter | None = None,
 ) -> None:
-    """Render the frames, each shader in a thread that takes the next frame nobody has, and write them meanwhile, or
+    """Render the frames, each shader in a thread that takes the next frame that is free, and write them meanwhile, or
     add them to the video.
 
-    on_done: called in this thread for each frame when its file is complete, not always in the frames' order; of a video
-    in order, when it has been encoded. The first error of any thread is raised here, after all of them have ended.
+    on_done: called in this thread for each frame when its file is complete, not always in the frames' order; for a
+    video in order, when the frame has been encoded. The first error of any thread is raised here, after all of them
+    have ended.
     """
     if not tasks:
         return
@@ -134,11 +135,11 @@ def run_tasks(
 
 
 Result = tuple[Record, Planes | None]
-"""Of a frame; with what a video takes of it, if it is one's."""
+"""Record of a frame; with the planes that a video takes of it, if it is one's."""
 
 
 class _Line:
-    """What the threads of a job share. room: for so many frames at once; stop: nothing more is to be done."""
+    """State that the threads of a job share. room: for `held` frames at once; stop: nothing more is to be done."""
 
     def __init__(self, tasks: Sequence[Task], options: RenderOptions, held: int, video: VideoWriter | None) -> None:
         self.room, self.stop = threading.Semaphore(held), threading.Event()
@@ -156,7 +157,7 @@ class _Line:
                 if task is None:
                     return
                 pool.submit(self._write, task, shader(task))
-        except BaseException as error:  # noqa: BLE001  # raised again by who waits for the frames
+        except BaseException as error:  # noqa: BLE001  # raised again in the thread that waits for the frames
             self._finished.put(error)
 
     def _write(self, task: Task, shaded: Shaded) -> None:
@@ -174,7 +175,7 @@ class _Line:
                 self.room.release()
 
     def results(self) -> Iterator[Result]:
-        """Of every frame when it is done. Raises what ended a thread."""
+        """Result of every frame when it is done. Raises what ended a thread."""
         for _ in self._tasks:
             item = self._finished.get()
             if isinstance(item, BaseException):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frames are rendered (`--frames`), and the file of each (`-o`)."""
+"""Choice of the frames that are rendered (`--frames`), and the file of each (`-o`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FIELD = re.compile(r"(#+)|%(0\d+)?d|\{(\w*)(?::(0\d+)d?)?\}", re.ASCII)
 
 KNOWN = "{name}, {frame}, #### or %04d"
 ODD = re.compile(r"%[-+ ]?\d*\.?\d*[diouxXeEfgGcsV]|[{}][^{}]*\}?")
-"""What is meant as a field, and is none."""
+"""Text that is meant as a field, and is none."""
 
 
 def parse_frames(text: str) -> list[int]:
@@ -61,7 +61,7 @@ def ranges(frames: Sequence[int]) -> str:
 class Pattern:
     """A pattern for the names of files.
 
-    `####` and `%04d` are the frame's number in at least so many digits, `{frame}` and `%d` in as few as it has,
+    `####` and `%04d` are the frame's number in at least four digits, `{frame}` and `%d` in as few as it has,
     `{frame:04}` in four again; `{name}` is its name without extension, with its folders.
     """
 
@@ -76,12 +76,12 @@ class Pattern:
 
     @property
     def has_frame(self) -> bool:
-        """Whether it tells frames apart by their numbers."""
+        """True if it tells frames apart by their numbers."""
         return any(match[3] != "name" for match in FIELD.finditer(self.text))
 
     @property
     def has_name(self) -> bool:
-        """Whether it tells frames apart by their names."""
+        """True if it tells frames apart by their names."""
         return any(match[3] == "name" for match in FIELD.finditer(self.text))
 
     def path(self, frame: int, name: str) -> Path:

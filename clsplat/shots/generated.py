@@ -19,9 +19,9 @@ from clsplat.shots.viewpoints import WIDEST_GAP, covered_arc, focus_point, look_
 def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A closed camera path around what the cameras look at, `frames` views with the first camera's intrinsics.
 
-    It keeps the cameras' median distance and height. Where they stand all around it goes round once; where they
-    leave a wide gap it swings to and fro over the arc that they cover, as nobody has seen the rest. It begins near
-    the first camera. Raises ValueError for no cameras or no frames.
+    It keeps the cameras' median distance and height. Where they stand all around it goes round once. Where they leave a
+    wide gap it swings to and fro over the arc that they cover, as no camera has seen the rest. It begins near the first
+    camera. Raises ValueError for no cameras or no frames.
     """
     if not cameras or frames < 1:
         raise ValueError(f"a turntable of {frames} frames from {len(cameras)} cameras: expected at least one of each")
@@ -104,13 +104,14 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _between(values: Float64, wave: Float64) -> Float64:
-    """From the 10th percentile of values (n,), where the wave is -1, to their 90th, where it is 1."""
+    """Values from the 10th percentile of `values` (n,), where the wave is -1, to their 90th, where it is 1."""
     low, high = np.percentile(values, [10, 90])
     return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * wave)
 
 
 def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """From the first camera to the last in their order, smoothed, at an even speed, with the first one's intrinsics.
+    """A path from the first camera to the last in their order, smoothed, at an even speed, with the first one's
+    intrinsics.
 
     Positions and rotations are those of a parabola fitted to a camera and three neighbours on each side (fewer towards
     the ends, which stay where they are), which keeps an arc where it is; a spline goes through these. Speed counts

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame sees of its shot beside its own camera: the next frame's, and those around the shutter's time."""
+"""Cameras of a shot around a frame's own: the next frame's, and those around the shutter's time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Stretch:
 
 
 def camera_after(shot: Shot, index: int) -> Camera:
-    """Where the shot is one frame number after its frame of this index.
+    """The shot's camera one frame number after its frame of this index.
 
     After the last it goes on as it did from the one before: the same rigid motion once more, so that a turntable turns
     on. A single frame stays where it is.

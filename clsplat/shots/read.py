@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what `clsplat render` is given to the frames it renders."""
+"""Choice of a shot: the frames that `clsplat render`'s arguments ask for."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def choose_shot(
     size: tuple[int | None, int | None] = (None, None),
     usd_camera: str | None = None,
 ) -> Shot:
-    """What --cameras, --path, --count and --frames mean together.
+    """The shot that --cameras, --path, --count and --frames ask for together.
 
     path: turntable, spiral or through: `count` frames of that path, made from the cameras; else the cameras themselves.
     frames: of these, the ones listed. Raises InputError.

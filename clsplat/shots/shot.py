@@ -13,8 +13,8 @@ from clsplat.shots.frame_numbers import parse_frames, ranges
 from clsplat.shots.keys import Key, interpolate
 
 MOST_FRAMES = 100_000
-"""Over an hour at 24 a second. More are a slip of the keyboard, and would be gigabytes of cameras from a file of few
-lines."""
+"""Most frames of a shot: over an hour at 24 a second. More are a slip of the keyboard, and would be
+gigabytes of cameras from a file of few lines."""
 
 
 @dataclass(frozen=True, eq=False)

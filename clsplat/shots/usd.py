@@ -24,7 +24,7 @@ ORTHOGRAPHIC_UNIT = 0.1
 """USD measures apertures in tenths of a world unit; only of an orthographic camera that is more than a ratio."""
 
 PINHOLES = ("", "perspective", "orthographic", "pinhole")
-"""What a camera's projection may be called."""
+"""Projections that a camera may name; others bend, and are refused."""
 
 
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:

@@ -11,7 +11,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 WIDEST_GAP = np.deg2rad(100.0)
-"""Where the cameras leave a wider gap around the middle than this, a turntable swings instead of going round."""
+"""Widest gap of the cameras around the middle, in radians, that a turntable still goes across; beyond it swings."""
 
 
 def look_at(position: Float64, target: Float64, up: Float64) -> tuple[Float64, Float64]:

@@ -16,11 +16,11 @@ from clsplat.gaussians import GROUPS, limit_of
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 REFUSED = ("parameters", "gradients", "moments", "steps")
-"""Why the steps of elements were refused: what adam.cl counts."""
+"""Reasons that adam.cl counts for refused steps of elements."""
 
 
 def updates_sh_rest(config: OptimiserConfig, step: int) -> bool:
-    """Whether step number `step` (from 1) updates the higher SH bands."""
+    """True if step number `step` (from 1) updates the higher SH bands."""
     return step % config.sh_rest_every == 0
 
 

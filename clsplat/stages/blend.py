@@ -63,7 +63,7 @@ def blend(
     (3,). Pixels of other tiles are left as they are.
 
     record: keep the cells that the gradient has to go through, where the kernels' shape has them; camera_array: for
-    pixels that are rays, whose gradient there is none of.
+    pixels that are rays, which have no gradient.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     planes = _planes(work, width, height, kept=band is not None and band.first > 0)

@@ -25,7 +25,7 @@ WIDTHS = {"depth": 1, "normal": 3, "position": 3, "motion": 2}
 
 @dataclass(frozen=True)
 class Features:
-    """Which features are blended, in the order of WIDTHS; depth always is, as it costs next to nothing."""
+    """The features that are blended, in the order of WIDTHS; depth always is, as it costs next to nothing."""
 
     names: tuple[str, ...] = ("depth",)
 
@@ -39,7 +39,7 @@ class Features:
 
     @property
     def offsets(self) -> dict[str, int]:
-        """Where each begins in a row."""
+        """Offset of each feature in a row."""
         found, at = {}, 0
         for name in self.names:
             found[name] = at
@@ -48,12 +48,12 @@ class Features:
 
     @property
     def floats(self) -> int:
-        """Of a row."""
+        """Floats of a row."""
         return sum(WIDTHS[name] for name in self.names)
 
     @property
     def defines(self) -> dict[str, object]:
-        """For both kernels."""
+        """Defines for both kernels."""
         return {"FEATURES": self.floats, **{f"FEATURE_{name.upper()}": at for name, at in self.offsets.items()}}
 
 
@@ -77,7 +77,7 @@ def features(
     after: DeviceArray,
     projected: Projected,
 ) -> DeviceArray:
-    """Of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to."""
+    """Features of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to."""
     rows = work.array("features", (gaussians.count, wanted.floats))
     for start, stop, (part,) in parts(work, gaussians):
         own = projected.rows(start, stop)

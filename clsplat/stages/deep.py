@@ -13,7 +13,7 @@ from clsplat.stages.duplicate import Band
 from clsplat.stages.ranges import TileLists
 
 DEEP_FLOATS = 6
-"""Of a pixel and bin: red, green, blue, associated with alpha; alpha; least and largest depth."""
+"""Floats of a pixel and bin: red, green, blue, associated with alpha; alpha; least and largest depth."""
 
 
 @stage("deep")

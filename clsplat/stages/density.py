@@ -20,19 +20,19 @@ from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostA
 from clsplat.stages.project import Projected, Screen
 
 NO_ROW = np.uint32(0xFFFFFFFF)
-"""In a list of rows: a row of zeros."""
+"""Entry of a list of rows that stands for a row of zeros."""
 
 
 @dataclass(frozen=True, eq=False)
 class EpochContributions:
-    """What each Gaussian added to the pictures of an epoch, in pixels: totals (n,), over its views; largest (n,), of
-    one of them. Infinite for Gaussians that were not there, or not looked at, from its first view on."""
+    """Contributions of each Gaussian to the pictures of an epoch, in pixels: totals (n,), over its views; largest (n,),
+    of one of them. Infinite, from its first view on, for Gaussians that were not there or not looked at."""
 
     totals: DeviceArray
     largest: DeviceArray
 
     def rows(self, start: int, stop: int) -> EpochContributions:
-        """Of the Gaussians from start to before stop."""
+        """The contributions of the Gaussians from start to before stop."""
         return EpochContributions(self.totals.rows(start, stop), self.largest.rows(start, stop))
 
 
@@ -53,7 +53,7 @@ class DensityStatistics:
     whole: EpochContributions | None = None
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
-        """Of the Gaussians from start to before stop."""
+        """The statistics of the Gaussians from start to before stop."""
         parts = {
             each.name: array.rows(start, stop)
             for each in fields(self)
@@ -73,8 +73,8 @@ class DensityStatistics:
         return found
 
     def moved(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_], *, densified: bool) -> dict[str, Float32]:
-        """What goes on, on the host by `named`, when row j becomes what row rows[j] was: contributions, of fresh rows
-        not known; and everything else if nothing was densified."""
+        """The arrays that are kept, on the host by `named`, when row j becomes what row rows[j] was: contributions,
+        infinite for fresh rows; and everything else if nothing was densified."""
         going_on = self.named()
         if densified:
             going_on = {name: array for name, array in going_on.items() if name.startswith(("current_", "whole_"))}
@@ -84,13 +84,13 @@ class DensityStatistics:
         return values
 
     def load(self, values: Mapping[str, Float32]) -> None:
-        """Take what there is of `named` from the host."""
+        """Take those of the arrays `named` that `values` has from the host."""
         for name, array in self.named().items():
             if name in values:
                 array.set(values[name])
 
     def forget_contributions(self) -> None:
-        """Nothing is known of what Gaussians contribute, until the next epoch is over."""
+        """Forget the Gaussians' contributions, until the next epoch is over."""
         for epoch in (self.current, self.whole):
             if epoch is not None:
                 epoch.totals.fill(np.inf)
@@ -108,7 +108,7 @@ class DensityStatistics:
 def new_statistics(
     device: Device, count: int, *, agreement: bool = False, contributions: bool = False
 ) -> DensityStatistics:
-    """For `count` Gaussians of which nothing is known yet: zeros, contributions infinite."""
+    """Statistics of `count` Gaussians of which nothing is known yet: zeros, contributions infinite."""
 
     def filled(value: float) -> DeviceArray:
         array = allocate(device, (count,), np.float32)

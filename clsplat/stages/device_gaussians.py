@@ -17,7 +17,7 @@ from clsplat.gaussians import GROUPS, Gaussians, group_shapes
 
 @dataclass(frozen=True, eq=False)
 class ShStorage:
-    """How a model that is only rendered keeps its SH.
+    """Form of the SH in a model that is only rendered.
 
     coefficients: of each channel; degrees (n,) uint8: the highest of each Gaussian that is looked at, None for all;
     half: the bands above 0 as float16.
@@ -29,7 +29,7 @@ class ShStorage:
 
     @property
     def floats(self) -> int:
-        """Of one Gaussian's parameters and what is kept beside them, in what floats take, rounded up."""
+        """Floats of one Gaussian's parameters and what is kept beside them, rounded up."""
         rest = 3 * (self.coefficients - 1)
         return 14 + (-(-rest // 2) if self.half else rest) + (self.degrees is not None)
 
@@ -75,7 +75,8 @@ class HostArray:
 
 @dataclass(frozen=True, eq=False)
 class HostGaussians:
-    """As DeviceGaussians, but on the host: for use they go to the device `rows` at a time (`parts`)."""
+    """Gaussians on the host, in the form of DeviceGaussians: for use they go to the device `rows` at a time
+    (`parts`)."""
 
     count: int
     coefficients: int

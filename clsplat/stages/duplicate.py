@@ -18,7 +18,7 @@ from clsplat.stages.scan import chunking, scan
 from clsplat.stages.sort import sort
 
 MAX_PAIRS = 2**31 - 1024
-"""In one band: what `stops` count is signed, and read a little ahead of."""
+"""Most pairs in one band: what `stops` count is signed, and read a little ahead of."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Band:
 
     @property
     def tiles(self) -> int:
-        """How many."""
+        """Number of tiles in the band."""
         return self.end - self.first
 
 
@@ -72,11 +72,11 @@ def count(
     all_bits: bool = False,
     found: DeviceArray | None = None,
 ) -> Counted:
-    """Which Gaussians are visible, how many pairs they make, and by which bits their depths differ, or with `all_bits`
-    32; waits for the device.
+    """Find the visible Gaussians, the number of their pairs, and the bits by which their depths differ, or with
+    `all_bits` 32; waits for the device.
 
-    shown (n,): not 0 where a Gaussian is visible; its tile_counts if not given, unless culling is switched off;
-    found (4 or more) uint32: the array that is read, if what is beyond its first four is to be read with them.
+    shown (n,): not 0 where a Gaussian is visible; its tile_counts if not given, unless culling is switched off; found
+    (4 or more) uint32: the array that is read, if what is beyond its first four is to be read with them.
     """
     (n,) = tile_counts.shape
     shown = shown or tile_counts
@@ -154,7 +154,7 @@ def count_band(
 def plan_bands(
     device: Device, work: Workspace, projected: Projected, tiles: tuple[int, int], capacity: int
 ) -> tuple[Band, ...]:
-    """As few bands as there can be of at most `capacity` pairs each. Raises CapacityError where one tile has more."""
+    """The fewest bands of at most `capacity` pairs each. Raises CapacityError where one tile has more."""
     n = projected.tile_counts.shape[0]
     counts = work.array("counts_by_tile", (tiles[0] * tiles[1],), np.uint32)
     counts.fill(0)
@@ -230,8 +230,8 @@ def duplicate(
 def duplicate_and_sort(
     device: Device, work: Workspace, splats: DeviceArray, counted: Counted, tiles: tuple[int, int], band: Band
 ) -> Pairs:
-    """What `duplicate` gives, by sorting all pairs by depth, as in the code of Kerbl et al.: with the sort by tile that
-    follows, the lower half of one by keys of 64 bits."""
+    """The pairs of `duplicate`, by sorting all pairs by depth, as in the code of Kerbl et al.: with the sort by tile
+    that follows, the lower half of one by keys of 64 bits."""
     visible, pairs = counted.visible, counted.pairs
     kernels = device.kernels("duplicate")
     tile_from_slot = work.array("tile_from_slot", (pairs,), np.uint32)

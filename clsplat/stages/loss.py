@@ -14,7 +14,7 @@ from clsplat.device.layout import PAD
 from clsplat.device.profile import stage
 
 _STRIPS = 64
-"""Of a row, on devices that are not CPUs."""
+"""Strips of a row, on devices that are not CPUs."""
 
 
 def strips(device: Device) -> int:

@@ -28,7 +28,7 @@ class Projected:
     shown: DeviceArray | None = None
 
     def rows(self, start: int, stop: int) -> Projected:
-        """Of the Gaussians from start to before stop."""
+        """The projected Gaussians from start to before stop."""
         shown = None if self.shown is None else self.shown.rows(start, stop)
         return Projected(self.splats.rows(start, stop), self.tile_counts.rows(start, stop), shown)
 
@@ -105,7 +105,7 @@ class Slots:
     first_slots: DeviceArray | None = None
 
     def rows(self, start: int, stop: int) -> Slots:
-        """For the Gaussians from start to before stop."""
+        """The slots of the Gaussians from start to before stop."""
         if self.first_slots is None:
             return Slots(self.values.rows(start, stop))
         return Slots(self.values, self.first_slots.rows(start, stop))
@@ -113,8 +113,8 @@ class Slots:
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """Of one view, in rows of the visible: gradients (n, 2) of the means on the image, in pixels; contributions (n,),
-    the sums of blending weights over the image's pixels, or None."""
+    """Results on the image of one view, in rows of the visible: gradients (n, 2) of the means on the image, in pixels;
+    contributions (n,), the sums of blending weights over the image's pixels, or None."""
 
     gradients: DeviceArray
     contributions: DeviceArray | None = None

@@ -12,15 +12,15 @@ from clsplat.device.launch import launch_groups
 from clsplat.stages.scan import chunking, scan
 
 BITONIC_MAX = 4096
-"""Keys and positions of so many fill the 32 KiB of local memory that every device has."""
+"""Number of keys that, with their positions, fill the 32 KiB of local memory that every device has."""
 
 BITONIC_WINS = {"cpu": 512, "gpu": BITONIC_MAX, "other": BITONIC_MAX}
 """Up to this many keys one launch of bitonic sort beats the radix sort's dozen."""
 
 
 WIDE_DIGIT, WIDE_FROM = 13, 1 << 17
-"""From so many keys on a digit may be so wide where a group is one item: its counters fill the 32 KiB of local memory,
-and fewer passes save more than the larger histograms cost."""
+"""Bits of a wide digit, and the number of keys from which it is used, where a group is one item. Its counters fill the
+32 KiB of local memory, and fewer passes save more than the larger histograms cost."""
 
 
 def _widest_digit(device: Device, n: int) -> int:
@@ -28,7 +28,7 @@ def _widest_digit(device: Device, n: int) -> int:
 
 
 def scratch_bytes(device: Device, n: int) -> int:
-    """At most so many bytes do sorts and scans of up to `n` elements need, beside the arrays under their names."""
+    """Upper bound of the bytes that sorts and scans of up to `n` elements need, beside the arrays under their names."""
     shape = device.shape
     groups = min(shape.chunks, -(-n // 1024)) if shape.items == 1 else -(-n // (16 * shape.items))
     return 4 * (1 << _widest_digit(device, n)) * max(groups, 1) + 8 * max(
@@ -112,8 +112,8 @@ def bitonic_sort(device: Device, work: Workspace, name: str, keys: DeviceArray) 
 def sort(
     device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int, base: int = 0
 ) -> tuple[DeviceArray, DeviceArray]:
-    """The quicker of the two for so many keys; `bits` is how many low bits of the keys less `base` can be set, `base`
-    no larger than any key."""
+    """Sort by the quicker of the two for this number of keys; `bits`: number of low bits of the keys less `base` that
+    can be set; `base`: no larger than any key."""
     if keys.shape[0] <= BITONIC_WINS[device.kind]:
         return bitonic_sort(device, work, name, keys)
     return radix_sort(device, work, name, keys, bits, base)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of Gaussians, steps and runs in which a number is not finite: policy only, no OpenCL.
+"""Health of a training: answers to numbers that are not finite in Gaussians, steps and runs. Policy only, no OpenCL.
 
 docs/decisions/0016-never-a-nan.md says why it is so.
 """
@@ -18,11 +18,11 @@ PATIENCE = 5
 """Troubled steps among the last WINDOW with which training goes back to a checkpoint."""
 WINDOW = 100
 RETURNS = 3
-"""How often it goes back in a run; the next time it stops."""
+"""Times that a run goes back; the next time it stops."""
 SMALLER = 0.5
-"""What each return leaves of the learning rates, for the rest of the run."""
+"""Factor on the learning rates at each return, for the rest of the run."""
 MOST_LOST = 0.5
-"""With more of its Gaussians broken a model is not mended: training goes back at once."""
+"""Share of broken Gaussians beyond which a model is not mended: training goes back at once."""
 KEPT = 1000
 """Gaussians of an incident of which a copy is kept."""
 
@@ -33,18 +33,18 @@ Model = Mapping[str, NDArray[np.float32]]
 @dataclass(frozen=True, eq=False)
 class Findings:
     """broken (n,): Gaussians with a parameter that is not finite or over its limit; refused (n,): those with a moment
-    that is not finite, which is also how `adam` marks whom it has refused a step."""
+    that is not finite, which is also `adam`'s mark for a Gaussian that it has refused a step."""
 
     broken: NDArray[np.bool_]
     refused: NDArray[np.bool_]
 
     @property
     def any(self) -> bool:
-        """Whether something is to be done."""
+        """True if something is to be done."""
         return bool(self.broken.any() or self.refused.any())
 
     def lost(self, stage: str) -> NDArray[np.bool_]:
-        """Those to remove. A loss that is not finite is no fault of the Gaussians that got no gradient from it."""
+        """Gaussians to remove. A loss that is not finite is no fault of the Gaussians that got no gradient from it."""
         return self.broken if stage == "loss" else self.broken | self.refused
 
 
@@ -94,7 +94,7 @@ class Incident:
 
 @dataclass
 class Patience:
-    """How much trouble there was of late, and what earlier trouble has left; a checkpoint has it."""
+    """Count of recent trouble, and what earlier trouble has left; a checkpoint has it."""
 
     troubled: list[int] = field(default_factory=list)
     rate_factor: float = 1.0
@@ -108,14 +108,14 @@ class Patience:
 
     @property
     def over(self) -> bool:
-        """Whether it is time to go back."""
+        """True if it is time to go back."""
         return self.lost or len(self.troubled) >= PATIENCE
 
     @property
     def spent(self) -> bool:
-        """Whether going back has been tried often enough."""
+        """True if going back has been tried often enough."""
         return self.returns >= RETURNS
 
     def after_return(self) -> Patience:
-        """What goes on with the model of a checkpoint."""
+        """The state that goes on with the model of a checkpoint."""
         return Patience(rate_factor=SMALLER * self.rate_factor, returns=self.returns + 1)

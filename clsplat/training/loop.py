@@ -50,7 +50,8 @@ REPORT_EVERY = 10
 
 
 Between = Callable[[Trainer, Callable[[], bool]], None]
-"""What is called before each step, with the trainer and whether Ctrl-C was pressed, after which it should return."""
+"""A function called before each step, with the trainer and a function that is True once Ctrl-C was pressed: then it
+should return."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ class _Session:
         self.trainer.watch.incidents.clear()
 
     def tell_the_rest(self) -> None:
-        """How much trouble was counted only."""
+        """Warn of the number of troubled steps that were only counted."""
         self.trainer.mend()
         self.tell_trouble()
         if self.untold:
@@ -269,7 +270,7 @@ class _Session:
                 warnings.warn(f"step {trainer.step}: {text}")
 
     def times_stages(self, step: int) -> bool:
-        """Whether it is measured what each stage of the step takes: only where that is written down."""
+        """True if each stage of the step is to be timed: only where the times are written down."""
         config = self.trainer.config
         if config.stages_every == 0:
             return False
@@ -327,7 +328,7 @@ def train(
     on_plan: Callable[[Plan], None] | None = None,
     between: Between | None = None,
 ) -> Gaussians:
-    """As `clsplat.train`, for arguments that are `checked` and a run that is locked, without its report."""
+    """Train like `clsplat.train`, for arguments that are `checked` and a run that is locked, and write no report."""
     limit = parse_bytes(max_device_mem)
     opened = device if isinstance(device, Device) else open_device(device, limit)
     if isinstance(device, Device) and limit is not None:
@@ -393,7 +394,7 @@ def _train(
     on_plan: Callable[[Plan], None] | None,
     between: Between | None,
 ) -> Gaussians:
-    """As `train`, alone in the run's folder."""
+    """Do the work of `train`, alone in the run's folder."""
     if not (resume and run is not None and run.checkpoints()):
         for text in doubts.of_scene(scene, config.background):
             warnings.warn(text)

@@ -19,8 +19,8 @@ from clsplat.training.health import Incident, Patience
 
 @dataclass(frozen=True, eq=False)
 class _Last:
-    """What is asked of a step that turns out to have had trouble: its number, view and background; the sums of its
-    loss, which are there until the next step has one."""
+    """The step to look at if it turns out to have had trouble: its number, view and background; the sums of its loss,
+    which are there until the next step has one."""
 
     step: int
     view: int
@@ -40,7 +40,7 @@ class Remedy:
 class Watch:
     """found: what a pass reads back, in the last four what `adam` counts (`Rasterizer.found`); names: of the views.
 
-    incidents: those not told yet; patience: how much trouble there was.
+    incidents: those not told yet; patience: the count of trouble.
     """
 
     def __init__(self, found: DeviceArray, names: Sequence[str]) -> None:
@@ -52,7 +52,7 @@ class Watch:
         self._noticed: tuple[_Last, str, int] | None = None
 
     def forget(self) -> None:
-        """Nothing has happened yet to the model that there is now."""
+        """Forget the last step and its trouble: the model is a new one."""
         self._last = self._noticed = None
         self.found.fill(0)
 
@@ -71,7 +71,7 @@ class Watch:
         self._noticed = (self._last, stage, sum(refused))
 
     def look(self) -> None:
-        """Read what there is to notice, rather than wait for the next pass."""
+        """Read the counts now, rather than wait for the next pass."""
         self.notice([int(value) for value in self.found.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:
@@ -80,7 +80,7 @@ class Watch:
             self._noticed = (self._last, "loss", 0)
 
     def examine(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> Remedy | None:
-        """What to do about what was noticed, if anything was."""
+        """The remedy for what was noticed, or None if nothing was."""
         if self._noticed is None:
             return None
         (last, stage, elements), self._noticed = self._noticed, None
@@ -89,7 +89,8 @@ class Watch:
         return self._judge(last, stage, elements, {k: {g: m[g].get() for g in GROUPS} for k, m in models.items()})
 
     def examine_all(self, arrays: Mapping[str, NDArray[np.float32]]) -> Remedy | None:
-        """As `examine`, of every number, whether `adam` has met it or not; arrays by "parameters/means" and so on."""
+        """The remedy, or None, after a look at every number, met by `adam` or not; arrays by "parameters/means" and so
+        on."""
         host = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in ("parameters", "first", "second")}
         if self._last is None or self.patience.lost or not health.examine(**host).any:
             return None

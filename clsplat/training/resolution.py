@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""At what size each training step works: low first, as there is nothing fine to fit yet. Policy only: no device."""
+"""Size of the pictures in each training step: low first, as nothing fine is fitted yet. Policy only: no device."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FACTORS = (8.0, 4 * 2**0.5, 4.0, 2 * 2**0.5, 2.0, 2**0.5)
-"""By what the sizes are divided while the resolution rises by the photographs' spectra."""
+"""Divisors of the sizes while the resolution rises by the photographs' spectra."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Sizes:
     until: tuple[tuple[int, float], ...]
 
     def factor(self, step: int) -> float:
-        """By what the width and the height of the photographs are divided at `step`, from 1."""
+        """Divisor of the photographs' width and height at `step`, from 1."""
         return next((factor for last, factor in self.until if step <= last), 1.0)
 
 
@@ -42,9 +42,9 @@ def by_spectra(images: Iterable[NDArray[np.float32]], steps: int) -> Sizes:
 
 
 def spectrum_shares(image: NDArray[np.float32]) -> NDArray[np.float64]:
-    """For each of FACTORS, the share of the amplitudes of the image's grey values, their mean left out, that lies under
-    the highest frequency that an image smaller by it has, along either axis; (len(FACTORS),), rising. 0 for a blank
-    image, which says nothing."""
+    """Shares of the amplitudes of the image's grey values, their mean left out, for each of FACTORS: those under the
+    highest frequency that an image smaller by it has, along either axis; (len(FACTORS),), rising. 0 for a blank image,
+    which says nothing."""
     grey = image[..., :3].astype(np.float64).mean(axis=2)
     height, width = grey.shape
     window = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1])  # else the image's edges are in it
@@ -59,14 +59,15 @@ def spectrum_shares(image: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def some_of(count: int, most: int = 16) -> list[int]:
-    """At most so many of `count` indices, evenly spread."""
+    """At most `most` of `count` indices, evenly spread."""
     return sorted({round(index) for index in np.linspace(0, count - 1, min(count, most))})
 
 
 def sizes_of(
     warmup: tuple[int, ...], frequency_steps: int, count: int, load: Callable[[int], NDArray[np.float32]]
 ) -> Sizes:
-    """By the spectra of some of `count` photographs, each read by `load`, where `frequency_steps` is not 0."""
+    """Sizes by the spectra of some of `count` photographs, each read by `load`; by doubling where `frequency_steps` is
+    0."""
     if frequency_steps == 0:
         return by_doubling(warmup)
     return by_spectra((load(index) for index in some_of(count)), frequency_steps)

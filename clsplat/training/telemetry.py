@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training notes in metrics.jsonl for its report: device and versions, time of each stage, contributions."""
+"""Notes of a training in metrics.jsonl for its report: device and versions, time of each stage, contributions."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ T = TypeVar("T")
 
 PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image")
 SECONDS = 1.0
-"""So long the training views are looked at for contributions, beside the first."""
+"""Seconds in which training views are looked at for contributions, beside the first."""
 EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
 """Powers of ten of pixels, between the bins of contributions."""
 
 
 def session(device: Device, step: int) -> dict[str, Any]:
-    """Who trains, from `step` on. No name of a user, host or folder: reports are sent to others."""
+    """Record of the machine that trains, from `step` on. No name of a user, host or folder: reports are sent to
+    others."""
     versions = {"clsplat": clsplat.__version__, "Python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -93,10 +94,10 @@ def contributions(trainer: Trainer, seconds: float = SECONDS) -> dict[str, Any] 
 
 
 def largest_contributions(trainer: Trainer, seconds: float = SECONDS) -> tuple[NDArray[np.float32], int]:
-    """What each Gaussian (n,) adds at most to one of the views: the sum of its blending weights there, in pixels of
-    the working size, which --density.min-contribution goes by; and of how many views.
+    """Largest contribution of each Gaussian (n,) to one of the views, and the number of views. A contribution is the
+    sum of blending weights, in pixels of the working size, which --density.min-contribution goes by.
 
-    Of as many training views, spread evenly, as `seconds` allow. Changes nothing that training goes by. Raises
+    It looks at as many training views, spread evenly, as `seconds` allow. Changes nothing that training goes by. Raises
     CapacityError.
     """
     device, rasterizer, views = trainer.device, trainer.rasterizer, trainer.views

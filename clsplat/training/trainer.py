@@ -116,7 +116,8 @@ class Trainer:
         return from_scene(self.scene, self.config.random_points, self.rng)
 
     def _make_plan(self, count: int) -> None:
-        """How so many Gaussians go through the device's memory, with all of their SH coefficients in the end."""
+        """Plan the way of `count` Gaussians through the device's memory, with all of their SH coefficients in the
+        end."""
         settings = self.config.density
         coefficients = (self.config.sh_degree + 1) ** 2
         cameras = [view.camera for view in self.scene.views]
@@ -225,8 +226,8 @@ class Trainer:
         return result
 
     def _note(self, *, begun: bool = False) -> None:
-        """From here on until something of the state is changed, `step_back` leads here. begun: the step's number has
-        risen."""
+        """Mark the state as it is now: until something of it is changed, `step_back` leads here. begun: the step's
+        number has risen."""
         self._mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
 
     def step_back(self) -> bool:
@@ -261,7 +262,7 @@ class Trainer:
     def _add_statistics(
         self, statistics: DensityStatistics, view: int, camera: Camera, projected: Projected, screen: Screen
     ) -> None:
-        """What density control will ask of this step, as long as it will."""
+        """Add the step to the statistics that density control goes by, as long as it needs them."""
         settings = self.config.density
         if self.step < settings.stop:
             add_statistics(self.device, statistics, camera, projected, screen, settings.gradient_threshold)
@@ -288,8 +289,8 @@ class Trainer:
             self._rearrange(adaptive.Plan(remedy.rows, none, none), densified=False)
 
     def rates(self) -> dict[str, float]:
-        """Learning rate of each group at this step; the means' falls exponentially, all of them in the cooldown, and
-        with each return to a checkpoint."""
+        """Learning rate of each group at this step. The means' falls exponentially; all fall in the cooldown, and with
+        each return to a checkpoint."""
         optimiser = self.config.optimiser
         into = optimiser.cooldown - max(self.config.iterations - self.step, 0)
         cooled = optimiser.cooldown_to ** (into / optimiser.cooldown) if into > 0 else 1.0
@@ -381,7 +382,7 @@ class Trainer:
         self._rearrange(plan, densified=True)
 
     def _rearrange(self, plan: adaptive.Plan, *, densified: bool) -> None:
-        """Move the rows of everything as the plan has them."""
+        """Move the rows of everything to their places in the plan."""
         config, device = self.config.density, self.device
         if len(plan.rows) == 0:
             raise ClsplatError(
@@ -440,7 +441,7 @@ class Trainer:
         return arrays
 
     def restart(self) -> None:
-        """Begin again, as slowly as `watch.patience` has it."""
+        """Begin again, at the rates that `watch.patience` allows."""
         del self.parameters, self.first, self.second, self.gradients, self.statistics
         self.watch.forget()
         self._start()

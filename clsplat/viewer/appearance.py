@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a model is looked at: what of it is left out or changed, which channel, in which colours. No OpenCL, no viser."""
+"""Appearance of a model on a page: parts left out or changed, the channel, its colours. No OpenCL, no viser."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Box = tuple[float, float, float, float, float, float]
 """The least x, y, z in the world, and the largest."""
 
 LARGEST_OPACITY = 0.999
-"""What a raised opacity goes up to: the logit of 1 is not finite."""
+"""Upper limit of a raised opacity: the logit of 1 is not finite."""
 SIZES = (0.05, 2.0)
 OPACITIES = (0.0, 3.0)
 SCALE = np.array(
@@ -44,13 +44,13 @@ class Look:
     crop: Box | None = None
 
     def changes(self, degree: int) -> Look | None:
-        """What it changes of a model of this SH degree, whatever the mode; None for nothing."""
+        """The part of the look that changes a model of this SH degree, whatever the mode; None for nothing."""
         asked = replace(self, mode="colour", degree=min(self.degree, degree))
         return None if asked == Look(degree=degree) else asked
 
 
 def read_look(mode: Any, degree: Any, size: Any, opacity: Any, crop: Any = None) -> Look:
-    """What a page's controls say; numbers that no slider has are brought into its range."""
+    """The look that a page's controls ask for; numbers that no slider has are brought into its range."""
     box = None
     if crop is not None:
         corners = np.asarray(crop, np.float64).reshape(2, 3)

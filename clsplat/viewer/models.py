@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is looked at: a model that does not change, or one in training. Pictures of them, by
+"""Models that are shown: one that does not change, or one in training. Their pictures are made by
 `clsplat.rendering.rasterizer`.
 
 Only the thread that made them may ask for pictures: a device has one queue.
@@ -39,12 +39,12 @@ class Model(Protocol):
     @property
     def pixels(self) -> int: ...
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        """(H, W, 3) uint8, and what there is to be said of it. Raises CapacityError and InputError."""
+        """The picture (H, W, 3) uint8, and a remark on it. Raises CapacityError and InputError."""
         ...
 
 
 def draft(config: RasterizerConfig) -> RasterizerConfig:
-    """For pictures in motion: what is approximate where that is quick, of the same SH."""
+    """Settings for pictures in motion: approximate where that is quick, of the same SH."""
     fast = PRESETS["fast"]
     return replace(
         config,
@@ -54,7 +54,7 @@ def draft(config: RasterizerConfig) -> RasterizerConfig:
 
 
 class HeldModel:
-    """Of a file. The device holds it as it is, and as it was last looked at otherwise."""
+    """A model from a file. The device holds it as it is, and with the changes of the last look."""
 
     version = 0
 
@@ -67,11 +67,11 @@ class HeldModel:
 
     @property
     def pixels(self) -> int:
-        """As `Model` has it."""
+        """See `Model`."""
         return min(MOST_PIXELS, frame_pixels(self.device, FEATURES))
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        """As `Model` has it."""
+        """See `Model`."""
         key = look.changes(self.gaussians.sh_degree)
         try:
             return self._picture(key, camera, look, exact=exact)
@@ -94,7 +94,8 @@ class HeldModel:
 
 
 class LiveModel:
-    """In training, between two of its steps. It works in the trainer's memory, and leaves alone what a step needs."""
+    """A model in training, between two of its steps. It works in the trainer's memory, and leaves alone what a step
+    needs."""
 
     def __init__(self, trainer: Trainer, background: Sequence[float]) -> None:
         self.trainer, self.background = trainer, background
@@ -104,16 +105,16 @@ class LiveModel:
 
     @property
     def version(self) -> int:
-        """As `Model` has it: the step."""
+        """See `Model`; here the step."""
         return self.trainer.step
 
     @property
     def pixels(self) -> int:
-        """As `Model` has it: what training has memory for."""
+        """See `Model`; here what training has memory for."""
         return max(view.camera.width * view.camera.height for view in self.trainer.views)
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
-        """As `Model` has it. Raises InputError for what needs more memory than a limited training leaves."""
+        """See `Model`. Raises InputError for what needs more memory than a limited training leaves."""
         trainer = self.trainer
         degree = round(trainer.parameters.coefficients**0.5) - 1
         key = look.changes(degree)
@@ -133,7 +134,7 @@ class LiveModel:
 def render_picture(
     renderer: Renderer, model: Gaussians | AnyGaussians, camera: Camera, look: Look, background: Sequence[float]
 ) -> tuple[Image, str]:
-    """What `Model.picture` gives, of a model or what of it is on the device."""
+    """The result of `Model.picture`, for a model or the part of it that is on the device."""
     if isinstance(model, Gaussians) and not len(model):
         raise InputError("nothing of the model is left: the crop box holds no Gaussian")
     if look.mode in ("depth", "count"):

@@ -30,14 +30,14 @@ THUMBNAIL = 240
 FRUSTUM = 0.05
 """Size of a camera in relation to its distance from what is looked at."""
 CAMERAS = ("hidden", "frames", "photos")
-"""What is drawn of the scene's cameras."""
+"""Ways to draw the scene's cameras."""
 CAMERA_COLOURS = {"train": (80, 160, 255), "test": (255, 160, 60), "key": (255, 60, 90)}
 SIZE = (1280, 720)
-"""Of a path's pictures and of screenshots, unless another is asked for."""
+"""Width and height of a path's pictures and of screenshots, unless another is asked for."""
 
 
 class ViserPage:
-    """What one who watches sees, and their controls. The methods that render are called by the device's thread."""
+    """One viewer's page, with its controls. The methods that render are called by the device's thread."""
 
     def __init__(self, client: Any, viewing: Viewing, world: World, paths: Path | None) -> None:
         self.client, self.viewing, self.world, self.paths = client, viewing, world, paths
@@ -48,7 +48,7 @@ class ViserPage:
         self._drawing, self._drawn = 0, threading.Lock()
 
     def show(self, image: Image, level: Level, text: str) -> None:
-        """As `scheduler.Page` has it."""
+        """See `scheduler.Page`."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
         if self._shown == 2:  # controls keep a browser busy: they may not come before the first picture
@@ -58,7 +58,7 @@ class ViserPage:
             self._say(", ".join(filter(None, (f"{width} x {height}, exact", text))))
 
     def tell(self, message: str) -> None:
-        """As `scheduler.Page` has it."""
+        """See `scheduler.Page`."""
         self._build()
         self.client.add_notification("clsplat", plain(message), auto_close_seconds=10.0)
         self._say(plain(message))
@@ -136,7 +136,7 @@ class ViserPage:
         shown.on_update(changed)
 
     def _clear(self, name: str) -> None:
-        """Remove what is under this name of the scene."""
+        """Remove the part of the scene under this name."""
         with self.client.atomic():
             self.client.scene.remove_by_name(name)
             self.client.scene.add_frame(name, show_axes=False)

@@ -19,7 +19,7 @@ FPS = 24.0
 
 
 class Recorder:
-    """The key frames of one who watches, in their order."""
+    """The key frames of one viewer, in their order."""
 
     def __init__(self) -> None:
         self.keys: list[Pose] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a page looks from, and where it starts."""
+"""Pose of a page's camera, and the pose that it starts with."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clsplat.rotations import quaternion_of, rotation_from_quaternion
 from clsplat.shots.viewpoints import focus_point, look_at, up_axis
 
 MOST_PIXELS = 4096 * 2304
-"""Of a picture on a page, whatever the browser says of its size."""
+"""Most pixels of a picture on a page, whatever size the browser asks for."""
 LARGEST_SIDE = 16384
 FIELD = math.radians(60)
 """Vertical angle of view where no camera of a scene says another."""
@@ -25,8 +25,8 @@ FIELD = math.radians(60)
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where the browser looks from. rotation (3, 3): world from camera (x right, y down, z forward); position (3,) in
-    the world; fov: vertical, radians; width, height of the page in pixels."""
+    """Pose of a browser's camera. rotation (3, 3): world from camera (x right, y down, z forward); position (3,) in the
+    world; fov: vertical, radians; width, height of the page in pixels."""
 
     rotation: Float64
     position: Float64
@@ -35,8 +35,8 @@ class Pose:
     height: int
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
-        """Of the page's size or another; where that has another shape, the vertical angle is kept. To the last bit as a
-        file of cameras has it (`Recorder.document`), which holds a quaternion and degrees."""
+        """The camera, of the page's size or another; where that has another shape, the vertical angle is kept. It is to
+        the last bit the one that a file of cameras holds (`Recorder.document`), as a quaternion and degrees."""
         across, down = width or self.width, height or self.height
         focal = focal_length(math.radians(math.degrees(self.fov)), down)
         quaternion = quaternion_of(self.rotation)
@@ -44,7 +44,7 @@ class Pose:
         return Camera(across, down, focal, focal, across / 2, down / 2, turn, -turn @ self.position)
 
     def same(self, other: Pose | None) -> bool:
-        """Whether the other shows the same."""
+        """True if the other shows the same."""
         return (
             other is not None
             and (self.fov, self.width, self.height) == (other.fov, other.width, other.height)
@@ -60,8 +60,8 @@ def read_pose(
     size: tuple[int, int],
     origin: Float64,
 ) -> Pose | None:
-    """What a browser says of its camera: the rotation from its axes (COLMAP's) to the world's as a quaternion w x y z,
-    the position counted from `origin` (3,), the vertical angle in radians, width and height. None for what no camera
+    """The pose that a browser sends: the rotation from its axes (COLMAP's) to the world's as a quaternion w x y z, the
+    position counted from `origin` (3,), the vertical angle in radians, width and height. None for values that no camera
     has: a browser may send anything."""
     try:
         turn, place = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
@@ -80,7 +80,7 @@ def read_pose(
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """How a page begins: a camera in the world, what it turns about, and what is up for that alone."""
+    """Start of a page: a camera in the world, the point that it turns about, and the direction that is up there."""
 
     position: Float64
     target: Float64
@@ -89,8 +89,8 @@ class Start:
 
 
 def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
-    """Where the first of the cameras stands, about the point that all of them look at. Without cameras: before the
-    points (N, 3) as a COLMAP scene would be seen: y down, looking along z. All of it in the world."""
+    """The start at the first of the cameras, about the point that all of them look at. Without cameras: before the
+    points (N, 3) as a COLMAP scene would be seen, y down, looking along z. All vectors are in the world."""
     if cameras:
         first, focus, up = cameras[0], focus_point(cameras), up_axis(cameras)
         ahead = first.rotation[2]

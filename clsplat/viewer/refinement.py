@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each who watches gets to see next: cameras, coarse pictures in motion, exact ones at rest, shares of a training.
+"""Refinement of a viewer's pictures: coarse ones in motion, exact ones at rest, shares of a training.
 
 No OpenCL and no viser. Times are seconds of any clock that does not go back.
 """
@@ -14,17 +14,17 @@ SETTLE = (0.2, 1.0)
 START = 0.5
 """The same for the first picture of all, which the browser has to get ready to show."""
 JUMPS = 3.0
-"""A camera that has not changed for so many times as long as it usually takes is at rest."""
+"""A camera is at rest when it has not changed for this many times its usual interval."""
 TARGET = 0.04
 """Seconds that a picture in motion may take, with its encoding: what the browser needs comes on top."""
 PATIENCE = 0.6
 """An exact picture that takes longer is led up to by pictures of growing size."""
 SMALLEST = 1 / 8
-"""Of the page's size: a coarser picture would not be told apart from another."""
+"""Smallest scale of the page's size: a coarser picture would not be told apart from another."""
 QUALITIES = (60, 95)
-"""Of JPEG, in motion and at rest."""
+"""Qualities of JPEG, in motion and at rest."""
 SHARES = (0.2, 0.05)
-"""Of the time of a training: for one who moves, and for those who just watch."""
+"""Shares of the time of a training: while a viewer moves, and while all are at rest."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Level:
 
     @property
     def quality(self) -> int:
-        """Of JPEG."""
+        """Quality of JPEG."""
         return QUALITIES[self.exact]
 
 
@@ -61,12 +61,12 @@ class Pace:
 
     @property
     def patient(self) -> bool:
-        """Whether an exact picture may be begun at once, by the latest one."""
+        """True if an exact picture may be begun at once, by the time of the latest one."""
         return self._exact <= PATIENCE
 
 
 class Refinement:
-    """What one who watches sees, and what comes next: coarse in motion, finer at rest, exact in the end."""
+    """The picture that a viewer sees, and the next one: coarse in motion, finer at rest, exact in the end."""
 
     def __init__(self, now: float, pace: Pace | None = None) -> None:
         self.pace = pace or Pace()
@@ -79,7 +79,7 @@ class Refinement:
 
     @property
     def moving(self) -> bool:
-        """Whether what is seen is not what is asked for."""
+        """True if the picture shown is not the one asked for."""
         return self._shown != self._changed
 
     def changed(self, now: float) -> None:
@@ -130,7 +130,7 @@ class Share:
         self._end, self._seconds = -math.inf, 0.0
 
     def ready(self, now: float, *, moving: bool) -> bool:
-        """Whether another picture may be made."""
+        """True if another picture may be made."""
         share = self._moving if moving else self._still
         return now - self._end >= self._seconds * (1 - share) / share
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One thread's work for all who watch: whose picture is next, and what else they ask for. No OpenCL, no viser.
+"""Scheduler of one thread's work for all viewers: whose picture is next, and their other requests. No OpenCL, no viser.
 
-Any thread may say what somebody wants; `work` alone renders, in the thread that owns the device.
+Any thread may say what a viewer wants; `work` alone renders, in the thread that owns the device.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 
 
 class Page(Protocol):
-    """What one sees."""
+    """The page of a viewer."""
 
     def show(self, image: Image, level: Level, text: str) -> None:
-        """A picture (H, W, 3), and what there is to be said of it."""
+        """Show a picture (H, W, 3), with a remark on it."""
         ...
 
     def tell(self, message: str) -> None:
-        """Why there is no picture."""
+        """Show the reason that there is no picture."""
         ...
 
 
 @dataclass(eq=False)
 class Watcher:
-    """One who watches."""
+    """One viewer: page, refinement, look and pose."""
 
     page: Page
     refinement: Refinement
@@ -46,7 +46,7 @@ class Watcher:
 
 
 class Viewing:
-    """Those who watch a model. model: None until there is one."""
+    """All viewers of a model. model: None until there is one."""
 
     def __init__(self, model: Model | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
         self.model, self.clock = model, clock
@@ -59,27 +59,27 @@ class Viewing:
         return len(self._watchers)
 
     def join(self, key: int, page: Page) -> None:
-        """Somebody has opened a page."""
+        """Take in a viewer that has opened a page."""
         with self._news:
             self._watchers[key] = Watcher(page, Refinement(self.clock()))
 
     def leave(self, key: int) -> None:
-        """And closed it."""
+        """Drop a viewer whose page is closed."""
         with self._news:
             self._watchers.pop(key, None)
 
     def pose(self, key: int) -> Pose | None:
-        """Where they look from."""
+        """The viewer's pose, None if there is none."""
         watcher = self._watchers.get(key)
         return watcher.pose if watcher else None
 
     def look(self, key: int) -> Look:
-        """How they look at the model."""
+        """The viewer's look at the model."""
         watcher = self._watchers.get(key)
         return watcher.look if watcher else Look()
 
     def moved(self, key: int, pose: Pose) -> None:
-        """They look from somewhere else, or say once more that they do not."""
+        """Take the viewer's pose, a new one or once more the same."""
         with self._news:
             watcher = self._watchers.get(key)
             if watcher is not None and not pose.same(watcher.pose):
@@ -90,7 +90,7 @@ class Viewing:
                     self._changed(watcher)
 
     def looks(self, key: int, look: Look) -> None:
-        """They look at it in another way."""
+        """Take the viewer's look at the model."""
         with self._news:
             watcher = self._watchers.get(key)
             if watcher is not None and look != watcher.look:
@@ -109,7 +109,7 @@ class Viewing:
             self._wake()
 
     def wait(self, most: float) -> None:
-        """Until there may be something to do, or for so many seconds."""
+        """Wait until there may be something to do, for at most `most` seconds."""
         with self._news:
             if self._told:
                 self._told = False
@@ -140,7 +140,8 @@ class Viewing:
         return bool(job or turn)
 
     def _turn(self, version: int, share: Share | None) -> tuple[int, Watcher, Level] | None:
-        """Who has waited longest among those for whom something is due."""
+        """The viewer that has waited longest of those for which a picture is due, with its key and the picture's
+        level."""
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):
             return None
@@ -152,7 +153,7 @@ class Viewing:
 
     def _show(self, key: int, watcher: Watcher, level: Level, begun: int, model: Model, share: Share | None) -> None:
         start, version, pose, look = self.clock(), model.version, watcher.pose, watcher.look
-        assert pose is not None, "only who has a pose has a turn"
+        assert pose is not None, "only a viewer with a pose has a turn"
         camera = pose.camera().resized(*fitted(pose.width, pose.height, level.scale, model.pixels))
         try:
             image, text = model.picture(camera, look, exact=level.exact)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's server, by viser (the extra `view`): who comes and goes, and what all of them see.
+"""The viewer's server, by viser (the extra `view`): viewers that come and go, and what all of them see.
 
-What is served are viser's own page and the messages of its web socket; no path of this machine is.
+It serves viser's own page and the messages of its web socket; no path of this machine.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import View
 
 LOCAL = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
-"""What a server for this machine alone may be asked for as."""
+"""Names, as a pattern, by which a server for this machine alone may be asked."""
 FAR = 1000.0
 """viser's own far plane, of what it draws itself: cameras and boxes."""
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What the pages begin with. origin (3,): subtracted from the world for the browser, whose numbers are float32;
-    box: corners (3,) of what the crop's sliders reach; degree: of the model's SH."""
+    """Facts that the pages begin with. origin (3,): subtracted from the world for the browser, whose numbers are
+    float32; box: corners (3,) of what the crop's sliders reach; degree: of the model's SH."""
 
     title: str
     start: Start
@@ -55,7 +55,7 @@ class World:
 
 @dataclass(frozen=True)
 class Address:
-    """Where the server listens, and the folder for paths that are saved, None for none."""
+    """Address that the server listens at, and the folder for paths that are saved, None for none."""
 
     host: str = HOST
     port: int = PORT
@@ -86,7 +86,7 @@ class Address:
 
     @property
     def local(self) -> bool:
-        """Whether only this machine can reach it."""
+        """True if only this machine can reach it."""
         if self.host == "localhost":
             return True
         try:
@@ -114,7 +114,7 @@ class Server:
         import viser
 
         self.viewing, self.world, self.address = viewing, world, address
-        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # who has left is no news
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # viewers that left
         with _quiet(), _guarded(address):
             self._server: Any = viser.ViserServer(host=address.host, port=address.port, label="clsplat", verbose=False)
         server = self._server
@@ -154,13 +154,13 @@ class Server:
 
     @property
     def url(self) -> str:
-        """For this machine's browser, or the host's name where it listens elsewhere."""
+        """Address for this machine's browser, or with the host's name where it listens elsewhere."""
         host = self.address.host
         name = "localhost" if self.address.local else f"[{host}]" if ":" in host else host
         return f"http://{name}:{self._server.get_port()}"
 
     def tell(self, text: str) -> None:
-        """What there is to be said of a training."""
+        """Show the state of a training on the pages."""
         if self._status is not None and self._status.content != text:
             self._status.content = text
 
@@ -225,7 +225,7 @@ def _guarded(address: Address) -> Iterator[None]:
 
 
 def _tell(_: Any, context: dict[str, Any]) -> None:
-    """A line in place of a traceback; as asyncio has it for what goes wrong in its tasks."""
+    """Print a line in place of a traceback; it takes what asyncio gives its handler for errors in tasks."""
     error = context.get("exception")
     words = f"{type(error).__name__}: {error}" if error is not None else str(context.get("message", ""))
     told = plain(" ".join(words.split()))[:200].rstrip(": ")
@@ -233,11 +233,12 @@ def _tell(_: Any, context: dict[str, Any]) -> None:
 
 
 def refused(headers: Any, *, local: bool) -> str:
-    """Why a request is not answered, '' if it is: it comes from a page that is not this server's, or, of a server for
-    this machine alone, asks for another name, as when a foreign name has been led here.
+    """The reason that a request is not answered, '' if it is.
 
-    Ports count, but not which: a tunnel (ssh -L) may have led another one here. A request without an origin is from no
-    page."""
+    Requests from a page that is not this server's are refused; so are, by a server for this machine alone, those for
+    another name, as when a foreign name has been led here. Ports count, but not which: a tunnel (ssh -L) may have led
+    another one here. A request without an origin is from no page.
+    """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or len(origins) > 1:
         return "expected one Host, and at most one Origin"

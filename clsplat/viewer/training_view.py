@@ -23,7 +23,8 @@ TELL_EVERY = 0.5
 
 
 class TrainingView:
-    """What `clsplat.api.train` calls between two steps: pictures for those who look, within their share."""
+    """The viewer's part of `clsplat.api.train`, called between two steps: pictures for all viewers, within their
+    share."""
 
     def __init__(self, viewing: Viewing, server: Server, background: tuple[float, float, float], last: int) -> None:
         self.viewing, self.server, self.background, self.last = viewing, server, background, last
@@ -31,7 +32,7 @@ class TrainingView:
         self._told = -math.inf
 
     def __call__(self, trainer: Trainer, interrupted: Callable[[], bool]) -> None:
-        """Returns at once where nobody looks."""
+        """Show pictures; returns at once where there are no viewers."""
         viewing = self.viewing
         if viewing.model is None:
             viewing.model = LiveModel(trainer, self.background)

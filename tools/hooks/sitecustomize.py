@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a pretended machine needs inside its interpreters: this folder on PYTHONPATH, as `tools/machines.py` puts it.
+"""Hooks for the interpreters of a pretended machine: this folder is put on PYTHONPATH by `tools/machines.py`.
 
 Python runs this file when it starts, and so in every process that a process of such a machine starts.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What formats have in place of our axes, there and back, and transforms of nodes."""
+"""Axes of the formats, to ours and back, and transforms of nodes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in a glTF file: its JSON, the nodes of its scene, and the arrays of its buffers, as they lie in the file.
+"""Contents of a glTF file: its JSON, the nodes of its scene, and the arrays of its buffers, as they lie in the file.
 
 Everything that the file says is checked before it is used; a buffer is the .glb's own, a file in the same folder or
 below it, or a data: URI.
@@ -34,7 +34,7 @@ from clsplat.models.formats import spz
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
 SPZ_EXTENSIONS = (SPZ_EXTENSION, "KHR_gaussian_splatting_compression_spz")
-"""The second is what the draft's own example calls it."""
+"""Names of the extension; the second is in the draft's own example."""
 UNDERSTOOD = {EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization", "KHR_materials_unlit"}
 COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")
 
@@ -42,7 +42,8 @@ JSON_CHUNK, BIN_CHUNK = 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MAX_NODES, MAX_PRIMITIVES = 100_000, 4096
-"""Of a scene; the second of those that have Gaussians: more are a bomb, which may be one mesh in many nodes."""
+"""Limits of a scene; the second counts the primitives that have Gaussians: more are a bomb, which may be one mesh in
+many nodes."""
 
 Array = NDArray[Any]
 
@@ -54,7 +55,7 @@ class Asset:
     path: Path
     document: dict[str, Any]
     binary: tuple[int, int] | None = None
-    """Where the .glb's own buffer begins, and how long it is."""
+    """Start of the .glb's own buffer in the file, and its length."""
     size: int = 0
     buffers: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
     total: int = 0
@@ -103,7 +104,7 @@ class Asset:
         return value
 
     def primitives(self) -> Iterator[tuple[str, NDArray[np.float64], dict[str, Any]]]:
-        """Those of Gaussians in the default scene: what to call them, the node's matrix in the world, and they."""
+        """The primitives of Gaussians in the default scene: name, the node's matrix in the world, and the primitive."""
         nodes = self.document.get("nodes", [])
         if "scenes" in self.document:
             roots = self.item("scenes", self.document.get("scene", 0)).get("nodes", [])
@@ -159,7 +160,7 @@ class Asset:
         return as_object(primitive["extensions"][EXTENSION])
 
     def gaussians(self, name: str, primitive: dict[str, Any]) -> Gaussians:
-        """In our frame."""
+        """The primitive's Gaussians in our frame."""
         said = self.extension(primitive)
         kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
         if kernel != "ellipse":

@@ -128,8 +128,9 @@ def _direction(vectors: Float32) -> Float32:
 
 
 def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
-    """By |c|^2 / 2 - v c, which is as far from v as half of the squared distance is. In tiles that are too small for a
-    library's threads: these wait for each other longer than they work, several times so on a busy machine."""
+    """Index of the nearest centre of each vector, by |c|^2 / 2 - v c: half of the squared distance, less a number of
+    v's alone. The tiles are too small for a library's threads: these wait for each other longer than they work, several
+    times so on a busy machine."""
     halves = np.float32(0.5) * np.einsum("ij,ij->i", centres, centres)
     columns = [(slice(start, start + TILE), centres[start : start + TILE].T) for start in range(0, len(centres), TILE)]
     labels = np.empty(len(vectors), np.int64)

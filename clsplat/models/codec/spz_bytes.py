@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bytes of SPZ's values, as the docstring of clsplat/models/formats/spz.py has them: arrays of a row for each
+"""The bytes of SPZ's values, described in clsplat/models/formats/spz.py: arrays of a row for each
 Gaussian."""
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def first_three(block: Bytes) -> NDArray[np.float32]:
 
 
 def smallest_three(block: Bytes) -> NDArray[np.float32]:
-    """From version 3: (n, 4) -> (n, 4) quaternions w x y z."""
+    """Quaternions w x y z, (n, 4), from bytes (n, 4) of version 3 and later."""
     packed = np.ascontiguousarray(block).view("<u4")[:, 0]
     fields = packed[:, None] >> np.array([20, 10, 0], np.uint32)
     three = (fields & 511).astype(np.float32) * np.float32(ROOT_HALF / 511)
@@ -58,13 +58,13 @@ def to_fixed(values: NDArray[np.float64]) -> Bytes:
 
 
 def to_first_three(unit: NDArray[np.float32]) -> Bytes:
-    """Of unit quaternions (n, 4), w x y z: (n, 3)."""
+    """Bytes (n, 3) of unit quaternions (n, 4), w x y z."""
     unit = np.where(unit[:, :1] < 0, -unit, unit)
     return to_byte(unit[:, 1:] * np.float32(127.5) + np.float32(127.5))
 
 
 def to_smallest_three(unit: NDArray[np.float32]) -> Bytes:
-    """Of unit quaternions (n, 4), w x y z: (4 n,)."""
+    """Bytes (4 n,) of unit quaternions (n, 4), w x y z."""
     q = unit[:, [1, 2, 3, 0]]
     largest = np.abs(q).argmax(axis=1)
     negate = np.take_along_axis(q, largest[:, None], axis=1) < 0
@@ -78,7 +78,7 @@ def to_smallest_three(unit: NDArray[np.float32]) -> Bytes:
 
 
 def to_sh(rest: NDArray[np.float32], sh_bits: tuple[int, int]) -> Bytes:
-    """(n, K - 1, 3) in our frame, of which band 1 and those above keep so many bits."""
+    """Bytes of coefficients (n, K - 1, 3) in our frame. sh_bits: bits that band 1, and those above, keep."""
     coefficients = rest.shape[1]
     steps = np.array([1 << (8 - sh_bits[0 if index < 3 else 1]) for index in range(coefficients)], np.int16)[:, None]
     signs = sh_signs(UP_BACK)[1 : coefficients + 1, None]

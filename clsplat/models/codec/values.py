@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What several formats share: values and their bytes, reading rows, an order in space, checks of what was read.
+"""Helpers of several formats: values and their bytes, reading rows, an order in space, checks of what was read.
 
 Colours in formats of bytes are 0.5 + C0 times SH coefficient 0, opacities lie in 0 to 1 (Kerbl et al. 2023).
 """
@@ -19,10 +19,11 @@ from clsplat.spherical_harmonics import C0
 
 BLOCK_ROWS = 1 << 15
 LEAST_SCALE = 2.0**-149
-"""What a scale of 0 is read as, whose log has to be finite: float32's least."""
+"""Value for a scale of 0, whose log has to be finite: float32's least."""
 FREE_COUNT = 1 << 20
-"""A compressed file may have so many Gaussians whatever its length is, and beyond them one for each byte of it: more
-than any model of a scene, whose positions alone take several bytes each, and less than what a bomb would ask for."""
+"""Gaussians that a compressed file may have whatever its length is; beyond them it may have one for each byte of it.
+That is more than any model of a scene, whose positions alone take several bytes each, and less than what a bomb would
+ask for."""
 MORTON_BITS = 21
 _SPREAD = (
     (32, 0x1F00000000FFFF),
@@ -34,7 +35,7 @@ _SPREAD = (
 
 
 def empty(count: int, degree: int) -> Gaussians:
-    """Room for so many, to be filled."""
+    """Room for `count` Gaussians, to be filled."""
 
     def room(*shape: int) -> Float32:
         return np.empty(shape, np.float32)
@@ -62,7 +63,8 @@ def opacities(logits: Float32) -> Float64:
 
 
 def logits(opacity: NDArray[Any]) -> Float32:
-    """Of opacities from 0 to 1, whose own logits are infinite: they count as float32's nearest others, halved."""
+    """Logits of opacities from 0 to 1. Those of 0 and 1 are infinite: they count as float32's nearest others,
+    halved."""
     p = np.clip(opacity.astype(np.float64), 2.0**-150, 1 - 2.0**-25)
     return (np.log(p) - np.log1p(-p)).astype(np.float32)
 
@@ -87,7 +89,7 @@ def log_scales(linear: NDArray[Any], path: Path | str, first: int) -> Float64:
 
 
 def colours(dc: Float32) -> Float64:
-    """Of SH coefficients 0."""
+    """Colours of SH coefficients 0."""
     return 0.5 + C0 * dc.astype(np.float64)
 
 

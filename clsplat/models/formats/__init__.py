@@ -57,7 +57,8 @@ def suffixes(*, writable: bool = False) -> list[str]:
 
 
 def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> ModuleType:
-    """By the longest ending that fits. Raises InputError for one that is not known, or not written if it should be."""
+    """The format of the longest ending that fits. Raises InputError for one that is not known, or not written if it
+    should be."""
     name = Path(path).name.lower()
     fits = [(len(suffix), module) for module in formats().values() for suffix in module.SUFFIXES if _has(name, suffix)]
     if not fits:
@@ -75,7 +76,8 @@ def _has(name: str, suffix: str) -> bool:
 
 
 def format_of(path: Path) -> ModuleType:
-    """By the name, unless the first bytes are another format's. Raises InputError, also where there is no such file."""
+    """The format by the name, unless the first bytes are another format's. Raises InputError, also where there is no
+    such file."""
     named = _named(path)
     if named is not None and path.is_dir():  # the reader knows whether it may be one
         return named
@@ -98,7 +100,7 @@ def tell_kind(path: Path, module: ModuleType) -> None:
 
 
 def is_model_name(path: Path) -> bool:
-    """Whether the ending is one of a model file."""
+    """True if the ending is one of a model file."""
     return _named(path) is not None
 
 
@@ -110,7 +112,7 @@ def _named(path: Path) -> ModuleType | None:
 
 
 def _recognised(module: ModuleType, head: bytes) -> bool:
-    """Whether nothing speaks against it."""
+    """True if nothing speaks against the format."""
     return not hasattr(module, "recognises") or bool(module.recognises(head))
 
 

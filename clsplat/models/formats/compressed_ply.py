@@ -83,7 +83,7 @@ def read(path: Path) -> Gaussians:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Of `clsplat info`: comments."""
+    """The format's part of `clsplat info`: comments."""
     with open_input(path, "a compressed PLY") as file:
         return {"comments": ply.read_header(file, path).comments}
 
@@ -153,7 +153,7 @@ def _elements(header: ply.Header, path: Path) -> tuple[ply.Element, ply.Element,
 
 
 def _starts(header: ply.Header, file: BinaryIO, path: Path) -> dict[str, int]:
-    """Where each element begins, the file's size checked for all of them."""
+    """Start of each element in the file, whose size is checked for all of them."""
     starts, at = {}, header.size
     for element in header.elements:
         starts[element.name] = at

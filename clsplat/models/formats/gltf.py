@@ -62,12 +62,12 @@ LARGEST_GLB = (1 << 32) - 1
 
 
 def recognises(head: bytes) -> bool:
-    """Whether a file begins as a .glb; a .gltf has JSON's beginning and nothing else."""
+    """True if a file begins as a .glb; a .gltf has JSON's beginning and nothing else."""
     return head[:4] == b"glTF" or head.lstrip()[:1] == b"{"
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What the extension says of the first primitive that has it."""
+    """Colour space and compression in the extension of the first primitive that has it."""
     asset = Asset.open(path)
     for _, _, primitive in asset.primitives():
         said = asset.extension(primitive)
@@ -131,7 +131,7 @@ def write(
 
 @dataclass
 class _Buffer:
-    """What the buffer will hold: arrays by the block of rows, or an SPZ file."""
+    """Contents of the buffer to be written: arrays by the block of rows, or an SPZ file."""
 
     gaussians: Gaussians
     attributes: list[str]

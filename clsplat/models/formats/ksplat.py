@@ -60,7 +60,7 @@ SECTION = np.dtype(
 BUCKET_BYTES = 12
 DEFAULT_RANGE = 32767
 DEFAULT_SH = 1.5
-"""What 0 means in the header."""
+"""Value that 0 stands for in the header."""
 SH_BYTES = (0, 9, 24, 45)
 _POSITION, _FLOAT, _SH = ("<f4", "<u2", "<u2"), ("<f4", "<f2", "<f2"), ("<f4", "<f2", "u1")
 
@@ -118,7 +118,7 @@ def read(path: Path) -> Gaussians:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Of `clsplat info`: version and compression level."""
+    """The format's part of `clsplat info`: version and compression level."""
     with open_input(path, "a .ksplat file") as file:
         header = packing.read_rows(file, HEADER, 1, path)[0]
     return {"version": f"{header['major']}.{header['minor']}", "level": int(header["level"])}

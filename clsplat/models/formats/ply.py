@@ -155,7 +155,7 @@ def _none(kept: int) -> Gaussians:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Of `clsplat info`: encoding, comments, properties that are ignored."""
+    """The format's part of `clsplat info`: encoding, comments, properties that are ignored, and `near`."""
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
     vertex, _ = _vertex_element(header, path)
@@ -302,7 +302,7 @@ def _local_means(
 def _count_from(
     origin: NDArray[np.float64], gaussians: Gaussians, local: NDArray[np.float32] | None, path: Path
 ) -> None:
-    """Have the means count from the origin: as they were written, unless somebody has moved the vertices since."""
+    """Have the means count from the origin: as they were written, unless the vertices were moved since."""
     world = gaussians.means.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         means = (world - origin).astype(np.float32)

@@ -68,16 +68,16 @@ PALETTE_COLUMNS = 64
 LARGEST_TAG = 252
 COEFFICIENTS = {degree: (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
 FREE_BYTES = 16 << 20
-"""Of a picture in an archive; beyond that 8 for each Gaussian, twice what its pixels have."""
+"""Bytes that a picture in an archive may have; beyond that 8 for each Gaussian, twice what its pixels have."""
 
 
 def recognises(head: bytes) -> bool:
-    """Whether a file begins as an archive, or as JSON."""
+    """True if a file begins as an archive, or as JSON."""
     return head.startswith(b"PK\x03\x04") or head.lstrip()[:1] == b"{"
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What meta.json says."""
+    """Version and antialiasing in meta.json."""
     with _opened(path) as files:
         meta = files.meta()
     return {"version": meta.get("version", 1), "antialiased": bool(meta.get("antialias", False))}
@@ -126,7 +126,7 @@ class _Files:
 
 
 class _Archive(_Files):
-    """Those in a .sog, unpacked one by one into a folder for a while."""
+    """The files in a .sog, unpacked one by one into a folder for a while."""
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, folder: Path) -> None:
         super().__init__(path)
@@ -298,7 +298,7 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
     largest = np.sqrt(np.maximum(0, 1 - np.square(three).sum(axis=1)))
     result = np.zeros((len(pixels), 4), np.float32)
-    result[tag < 0, 0] = 1  # no rotation, as the other reader has it
+    result[tag < 0, 0] = 1  # no rotation, like the other reader
     for index in range(4):
         chosen = tag == index
         result[np.ix_(chosen, [each for each in range(4) if each != index])] = three[chosen]
@@ -307,7 +307,7 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
 
 
 def _no_progress(stage: str, part: float | None = None) -> None:
-    """Nobody listens."""
+    """Do nothing: progress that nobody reads."""
 
 
 def write(

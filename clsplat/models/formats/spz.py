@@ -46,9 +46,9 @@ FLOAT = False
 MAGIC = b"NGSP"
 VERSIONS = (2, 3, 4)
 DEFAULT_VERSION = 4
-"""What the format's library and splat-transform write."""
+"""Version that the format's library and splat-transform write."""
 SH_BITS = (6, 6)
-"""Of band 1, and of those above. The format's library keeps 5 and 4: files a fifth smaller, and a trained model of
+"""Bits of band 1, and of those above. The format's library keeps 5 and 4: files a fifth smaller, and a trained model of
 strong view dependence 11 dB worse, at 36 (docs/formats.md). Readers need not know."""
 ANTIALIASED, HAS_EXTENSIONS = 1, 2
 COORDINATE_SYSTEM = 0xADBE0003
@@ -86,7 +86,7 @@ class Header:
 
 
 def recognises(head: bytes) -> bool:
-    """Whether a file begins as one of this format."""
+    """True if a file begins as one of this format."""
     if head[:2] != b"\x1f\x8b":
         return head.startswith(MAGIC)
     try:
@@ -96,7 +96,7 @@ def recognises(head: bytes) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What the header says."""
+    """Version, bits after the point and antialiasing in the header."""
     with open_input(path, "an SPZ file") as file:
         header, _ = _open(file, os.fstat(file.fileno()).st_size, path)
     antialiased = bool(header.flags & ANTIALIASED)
@@ -175,7 +175,7 @@ def _check(header: Header, path: Path) -> None:
 
 
 def _records(data: bytes, path: Path) -> dict[int, bytes]:
-    """Extensions by their type: type and length of 32 bits each, and then so many bytes."""
+    """Extensions by their type. Each is its type and its length, 32 bits each, and then its bytes."""
     found, at = {}, 0
     while len(data) - at >= 8:
         kind, length = struct.unpack_from("<II", data, at)
@@ -249,7 +249,7 @@ def _fill(stream: Stream, buffer: memoryview, path: Path, what: str) -> None:
 
 
 def _rest(stream: Any, path: Path) -> bytes:
-    """What follows the Gaussians, a little of it; gzip checks its sum at the end."""
+    """The bytes after the Gaussians, up to MAX_EXTENSIONS; gzip checks its sum at the end."""
     import zstandard
 
     try:
@@ -306,10 +306,10 @@ def write(
 ) -> None:
     """Write an SPZ file, atomically; the same Gaussians give the same bytes.
 
-    fractional_bits: of positions; by default 12, as the format's library has it, more for a model so small that this
-    would be coarse, fewer for one that does not fit. sh_bits: of band 1 and of those above, 1 to 8. Means count from
-    the world's origin: far from it they lose more. Raises InputError for values that are not finite or positions that
-    no number of bits holds, ValueError for settings out of range.
+    fractional_bits: of positions; by default 12, like the format's library, more for a model so small that this would
+    be coarse, fewer for one that does not fit. sh_bits: of band 1 and of those above, 1 to 8. Means count from the
+    world's origin: far from it they lose more. Raises InputError for values that are not finite or positions that no
+    number of bits holds, ValueError for settings out of range.
     """
     if version not in VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
@@ -323,7 +323,7 @@ def write(
 def header_for(
     path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None, flags: int = 0
 ) -> Header:
-    """What `write_to` is to write. Raises InputError for positions that do not fit, and for no Gaussians."""
+    """The header for `write_to`. Raises InputError for positions that do not fit, and for no Gaussians."""
     if not len(gaussians):
         raise InputError(f"{path}: cannot be written: the model has no Gaussians")
     bits = _fractional_bits(path, gaussians, fractional_bits)
@@ -360,7 +360,8 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
 
 
 def _fractional_bits(path: Path, gaussians: Gaussians, wanted: int | None) -> int:
-    """As many as asked for, if the positions fit; or by the model's size, without its farthest hundredth."""
+    """Bits after the point: as many as asked for, if the positions fit; or by the model's size, without its farthest
+    hundredth."""
     low, high = (
         values.world_means(gaussians, rows) for rows in (gaussians.means.argmin(axis=0), gaussians.means.argmax(axis=0))
     )

@@ -59,7 +59,7 @@ def _pxr(path: Path) -> Any:
 
 
 def recognises(head: bytes) -> bool:
-    """Whether a file begins as text or binary of USD, or as an archive, which a .usdz is."""
+    """True if a file begins as text or binary of USD, or as an archive, which a .usdz is."""
     return head.startswith((b"#usda", b"PXR-USDC", b"PK\x03\x04"))
 
 
@@ -76,7 +76,7 @@ def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **ar
 
 
 def _stands_alone(file: BinaryIO) -> bool:
-    """Whether it is text that refers to no other file, of few levels: USD reads that without harm."""
+    """True if the file is text that refers to no other file, of few levels: USD reads that without harm."""
     if file.read(5) != b"#usda":
         return False
     levels = 0
@@ -100,7 +100,7 @@ def _lives(call: str, arguments: str, path: str, *_: int) -> bool:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What the stage says of its axes and units, which move nothing here."""
+    """The stage's axes and units, which move nothing here."""
     survive(path)
     stage = _open(path)
     from pxr import UsdGeom

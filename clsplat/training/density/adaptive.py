@@ -26,18 +26,18 @@ class Plan:
 
 
 def is_due(config: DensityConfig, step: int) -> bool:
-    """Whether Gaussians are cloned, split and pruned after this step."""
+    """True if Gaussians are cloned, split and pruned after this step."""
     return config.every > 0 and config.start < step < config.stop and step % config.every == 0
 
 
 def is_pruning_due(config: DensityConfig, step: int) -> bool:
-    """Whether Gaussians are pruned by opacity and contribution after this step, densified or not."""
+    """True if Gaussians are pruned by opacity and contribution after this step, densified or not."""
     regular = config.prune_every > 0 and step > config.start and step % config.prune_every == 0
     return regular or step in config.prune_at
 
 
 def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
-    """Whether opacities are reset after this step; once early before a white background, as the authors' code."""
+    """True if opacities are reset after this step; once early before a white background, as in the authors' code."""
     if config.every <= 0 or step >= config.stop:
         return False
     return (config.opacity_reset_every > 0 and step % config.opacity_reset_every == 0) or (
@@ -46,7 +46,8 @@ def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
 
 
 def wants_contributions(config: DensityConfig, step: int = 0) -> bool:
-    """Whether what Gaussians contribute is to be known in this step: some pruning at its end or later goes by it."""
+    """True if the Gaussians' contributions have to be known in this step: some pruning at its end or later goes by
+    them."""
     last_fraction = max(config.prune_at) if config.prune_fraction > 0 and config.prune_at else -1
     if step <= last_fraction:
         return True
@@ -54,13 +55,13 @@ def wants_contributions(config: DensityConfig, step: int = 0) -> bool:
 
 
 def wants_agreement(config: DensityConfig) -> bool:
-    """Whether the views over the threshold are to be counted."""
+    """True if the views over the threshold are to be counted."""
     return config.every > 0 and config.views_agree > 1
 
 
 @dataclass(frozen=True, eq=False)
 class Contributions:
-    """What each Gaussian added to the pictures, in pixels; (n,), infinite where it is not known yet.
+    """Contributions of each Gaussian to the pictures, in pixels; (n,), infinite where they are not known yet.
 
     totals: over the views of the last whole epoch; largest: of any view in that epoch and the one under way.
     """
@@ -127,7 +128,7 @@ def _transparent(config: DensityConfig, opacity_logits: Float32) -> NDArray[np.b
 
 
 def _useless(config: DensityConfig, step: int, contributions: Contributions | None, count: int) -> NDArray[np.bool_]:
-    """Those that no view needs, and at the steps of `prune_at` a fraction of those whose use is known."""
+    """Gaussians that no view needs, and at the steps of `prune_at` a fraction of those whose use is known."""
     useless = np.zeros(count, bool)
     if contributions is None:
         return useless
@@ -147,7 +148,7 @@ def _wanted(
     agreeing: Float32 | None,
     useless: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Whom to clone or split, by mean gradients (n,)."""
+    """Gaussians to clone or split, by mean gradients (n,)."""
     n = len(gradients)
     room = config.max_gaussians - n
     if config.growth == "budget":
@@ -166,7 +167,7 @@ def _wanted(
 
 
 def budget(config: DensityConfig, step: int, count: int) -> int:
-    """How many Gaussians there are to be after this step's densification, when there are `count` before it.
+    """Number of Gaussians wanted after this step's densification, when there are `count` before it.
 
     Taming 3DGS (Mallick et al. 2024): A(x) = (B - S - k N)/N^2 x^2 + k x + S with k = 2 (B - S)/N, from S to B in N
     densifications. That is B - (B - S)(1 - x/N)^2, so that each brings what is still missing down by a known ratio:
@@ -193,6 +194,6 @@ def split_halves(
 
 
 def reset_opacities(config: DensityConfig, opacity_logits: Float32) -> Float32:
-    """At most `opacity_reset_to`."""
+    """Opacities of at most `opacity_reset_to`."""
     ceiling = np.log(config.opacity_reset_to / (1 - config.opacity_reset_to))
     return np.minimum(opacity_logits, np.float32(ceiling))
