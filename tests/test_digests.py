@@ -18,7 +18,8 @@ from quick import quick
 from clsplat.device.context import Device
 from clsplat.images.channels import LAYERS
 
-TOOLS = Path(__file__).resolve().parents[1] / "tools"
+ROOT = Path(__file__).resolve().parents[1]
+TOOLS = ROOT / "tools"
 sys.path.insert(0, str(TOOLS))
 import digests  # noqa: E402
 from digests import EXPECTED, Row, problems  # noqa: E402
@@ -86,6 +87,11 @@ def test_a_child(tmp_path: Path) -> None:
     kinds = ("perspective", "orthographic", "equirectangular", "fisheye")
     assert {kind: set(each) for kind, each in told["pictures"].items()} == dict.fromkeys(kinds, channels)
     assert (tmp_path / "arrays.npz").exists()
+    page = (ROOT / "docs/bit-identity.md").read_text("utf-8").splitlines()
+    row = Row("any", "8x1", **told)
+    rows = [line for line in page if line.startswith("| 8x1 |") and "not run" not in line]
+    assert rows and all(f"| `{row.frame}` | `{row.channels}` | `{row.gradient}` |" in line for line in rows)
+    assert set(digests.channel_table(row)) <= set(page)
 
 
 @pytest.mark.parametrize("shape", quick([(1, 1), (1, 64), (4, 1), (8, 16), (16, 1)], (1, 64)), ids=str)

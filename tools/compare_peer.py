@@ -5,7 +5,7 @@
     python tools/compare_peer.py fox banana sceaux_castle --limit './limit 400000' [--device DEVICE] [--json]
     python tools/compare_peer.py fox --limit-gpairs 3.55
 
-The arguments are the scenes' folders (README.md says where they come from), with the sizes and starting points that the
+The arguments are the scenes' folders (docs/quality.md says whence), with the sizes and starting points that the
 peer had. The step is the trainer's own, at the full size (`--warmup ''`), pictures decoded beforehand as the peer
 does; the median of steps 3 to 30, wall time from an idle device to an idle device.
 

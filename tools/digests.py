@@ -5,8 +5,8 @@ gradients and of a trained model, or how far they differ.
 
     .venv/bin/python tools/digests.py [--markdown]
 
---markdown prints what README.md has: drivers with the same digests in one row, and each channel's own digest. The first
-line is the processor that they were made on.
+--markdown prints the tables of docs/bit-identity.md: drivers with the same digests in one row, and each channel's own
+digest. The first line is the processor that they were made on.
 
 Every driver that is found is run in every shape, each in a process of its own, PoCL also with its other ways to make
 work-groups, and Rusticl where CLSPLAT_RUSTICL names its libRusticlOpenCL.so. Exit status 1 where

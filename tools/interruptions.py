@@ -4,10 +4,10 @@
 
     python tools/interruptions.py [--verbs train,eval] [--events SIGINT,2>&-] [--markdown]
 
-Each verb really runs, as a process of its own, on a small scene that is made on the spot; --markdown prints the tables
-of docs/interruptions.md. A full disk is a file system of its own where this user may mount one, else a limit of the
-size of files; a verb that writes none prints to /dev/full. Exit status 1 if a process ends with a traceback, by a
-signal or not at all. Set CLSPLAT_TRUST_DRIVER=1 to be quick.
+Each verb really runs, as a process of its own, on a small scene that is made on the spot; --markdown prints the
+tables that docs/interruptions.md sums up. A full disk is a file system of its own where this user may mount one, else a
+limit of the size of files; a verb that writes none prints to /dev/full. Exit status 1 if a process ends with a
+traceback, by a signal or not at all. Set CLSPLAT_TRUST_DRIVER=1 to be quick.
 """
 
 from __future__ import annotations
