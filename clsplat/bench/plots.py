@@ -135,10 +135,8 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
         x, y = ([point[key] for point in chosen] for key in ("frame_ms", "psnr"))
         style = {"markerfacecolor": colour, "markeredgecolor": VERMILION if on else BLUE, "markeredgewidth": 1.6}
         axes.plot(x, y, marker="o", markersize=7, linestyle="none", label=label, zorder=3, **style)
-    for key, lower, upper in (("frame_ms", 0.3, 0.1), ("psnr", 0.1, 0.1)):  # labels have room on the left, too
-        values = [point[key] for point in (rivals if key == "frame_ms" else drawn)]
-        span = max(values) - min(values) or 1.0
-        (axes.set_xlim if key == "frame_ms" else axes.set_ylim)(min(values) - lower * span, max(values) + upper * span)
+    axes.set_xlim(_around([point["frame_ms"] for point in rivals], 0.3))  # labels have room on the left, too
+    axes.set_ylim(_around([point["psnr"] for point in drawn], 0.1))
     top = axes.get_ylim()[1]
     edges = [(point["frame_ms"], point["psnr"]) for point, is_best in zip(rivals, best, strict=True) if is_best]
     steps = _steps([(ms, min(psnr, top) if psnr >= PSNR_MAX else psnr) for ms, psnr in sorted(edges)])
@@ -158,6 +156,12 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
 def _exact_point(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
     points: Points = result["points"]
     return next((point for point in points if point["name"] == result["exact"]), None)
+
+
+def _around(values: Sequence[float], below: float) -> tuple[float, float]:
+    """Limits of an axis: the values, a tenth of their span above them and the share `below` under them."""
+    span = max(values) - min(values) or 1.0
+    return min(values) - below * span, max(values) + 0.1 * span
 
 
 def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
