@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,6 +24,7 @@ from clsplat.bench import plots
 from clsplat.bench import settings as tradeoff
 from clsplat.bench import stages as bench_stages
 from clsplat.bench import subject as bench_subject
+from clsplat.bench.labels import LEADER, Box, Segment, place_labels
 from clsplat.cli.main import main
 from clsplat.config.presets import PRESETS
 from clsplat.config.rasterizer import RasterizerConfig
@@ -366,14 +369,46 @@ def test_front() -> None:
     assert tradeoff.front([(1, 1), (2, 2), (3, 1), (1, 0), (2, 2)]) == [True, True, False, False, True]
 
 
+def test_what_approximates() -> None:
+    exact = asdict(PRESETS["exact"])
+    off = asdict(tradeoff.settings()[tradeoff.ALL_OFF])
+    for field in exact:  # a new setting is one or the other
+        assert (field in tradeoff.MAY_CHANGE_BITS) != (off[field] != exact[field]), field
+    named = {name for name, config in tradeoff.settings().items() if tradeoff.approximate(config)}
+    for name in ("preset fast", "extent 3sigma", "sh-storage half", "alpha-min 2/255"):
+        assert name in named
+    assert tradeoff.ALL_OFF not in named
+    assert not any(name.startswith(("no ", "tile", "key", "depth", "preset exact")) for name in named)
+
+
+def a_point(name: str, ms: float, psnr: float, error: float, *, approximate: bool = True) -> dict[str, object]:
+    """As `compare` has them, with steps of twice the time."""
+    against = {"psnr": psnr, "max_abs": error}
+    return {
+        "name": name,
+        "approximate": approximate,
+        "frame_ms": ms,
+        "iteration_ms": 2 * ms,
+        "against_exact": against,
+        **against,
+    }
+
+
 @pytest.fixture
 def result() -> dict[str, object]:
     points = [
-        {"name": "exact", "frame_ms": 9.0, "psnr": 160.0, "max_abs": 0.0, "on_front": True},
-        {"name": "fast", "frame_ms": 5.0, "psnr": 50.0, "max_abs": 0.02, "on_front": True},
-        {"name": "slow", "frame_ms": 12.0, "psnr": 40.0, "max_abs": 0.03, "on_front": False},
+        a_point("exact", 40.0, 160.0, 0.0, approximate=False),
+        a_point("no early-stop", 42.0, 160.0, 0.0, approximate=False),
+        a_point("tile-test square", 60.0, 160.0, 0.0, approximate=False),
+        a_point(tradeoff.ALL_OFF, 170.0, 160.0, 0.0, approximate=False),
+        a_point("fast", 30.0, 50.0, 0.02),
+        a_point("fast again", 30.1, 50.1, 0.021),
+        a_point("slow", 80.0, 40.0, 0.03),
+        a_point("in vain", 41.0, 160.0, 0.0),
     ]
     return {
+        "exact": "exact",
+        "exact_switches_faster": {"frame": 4.25, "iteration": 4.126},
         "error_is_against": "the exact preset's frame",
         "crop": [1, 2, 3, 4],
         "exact_against_float64": {"psnr": 120.0, "max_abs": 1e-6},
@@ -381,19 +416,93 @@ def result() -> dict[str, object]:
     }
 
 
+def words_of(path: Path) -> list[str]:
+    """The texts of an SVG, from top to bottom as they were written; letters are outlines, the text is beside them."""
+    return [html.unescape(text) for text in re.findall(r"<!-- (.*?) -->", path.read_text("utf-8"))]
+
+
 @pytest.mark.needs("matplotlib")
 @pytest.mark.parametrize("name", quick(["plot.svg", "plot.PNG"], "plot.svg"))
-def test_plot_is_written(tmp_path: Path, result: dict[str, object], name: str) -> None:
+def test_plots_are_written(tmp_path: Path, result: dict[str, object], name: str) -> None:
     path, again = tmp_path / name, tmp_path / f"again_{name}"
-    for file in (path, again):
-        plots.check_plot(file)
-        plots.plot_settings(file, result, "a title")
-    assert path.read_bytes().startswith(b"\x89PNG" if name.endswith("PNG") else b"<?xml")
-    assert path.read_bytes() == again.read_bytes()
-    if name.endswith("svg"):
-        text = path.read_text()
-        for words in ("a title", "fast", "the exact preset's frame", "3x4 pixels"):
-            assert words.replace("'", "&#39;") in text or words in text
+    first, second = (plots.plot_settings(file, result, "a title") for file in (path, again))
+    kind = path.suffix
+    assert first == plots.plot_files(path) == (tmp_path / f"plot-switches{kind}", tmp_path / f"plot-error{kind}")
+    for one, other in zip(first, second, strict=True):
+        assert one.read_bytes().startswith(b"\x89PNG" if kind == ".PNG" else b"<?xml")
+        assert one.read_bytes() == other.read_bytes()
+    assert not path.exists()
+    if kind == ".PNG":
+        return
+    switches, error = map(words_of, first)
+    names = [word for word in switches if word in ("no early-stop", "tile-test square", tradeoff.ALL_OFF, "fast")]
+    assert names == ["no early-stop", "tile-test square"]  # the axis runs upwards: what is worth most is on top
+    assert {"1.05", "1.50", "a frame", "a training step", "a title"} <= set(switches)
+    assert "All off: 4.25 times for a frame, 4.13 times for a step." in switches
+    assert {"fast (0.02)", "fast again (0.021)", "slow (0.03)", "exact: 40.0 ms", "a title"} <= set(error)
+    notes = " ".join(error)
+    for words in (
+        "Error against the exact preset's frame",
+        "3x4 pixels in the middle: 120.0 dB, largest error 1e-06",
+        "the same bits as exact here: in vain (41.0 ms)",
+    ):
+        assert words in notes
+    assert not any("early-stop" in word for word in error)
+
+
+@pytest.mark.needs("matplotlib")
+def test_plots_of_little(tmp_path: Path, result: dict[str, object]) -> None:
+    """Of the exact preset alone, and of settings without it."""
+    points = result["points"]
+    assert isinstance(points, list)
+    switches, error = plots.plot_settings(tmp_path / "a.svg", {**result, "points": points[:1]}, "a title")
+    assert "no exact switch was measured" in words_of(switches)
+    assert "no approximate setting differs" in words_of(error)
+    others = {**result, "exact": None, "exact_switches_faster": None, "points": points[4:]}
+    switches, error = plots.plot_settings(tmp_path / "b.svg", others, "a title")
+    assert "no exact switch was measured" in words_of(switches)
+    assert not any(word.startswith("exact: ") for word in words_of(error))
+
+
+def test_labels_cover_nothing() -> None:
+    rng = np.random.default_rng(5)
+    frame = Box(0, 0, 700, 450)
+    crowds = [rng.uniform((50, 50), (650, 400), (20, 2)), rng.normal((300, 100), (12, 40), (12, 2))]
+    for crowd in [*crowds, np.full((4, 2), 200.0), np.array([[1.0, 1.0], [699.0, 449.0]])]:
+        points = [(float(x), float(y)) for x, y in crowd]
+        sizes = [(float(rng.uniform(60, 170)), 16.0) for _ in points]
+        line = ((300.0, 0.0), (300.0, 450.0))
+        places = place_labels(points, sizes, frame, [line])
+        assert places == place_labels(points, sizes, frame, [line])
+        for index, (place, size) in enumerate(zip(places, sizes, strict=True)):
+            box = place.box
+            assert (box.right - box.left, box.top - box.bottom) == pytest.approx(size)
+            assert frame.holds(box)
+            assert not any(box.overlaps(other.box) for other in places[index + 1 :])
+            assert not any(box.left < x < box.right and box.bottom < y < box.top for x, y in points)
+            assert not any(box.crossed(other.leader) for other in places if other.leader)
+            assert (place.leader is None) == (box.distance(points[index]) <= LEADER)
+
+
+def test_too_many_labels_have_a_place_each() -> None:
+    places = place_labels([(50.0, 20.0)] * 6, [(60.0, 16.0)] * 6, Box(0, 0, 100, 40))
+    assert len(places) == 6
+
+
+@pytest.mark.parametrize(
+    ("segment", "crossed"),
+    [
+        (((0, 0), (4, 3)), True),
+        (((0, 2), (5, 2)), True),
+        (((2, 2), (2.5, 2.5)), True),
+        (((0, 0), (0, 9)), False),
+        (((0, 0), (1, 1)), False),  # ends at the corner
+        (((0, 3), (5, 3)), False),  # along the edge
+        (((0, 3), (3, 6)), False),
+    ],
+)
+def test_segments_through_a_box(segment: Segment, crossed: bool) -> None:
+    assert Box(1, 1, 4, 3).crossed(segment) is crossed
 
 
 @pytest.mark.needs("matplotlib")
@@ -402,17 +511,26 @@ def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyP
     some = {"exact": PRESETS["exact"], "fast": PRESETS["fast"]}
     monkeypatch.setattr(tradeoff, "settings", lambda: some)
     path = tmp_path / "plot.svg"
+    files = tmp_path / "plot-switches.svg", tmp_path / "plot-error.svg"
     assert main(["bench", *SMALL, "--plot", str(path), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert [point["name"] for point in result["settings"]["points"]] == list(some)
-    assert path.exists()
-    path.write_bytes(b"precious")
-    assert main(["bench", *SMALL, "--plot", str(path)]) == 2
-    said = f"clsplat: error: {path}: is there already; name another file, or give --overwrite to replace it\n"
-    assert capsys.readouterr() == ("", said)
-    assert path.read_bytes() == b"precious"
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)["settings"]
+    assert [(point["name"], point["approximate"]) for point in result["points"]] == [("exact", False), ("fast", True)]
+    assert result["exact"] == "exact"
+    for file in files:
+        assert file.exists()
+        assert f"plot in {file}\n" in printed.err
+    assert not path.exists()
+    for file, other in (files, files[::-1]):
+        other.unlink(missing_ok=True)
+        file.write_bytes(b"precious")
+        assert main(["bench", *SMALL, "--plot", str(path)]) == 2
+        said = f"clsplat: error: {file}: is there already; name another file, or give --overwrite to replace it\n"
+        assert capsys.readouterr() == ("", said)
+        assert file.read_bytes() == b"precious"
+        assert not other.exists()
     assert main(["bench", *SMALL, "--plot", str(path), "--overwrite"]) == 0
-    assert path.read_bytes().startswith(b"<?xml")
+    assert all(file.read_bytes().startswith(b"<?xml") for file in files)
 
 
 def test_plot_without_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:

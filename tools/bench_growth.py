@@ -21,8 +21,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from measuring import Result, machine, number, options_parser, reporting, require, show, sizes
+from plotting import Panel, plot_growth
 
-from clsplat.bench.plots import Panel, check_plot, plot_growth
+from clsplat.bench.plots import check_plot
 from clsplat.bench.stages import columns, wall_ms
 from clsplat.bench.subject import synthetic
 from clsplat.device.buffers import upload

@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 from measuring import Result, machine, number, options_parser, reporting, require, show, sizes
 from numpy.typing import NDArray
+from plotting import Panel, plot_growth
 
-from clsplat.bench.plots import Panel, check_plot, plot_growth
+from clsplat.bench.plots import check_plot
 from clsplat.bench.stages import columns, wall_ms
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device, open_device

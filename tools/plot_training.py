@@ -16,7 +16,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from clsplat.bench.plots import check_plot, plot_training
+from plotting import plot_training
+
+from clsplat.bench.plots import check_plot
 from clsplat.errors import InputError
 from clsplat.runs.run import Run
 

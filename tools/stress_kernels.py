@@ -20,13 +20,14 @@ from typing import Any
 import numpy as np
 from measuring import Result, heading, machine, number, options_parser, reporting, require, show
 from numpy.typing import NDArray
+from plotting import Panel, plot_grid
 from stress_cases import BAND_SHARE, FRAME, FRAME_TAIL, GRADIENT_NORM, GRADIENT_TAIL, PROJECTION, STRESSORS
 from stress_frames import SCENES, FrameOutcome, compare_8k
 from stress_frames import compare as compare_frame
 from stress_projection import ERRORS, compare
 from stress_stages import BOUNDS, stages
 
-from clsplat.bench.plots import Panel, check_plot, plot_grid
+from clsplat.bench.plots import check_plot
 from clsplat.device.context import Device, open_device
 
 Array = NDArray[Any]

@@ -1,20 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plots of time against quality, by matplotlib, the optional extra `plot`. SVG or PNG by the file's name."""
+"""The two plots of `clsplat bench --plot`, by matplotlib, the optional extra `plot`. SVG or PNG by the file's name.
+
+Each is legible at 800 pixels of width: fonts of 10 points and more on 8 inches. The colours are those of Okabe and Ito,
+which colour-blind people tell apart.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from clsplat.bench.labels import Box, Place, place_labels
+from clsplat.bench.settings import ALL_OFF, PSNR_MAX, front
 from clsplat.errors import InputError
 from clsplat.files import atomic_writer
 
 EXTENSIONS = (".svg", ".png")
-SAME_BITS = 1e-8
-"""Where a difference of zero is drawn, on an axis that has none."""
+WIDTH, DPI = 8.0, 100
+"""Inches, and pixels an inch of the layout."""
+SIZE = 10
+"""Of text, in points."""
+BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK, GREY = COLOURS = (
+    "#0072B2",
+    "#E69F00",
+    "#009E73",
+    "#D55E00",
+    "#CC79A7",
+    "#56B4E9",
+    "#000000",
+    "#666666",
+)
+PAD = 2.0
+"""Pixels around a label."""
+
+Points = Sequence[Mapping[str, Any]]
 
 
 def check_plot(path: Path) -> None:
@@ -30,122 +52,221 @@ def check_plot(path: Path) -> None:
         raise InputError(message) from None
 
 
-def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> None:
-    """What `clsplat.bench.settings.compare` found: milliseconds a frame against PSNR and against the largest
-    difference."""
-    points = result["points"]
-    figure = _figure(title, 2)
-    upper, lower = figure.axes
-    same = [point["max_abs"] == 0 for point in points]
-    numbers = range(1, len(points) + 1)
-    for axes, key in ((upper, "psnr"), (lower, "max_abs")):
-        values = [max(point[key], SAME_BITS) if key == "max_abs" else point[key] for point in points]
-        best = sorted(
-            (point["frame_ms"], value) for point, value in zip(points, values, strict=True) if point["on_front"]
-        )
-        axes.plot(*zip(*best, strict=True), color="tab:red", linewidth=1, label="Pareto front, by PSNR")
-        for number, point, value, equal in zip(numbers, points, values, same, strict=True):
-            colour = "tab:red" if point["on_front"] else "tab:blue"
-            axes.plot(point["frame_ms"], value, marker="o" if equal else "s", color=colour, linestyle="none")
-            axes.annotate(str(number), (point["frame_ms"], value), (4, 4), textcoords="offset points", fontsize=8)
-        axes.set_xlabel("ms a frame, median")
-        axes.grid(alpha=0.3)
-    upper.set_ylabel("PSNR, dB (equal frames: 160)")
-    lower.set_ylabel("largest absolute difference")
-    lower.set_yscale("log")
-    if any(same):
-        lower.axhline(SAME_BITS, color="gray", linewidth=0.8, linestyle=":")
-        lower.text(0.99, SAME_BITS, "0: the same bits", transform=lower.get_yaxis_transform(), ha="right", va="top")
-    lines = [f"{number}  {point['name']}" for number, point in zip(numbers, points, strict=True)]
-    figure.text(0.7, 0.88, "\n".join(lines), va="top", fontsize=8)
-    x, y, width, height = result["crop"]
-    known = result["exact_against_float64"]
-    measured = f"PSNR {known['psnr']:.1f} dB, largest difference {known['max_abs']:.2g}"
-    note = (
-        f"Error against {result['error_is_against']}. "
-        f"The exact preset against the float64 reference on {width}x{height} pixels at ({x}, {y}): {measured}."
-    )
-    figure.text(0.01, 0.01, note, fontsize=8)
-    upper.legend(fontsize=8)
-    figure.subplots_adjust(left=0.07, right=0.68, bottom=0.15, wspace=0.28)
-    _save(figure, path)
+def plot_files(path: Path) -> tuple[Path, Path]:
+    """The files that `plot_settings` writes beside `path`: of the exact switches, and of the approximate settings."""
+    switches, error = (path.with_name(f"{path.stem}-{kind}{path.suffix}") for kind in ("switches", "error"))
+    return switches, error
 
 
-def plot_training(path: Path, runs: Mapping[str, Sequence[tuple[float, float]]], title: str) -> None:
-    """Of each run by name (seconds of training, held-out PSNR in dB)."""
-    figure = _figure(title, 1)
-    (axes,) = figure.axes
-    for name, points in runs.items():
-        axes.plot(*zip(*sorted(points), strict=True), marker="o", markersize=4, label=name)
-    axes.set_xlabel("seconds of training")
-    axes.set_ylabel("PSNR of the held-out views, dB")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    _save(figure, path)
+def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> tuple[Path, Path]:
+    """Draw what `clsplat.bench.settings.compare` measured into `plot_files(path)`, which are returned."""
+    files = plot_files(path)
+    for file, draw in zip(files, (_draw_switches, _draw_error), strict=True):
+        save_figure(draw(result, title), file)
+    return files
 
 
-Points = Sequence[tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A pair of logarithmic axes, what they show, and by name what was measured and what was fitted to it."""
-
-    x: str
-    y: str
-    measured: Mapping[str, Points]
-    fitted: Mapping[str, Points] = field(default_factory=dict)
-
-
-def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
-    """How a time grows with a size: panels side by side."""
-    figure = _figure(title, len(panels))
-    for axes, panel in zip(figure.axes, panels, strict=True):
-        for name, points in panel.measured.items():
-            axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=name)
-        for name, points in panel.fitted.items():
-            axes.plot(*zip(*points, strict=True), color="gray", linewidth=0.8, linestyle="--", label=name)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel(panel.x)
-        axes.set_ylabel(panel.y)
-        axes.grid(alpha=0.3, which="both")
-        axes.legend(fontsize=8)
-    figure.subplots_adjust(wspace=0.28)
-    _save(figure, path)
-
-
-def plot_grid(path: Path, panels: Sequence[Panel], title: str, columns: int = 3) -> None:
-    """Panels in rows with one scale of y, their lines without markers, one legend for all."""
-    rows = -(-len(panels) // columns)
-    figure = import_module("matplotlib.figure").Figure(figsize=(4.4 * columns, 2.9 * rows + 0.8), layout="constrained")
-    figure.suptitle(title, fontsize=9)
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=True).flat
-    for axes, panel in zip(grid, panels, strict=False):
-        for name, points in panel.measured.items():
-            if points:
-                axes.plot(*zip(*points, strict=True), linewidth=1.2, label=name)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel(panel.x, fontsize=8)
-        axes.tick_params(labelsize=7)
-        axes.grid(alpha=0.3)
-    for axes in list(grid):
-        axes.set_visible(False)
-    first = figure.axes[0]
-    figure.legend(*first.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
-    _save(figure, path)
-
-
-def _figure(title: str, columns: int) -> Any:
-    figure = import_module("matplotlib.figure").Figure(figsize=(6 + 4 * (columns - 1) + 2 * (columns > 1), 5))
-    figure.subplots(1, columns)
-    figure.suptitle(title, fontsize=10)
+def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
+    """What each exact switch is worth: the time without it over the time with all of them, of a frame and of a step."""
+    exact = _exact_point(result)
+    rows = []
+    if exact is not None:
+        for point in result["points"]:
+            if not point["approximate"] and point["name"] not in (exact["name"], ALL_OFF):
+                ratios = [point[key] / exact[key] for key in ("frame_ms", "iteration_ms")]
+                rows.append((ratios, point["name"]))
+    rows.sort(key=lambda row: row[0][0])
+    notes = ["Time without the switch over the time of exact, which has all of them. 1.00: no difference."]
+    if (faster := result["exact_switches_faster"]) is not None:
+        notes.append(f"All off: {faster['frame']:.2f} times for a frame, {faster['iteration']:.2f} times for a step.")
+    names = [name for _, name in rows]
+    heights = {"top": 0.4, "bottom": 0.6, "axes": max(0.42 * len(rows) + 0.2, 1.0)}
+    figure, axes = sheet(["What each exact switch is worth", title], notes, heights, _left_of(names))
+    for index, (key, colour) in enumerate((("a frame", BLUE), ("a training step", ORANGE))):
+        values = [ratios[index] for ratios, _ in rows]
+        places = [row + 0.2 - 0.4 * index for row in range(len(rows))]
+        axes.barh(places, [value - 1 for value in values], 0.38, left=1, color=colour, label=key)
+        for place, value in zip(places, values, strict=True):
+            text = f"{value:.2f}"
+            axes.annotate(text, (max(value, 1), place), (4, 0), textcoords="offset points", va="center", fontsize=SIZE)
+    axes.axvline(1, color=BLACK, linewidth=1)
+    axes.set_yticks(range(len(rows)), names, fontsize=SIZE)
+    axes.set_ylim(-0.6, len(rows) - 0.4)
+    ratios = [value for both, _ in rows for value in both]
+    low, high = min([1.0, *ratios]), max([1.05, *ratios])
+    axes.set_xlim(low - 0.02 * (high - low), high + 0.12 * (high - low))
+    axes.set_xlabel("times as long without it", fontsize=SIZE)
+    axes.grid(alpha=0.3, axis="x")
+    if rows:
+        legend_above(axes, 2)
+    else:
+        axes.text(0.5, 0.5, "no exact switch was measured", transform=axes.transAxes, ha="center", fontsize=SIZE)
     return figure
 
 
-def _save(figure: Any, path: Path) -> None:
-    """Without the date and random names that matplotlib puts in an SVG, so that equal plots are equal files."""
+def _draw_error(result: Mapping[str, Any], title: str) -> Any:
+    """Time a frame against PSNR of the approximate settings, with the exact preset as the reference."""
+    exact = _exact_point(result)
+    tried = [point for point in result["points"] if point["approximate"]]
+    drawn = [point for point in tried if point["against_exact"]["max_abs"] > 0]
+    same = [f"{point['name']} ({point['frame_ms']:.1f} ms)" for point in tried if point not in drawn]
+    _, _, width, height = result["crop"]
+    known = result["exact_against_float64"]
+    reference = f"The exact preset against the float64 reference, {width}x{height} pixels in the middle"
+    notes = [
+        f"Error against {result['error_is_against']}; in brackets the largest absolute error.",
+        f"{reference}: {known['psnr']:.1f} dB, largest error {known['max_abs']:.2g}.",
+    ]
+    if same:
+        notes.append(f"Approximate, but the same bits as exact here: {', '.join(same)}.")
+    heights = {"top": 0.7, "bottom": 0.6, "axes": 5.0}
+    figure, axes = sheet(["Time against error of the approximate settings", title], notes, heights, 0.75)
+    axes.set_xlabel("ms a frame, median", fontsize=SIZE)
+    axes.set_ylabel("PSNR, dB", fontsize=SIZE)
+    axes.grid(alpha=0.3)
+    if not drawn:
+        axes.text(0.5, 0.5, "no approximate setting differs", transform=axes.transAxes, ha="center", fontsize=SIZE)
+        return figure
+    rivals = [*drawn, *([exact] if exact is not None else [])]
+    best = front([(point["frame_ms"], point["psnr"]) for point in rivals])
+    kinds = ((True, VERMILION, "on the Pareto front with exact"), (False, "white", "behind it"))
+    for on, colour, label in kinds:
+        chosen = [point for point, is_best in zip(drawn, best, strict=False) if is_best == on]
+        x, y = ([point[key] for point in chosen] for key in ("frame_ms", "psnr"))
+        style = {"markerfacecolor": colour, "markeredgecolor": VERMILION if on else BLUE, "markeredgewidth": 1.6}
+        axes.plot(x, y, marker="o", markersize=7, linestyle="none", label=label, zorder=3, **style)
+    axes.set_xlim(_around([point["frame_ms"] for point in rivals], 0.3))  # labels have room on the left, too
+    axes.set_ylim(_around([point["psnr"] for point in drawn], 0.1))
+    top = axes.get_ylim()[1]
+    edges = [(point["frame_ms"], point["psnr"]) for point, is_best in zip(rivals, best, strict=True) if is_best]
+    steps = _steps([(ms, min(psnr, top) if psnr >= PSNR_MAX else psnr) for ms, psnr in sorted(edges)])
+    axes.plot(*zip(*steps, strict=True), color=VERMILION, linewidth=1.5, zorder=2)
+    legend_above(axes, 2, rise=0.05)
+    lines = list(pairwise(steps))
+    if exact is not None:
+        ms = exact["frame_ms"]
+        axes.axvline(ms, color=GREY, linewidth=1.2, linestyle="--", zorder=1)
+        _over_the_axes(figure, axes, ms, f"exact: {ms:.1f} ms")
+        lines.append(((ms, axes.get_ylim()[0]), (ms, top)))
+    texts = [f"{point['name']} ({point['max_abs']:.2g})" for point in drawn]
+    label_points(figure, axes, [(point["frame_ms"], point["psnr"]) for point in drawn], texts, lines)
+    return figure
+
+
+def _exact_point(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    points: Points = result["points"]
+    return next((point for point in points if point["name"] == result["exact"]), None)
+
+
+def _around(values: Sequence[float], below: float) -> tuple[float, float]:
+    """Limits of an axis: the values, a tenth of their span above them and the share `below` under them."""
+    span = max(values) - min(values) or 1.0
+    return min(values) - below * span, max(values) + 0.1 * span
+
+
+def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The best quality that each cost buys: level up to the next cost, then up."""
+    path = list(corners[:1])
+    for (_, quality), (cost, better) in pairwise(corners):
+        path += [(cost, quality), (cost, better)]
+    return path
+
+
+def _left_of(names: Sequence[str]) -> float:
+    """Inches that the longest of some names takes left of the axes."""
+    figure = import_module("matplotlib.figure").Figure(dpi=DPI)
+    return max((_extent(figure, name)[0] for name in names), default=0.0) / DPI + 0.25
+
+
+def _over_the_axes(figure: Any, axes: Any, x: float, text: str) -> None:
+    """A text over the top edge of the axes, in the middle over `x` where it does not stick out."""
+    half = _extent(figure, text)[0] / 2
+    box = axes.get_window_extent()
+    middle = min(max(axes.transData.transform((x, 0))[0], box.x0 + half), box.x1 - half)
+    place = figure.transFigure.inverted().transform((middle, box.y1 + 3))
+    figure.text(*place, text, ha="center", va="bottom", fontsize=SIZE, color=GREY)
+
+
+def label_points(
+    figure: Any,
+    axes: Any,
+    points: Sequence[tuple[float, float]],
+    texts: Sequence[str],
+    lines: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
+) -> list[Place]:
+    """Write a text beside each point, with a leader line where it lies apart; `lines` are better not crossed. The axes
+    must have their place and limits."""
+    to_pixels, to_figure = axes.transData.transform, figure.transFigure.inverted().transform
+    bounds = axes.get_window_extent()
+    frame = Box(bounds.x0 + PAD, bounds.y0 + PAD, bounds.x1 - PAD, bounds.y1 - PAD)
+    sizes = [(width + 2 * PAD, height + 2 * PAD) for width, height in (_extent(figure, text) for text in texts)]
+    spots = [tuple(map(float, to_pixels(point))) for point in points]
+    crossed = [(tuple(map(float, to_pixels(a))), tuple(map(float, to_pixels(b)))) for a, b in lines]
+    places = place_labels(spots, sizes, frame, crossed)  # type: ignore[arg-type]
+    line = import_module("matplotlib.lines").Line2D
+    for text, place in zip(texts, places, strict=True):
+        corner = to_figure((place.box.left + PAD, place.box.bottom + PAD))
+        figure.text(*corner, text, ha="left", va="bottom", fontsize=SIZE)
+        if place.leader is not None:
+            x, y = zip(*map(to_figure, place.leader), strict=True)
+            figure.add_artist(line(x, y, color=GREY, linewidth=0.8, zorder=1))
+    return places
+
+
+def sheet(titles: Sequence[str], notes: Sequence[str], heights: Mapping[str, float], left: float) -> tuple[Any, Any]:
+    """A figure with one pair of axes, titles over it and notes below. heights: inches of the axes, and of what belongs
+    to them on `top` (a legend) and at the `bottom` (ticks and their label)."""
+    line = 0.2
+    figure = import_module("matplotlib.figure").Figure(dpi=DPI)
+    first, *others = (wrapped(figure, text) for text in titles)
+    below = [text for note in notes for text in wrapped(figure, note)]
+    head = [*first, *(text for lines in others for text in lines)]
+    height = 0.1 + line * len(head) + heights["top"] + heights["axes"] + heights["bottom"] + line * len(below) + 0.1
+    figure.set_size_inches(WIDTH, height)
+    for number, text in enumerate(head):
+        weight = "bold" if number < len(first) else "normal"
+        figure.text(0.1 / WIDTH, 1 - (0.1 + line * number) / height, text, va="top", fontsize=SIZE, weight=weight)
+    for number, text in enumerate(reversed(below)):
+        figure.text(0.1 / WIDTH, (0.1 + line * number) / height, text, va="bottom", fontsize=SIZE)
+    bottom = (0.1 + line * len(below) + heights["bottom"]) / height
+    axes = figure.add_axes((left / WIDTH, bottom, 1 - (left + 0.2) / WIDTH, heights["axes"] / height))
+    axes.tick_params(labelsize=SIZE)
+    return figure, axes
+
+
+def wrapped(figure: Any, text: str) -> list[str]:
+    """The lines of a text that fit into the figure's width."""
+    lines = []
+    for part in text.split("\n"):
+        line = ""
+        for word in part.split(" "):
+            longer = f"{line} {word}" if line else word
+            if line and _extent(figure, longer)[0] > (WIDTH - 0.3) * DPI:
+                lines.append(line)
+                line = word
+            else:
+                line = longer
+        lines.append(line)
+    return lines
+
+
+def legend_above(axes: Any, columns: int, rise: float = 0.0) -> None:
+    """A legend over the axes, where it covers no point."""
+    place = {"loc": "lower left", "bbox_to_anchor": (0, 1 + rise), "borderaxespad": 0.2}
+    axes.legend(fontsize=SIZE, ncols=columns, frameon=False, **place)
+
+
+def _extent(figure: Any, text: str) -> tuple[float, float]:
+    """Width and height of a text in pixels."""
+    canvas = import_module("matplotlib.backends.backend_agg").FigureCanvasAgg(figure)
+    artist = figure.text(0, 0, text, fontsize=SIZE)
+    box = artist.get_window_extent(canvas.get_renderer())
+    artist.remove()
+    return float(box.width), float(box.height)
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write it without the date and random names that matplotlib puts in an SVG: equal plots are equal files."""
     with import_module("matplotlib").rc_context({"svg.hashsalt": "clsplat"}):
         kind = path.suffix.lower()[1:]
         with atomic_writer(path) as file:

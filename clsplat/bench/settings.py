@@ -40,6 +40,8 @@ ALL_OFF = "all exact switches off"
 """Of several values that a switch can have, the one that does most."""
 PSNR_MAX = 160.0
 """PSNR of equal images, which would be infinite."""
+MAY_CHANGE_BITS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
+"""Settings whose values approximate, all but that of `exact`. Of `extent` one value does: 3sigma."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,12 @@ def settings() -> dict[str, RasterizerConfig]:
     for name, config in named.items():
         merged[config] = f"{merged[config]} = {name.removeprefix('preset ')}" if config in merged else name
     return {name: config for config, name in merged.items()}
+
+
+def approximate(config: RasterizerConfig) -> bool:
+    """Whether a setting that may change bits differs from that of the `exact` preset."""
+    exact = PRESETS["exact"]
+    return config.extent == "3sigma" or any(getattr(config, key) != getattr(exact, key) for key in MAY_CHANGE_BITS)
 
 
 def compare(
@@ -150,22 +158,28 @@ def compare(
     medians = {name: tuple(map(statistics.median, zip(*each, strict=True))) for name, each in times.items()}
     whole = (width, height) == (camera.width, camera.height)
     return {
+        "exact": _exact_of(candidates),
         "exact_switches_faster": _faster(candidates, medians),
         "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
         "crop": list(crop),
         "exact_against_float64": asdict(errors(exact)[0]),
-        "points": _points(found, medians, whole=whole),
+        "points": _points(candidates, found, medians, whole=whole),
     }
 
 
 def _points(
-    found: Mapping[str, tuple[Error, Error]], medians: Mapping[str, tuple[float, ...]], *, whole: bool
+    candidates: Mapping[str, RasterizerConfig],
+    found: Mapping[str, tuple[Error, Error]],
+    medians: Mapping[str, tuple[float, ...]],
+    *,
+    whole: bool,
 ) -> list[dict[str, Any]]:
     points = []
     for name, (from_reference, from_exact) in found.items():
         points.append(
             {
                 "name": name,
+                "approximate": approximate(candidates[name]),
                 "frame_ms": medians[name][0],
                 "iteration_ms": medians[name][1],
                 "against_float64": asdict(from_reference),
@@ -179,10 +193,15 @@ def _points(
     return points
 
 
+def _exact_of(candidates: Mapping[str, RasterizerConfig]) -> str | None:
+    """The name of the setting that is the `exact` preset."""
+    return next((name for name, config in candidates.items() if config == PRESETS["exact"]), None)
+
+
 def _faster(
     candidates: Mapping[str, RasterizerConfig], medians: Mapping[str, tuple[float, ...]]
 ) -> dict[str, float] | None:
-    on = next((name for name, config in candidates.items() if config == PRESETS["exact"]), None)
+    on = _exact_of(candidates)
     if on is None or ALL_OFF not in medians:
         return None
     return {key: medians[ALL_OFF][k] / medians[on][k] for k, key in enumerate(("frame", "iteration"))}

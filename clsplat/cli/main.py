@@ -273,9 +273,10 @@ class Bench:
     """Bundle of rasterizer settings: exact and default approximate nothing, fast does a little. A --rasterizer flag
     overrides it."""
     plot: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Measure every setting of the rasterizer too, and plot run time against error into this file: .svg or .png."""
+    """Measure every setting of the rasterizer too, and draw two plots, .svg or .png. For NAME.svg: NAME-switches.svg,
+    what each exact switch is worth, and NAME-error.svg, time against error of the approximate settings."""
     overwrite: Flag = False
-    """Replace the plot that is there."""
+    """Replace plots that are there."""
     device: Device = None
     """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""

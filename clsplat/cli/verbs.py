@@ -316,7 +316,7 @@ def bench(verb: Bench) -> int:
     from clsplat.bench import settings as tradeoff
     from clsplat.bench import stages as bench_stages
     from clsplat.bench import subject as bench_subject
-    from clsplat.bench.plots import check_plot, plot_settings
+    from clsplat.bench.plots import check_plot, plot_files, plot_settings
     from clsplat.device.context import Device, select
     from clsplat.files import check_new
     from clsplat.progress import StageProgress
@@ -330,7 +330,8 @@ def bench(verb: Bench) -> int:
     verb.rasterizer.check()
     if verb.plot is not None:
         check_plot(verb.plot)
-        check_new(verb.plot, overwrite=verb.overwrite)
+        for file in plot_files(verb.plot):
+            check_new(file, overwrite=verb.overwrite)
     if verb.source is not None and not verb.source.exists():
         raise InputError(f"{verb.source}: no such file or folder, expected a scene, a run or a model file")
     progress = StageProgress()
@@ -348,8 +349,8 @@ def bench(verb: Bench) -> int:
         result["settings"] = tradeoff.compare(subject, device, repeat=verb.repeat, progress=progress)
         size_text = f"{result['width']}x{result['height']}, {result['gaussians']:,} Gaussians"
         title = f"{subject.name}, {size_text}\n{device.name}, {device.driver.split('  ')[0]}"
-        plot_settings(verb.plot, result["settings"], title)
-        print(f"plot in {verb.plot}", file=sys.stderr)
+        for file in plot_settings(verb.plot, result["settings"], title):
+            print(f"plot in {file}", file=sys.stderr)
     if verb.json:
         print(json.dumps(result, indent=2))
         return 0
