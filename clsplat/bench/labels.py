@@ -33,7 +33,7 @@ class Box:
     top: float
 
     def overlaps(self, other: Box) -> bool:
-        """Whether the two share more than an edge."""
+        """True if the two share more than an edge."""
         across = self.left < other.right and other.left < self.right
         return across and self.bottom < other.top and other.bottom < self.top
 
@@ -44,7 +44,7 @@ class Box:
         return max(width, 0.0) * max(height, 0.0)
 
     def holds(self, other: Box) -> bool:
-        """Whether all of the other lies in it."""
+        """True if all of the other lies in it."""
         inside = self.left <= other.left and other.right <= self.right
         return inside and self.bottom <= other.bottom and other.top <= self.top
 
@@ -59,7 +59,7 @@ class Box:
         return hypot(x - point[0], y - point[1])
 
     def crossed(self, segment: Segment) -> bool:
-        """Whether a segment goes through the inside. Clipped edge by edge (Liang and Barsky)."""
+        """True if a segment goes through the inside. Clipped edge by edge (Liang and Barsky)."""
         (x0, y0), (x1, y1) = segment
         first, last = 0.0, 1.0
         for start, move, low, high in ((x0, x1 - x0, self.left, self.right), (y0, y1 - y0, self.bottom, self.top)):
@@ -138,7 +138,7 @@ def _candidates(point: Point, size: tuple[float, float]) -> Iterator[tuple[Place
 
 
 def _covered(place: Place, frame: Box, boxes: Sequence[Box], leaders: Sequence[Segment], own: Box) -> float:
-    """What a place covers, in pixels: 0 for one that is free."""
+    """Cost of a place, by the pixels that it covers: 0 for one that is free."""
     box = place.box
     covered = sum(box.shared(other) for other in boxes)
     covered += sum(100.0 for leader in leaders if box.crossed(leader))
@@ -151,7 +151,7 @@ def _covered(place: Place, frame: Box, boxes: Sequence[Box], leaders: Sequence[S
 
 
 def _cross(one: Segment | None, other: Segment) -> bool:
-    """Whether two segments cross, each from side to side of the other."""
+    """True if two segments cross, each from side to side of the other."""
     if one is None:
         return False
 

@@ -67,7 +67,7 @@ def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> tuple[Pa
 
 
 def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
-    """What each exact switch is worth: the time without it over the time with all of them, of a frame and of a step."""
+    """Bars of the time without each exact switch over the time with all of them, of a frame and of a step."""
     exact = _exact_point(result)
     rows = []
     if exact is not None:

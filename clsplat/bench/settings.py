@@ -95,7 +95,7 @@ def settings() -> dict[str, RasterizerConfig]:
 
 
 def approximate(config: RasterizerConfig) -> bool:
-    """Whether a setting that may change bits differs from that of the `exact` preset."""
+    """True if a setting that may change bits differs from that of the `exact` preset."""
     exact = PRESETS["exact"]
     return config.extent == "3sigma" or any(getattr(config, key) != getattr(exact, key) for key in MAY_CHANGE_BITS)
 
@@ -233,7 +233,7 @@ def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, i
 
 
 def settings_table(result: dict[str, Any]) -> str:
-    """What `compare` measured, for people."""
+    """Table of what `compare` measured, for people."""
     rows: list[tuple[str, ...]] = [("setting", "ms", "step ms", "PSNR dB", "largest", "front")]
     for point in result["points"]:
         psnr = "same bits" if point["max_abs"] == 0 else f"{point['psnr']:.1f}"
