@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import prod
 
 import numpy as np
 
@@ -48,20 +49,14 @@ class Gaussians:
 
     def check(self) -> None:
         """Raise ValueError naming the array whose dtype or shape is not as the class says."""
-        for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
+        for name in (*(group.field for group in GROUPS.values()), "origin"):
             if not isinstance(array := getattr(self, name), np.ndarray):
                 raise ValueError(f"{name} is a {type(array).__name__}, expected a NumPy array")
         count = len(self.means) if self.means.ndim else 0
         coefficients = self.sh.shape[1] if self.sh.ndim == 3 else 0
         if coefficients not in [(degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1)]:
             raise ValueError(f"sh has shape {self.sh.shape}, expected (N, 1, 4, 9 or 16, 3)")
-        shapes = {
-            "means": (count, 3),
-            "quaternions": (count, 4),
-            "log_scales": (count, 3),
-            "opacity_logits": (count,),
-            "sh": (count, coefficients, 3),
-        }
+        shapes = {group.field: (count, *group.shape) for group in GROUPS.values()} | {"sh": (count, coefficients, 3)}
         for name, shape in shapes.items():
             array = getattr(self, name)
             if array.dtype != np.float32 or array.shape != shape:
@@ -96,22 +91,40 @@ LIMIT = 1e19
 """No parameter may be larger: its square is to be a float32."""
 
 
-def limit_of(group: str) -> float:
-    """The bound that the magnitudes of a group's parameters have to stay under."""
-    return SH_LIMIT if group.startswith("sh_") else LIMIT
+@dataclass(frozen=True)
+class Group:
+    """A parameter array that Adam steps.
+
+    field: the array of `Gaussians` that holds it; shape: the floats of one Gaussian, -1 for the SH coefficients after
+    the constant one; rate: its learning rate in `OptimiserConfig`; limit: the bound that magnitudes stay under.
+    """
+
+    field: str
+    shape: tuple[int, ...]
+    rate: str
+    limit: float = LIMIT
 
 
-GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
-"""The parameter groups on the device: as in `Gaussians`, with SH split into its constant and the rest."""
+GROUPS: dict[str, Group] = {
+    "means": Group("means", (3,), "means_rate"),
+    "quaternions": Group("quaternions", (4,), "quaternions_rate"),
+    "log_scales": Group("log_scales", (3,), "scales_rate"),
+    "opacity_logits": Group("opacity_logits", (), "opacities_rate"),
+    "sh_dc": Group("sh", (3,), "sh_dc_rate", SH_LIMIT),
+    "sh_rest": Group("sh", (-1, 3), "sh_rest_rate", SH_LIMIT),
+}
+"""The parameter groups on the device, in the order of the kernels' arguments. SH is split into its constant and the
+rest."""
 
 
 def group_shapes(count: int, coefficients: int) -> dict[str, tuple[int, ...]]:
     """The arrays of `count` Gaussians with `coefficients` SH coefficients a channel."""
     return {
-        "means": (count, 3),
-        "quaternions": (count, 4),
-        "log_scales": (count, 3),
-        "opacity_logits": (count,),
-        "sh_dc": (count, 3),
-        "sh_rest": (count, coefficients - 1, 3),
+        name: (count, *(coefficients - 1 if axis < 0 else axis for axis in group.shape))
+        for name, group in GROUPS.items()
     }
+
+
+def floats_of(coefficients: int) -> int:
+    """The floats of one Gaussian's parameters."""
+    return sum(prod(shape) for shape in group_shapes(1, coefficients).values())

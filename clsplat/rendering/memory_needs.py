@@ -9,6 +9,7 @@ from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.device.layout import PAD, TILE, SlotFields
+from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_plan import Need, Plan, plan
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.loss import strips
@@ -56,7 +57,7 @@ def plan_step(
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted. Raises
     CapacityError."""
-    floats = 11 + 3 * coefficients
+    floats = floats_of(coefficients)
     statistics = 4 * (5 * fields.contributions + agreement)  # contributions and two epochs of two statistics each
     return _plan(device, gaussians, floats, cameras, config, training=True, slot=fields.floats, statistics=statistics)
 

@@ -12,7 +12,7 @@ from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.gaussians import GROUPS, limit_of
+from clsplat.gaussians import GROUPS
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 REFUSED = ("parameters", "gradients", "moments", "steps")
@@ -46,14 +46,14 @@ def adam(
     counts = found.buffer  # no array that a step goes through: it is touched where something is wrong
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     lanes = device.shape.lanes
-    for group in GROUPS:
+    for group, about in GROUPS.items():
         updates = step
         if group == "sh_rest":
             if not updates_sh_rest(config, step):
                 continue
             updates = step // config.sh_rest_every
         rate, root = rates[group] / (1.0 - beta1**updates), (1.0 - beta2**updates) ** -0.5
-        constants = (rate, root, beta1, beta2, epsilon, limit_of(group) ** 2, counts)
+        constants = (rate, root, beta1, beta2, epsilon, about.limit**2, counts)
         arrays = (parameters[group], gradients[group], first[group], second[group])
         size, rows = parameters[group].size, parameters.count
         if size == 0:

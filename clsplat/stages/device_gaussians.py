@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.gaussians import GROUPS, Gaussians, group_shapes
+from clsplat.gaussians import GROUPS, Gaussians, floats_of, group_shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,8 @@ class ShStorage:
     def floats(self) -> int:
         """Floats of one Gaussian's parameters and what is kept beside them, rounded up."""
         rest = 3 * (self.coefficients - 1)
-        return 14 + (-(-rest // 2) if self.half else rest) + (self.degrees is not None)
+        kept = -(-rest // 2) if self.half else rest
+        return floats_of(self.coefficients) - rest + kept + (self.degrees is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,14 +131,8 @@ def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: b
 
 
 def _grouped(gaussians: Gaussians, sh: ShStorage) -> dict[str, NDArray[Any]]:
-    host = {
-        "means": gaussians.means,
-        "quaternions": gaussians.quaternions,
-        "log_scales": gaussians.log_scales,
-        "opacity_logits": gaussians.opacity_logits,
-        "sh_dc": gaussians.sh[:, 0],
-        "sh_rest": gaussians.sh[:, 1 : sh.coefficients],
-    }
+    host = {name: getattr(gaussians, group.field) for name, group in GROUPS.items()}
+    host |= {"sh_dc": gaussians.sh[:, 0], "sh_rest": gaussians.sh[:, 1 : sh.coefficients]}
     kinds = {"sh_rest": np.float16 if sh.half else np.float32}
     arrays = {name: np.ascontiguousarray(values, kinds.get(name, np.float32)) for name, values in host.items()}
     return arrays if sh.degrees is None else {**arrays, "sh_degrees": sh.degrees}
@@ -184,10 +179,5 @@ def to_device(device: Device, gaussians: HostGaussians) -> DeviceGaussians:
 def download_gaussians(gaussians: AnyGaussians) -> Gaussians:
     """A copy on the host."""
     host = {name: gaussians[name].get() for name in GROUPS}
-    return Gaussians(
-        means=host["means"],
-        quaternions=host["quaternions"],
-        log_scales=host["log_scales"],
-        opacity_logits=host["opacity_logits"],
-        sh=np.concatenate([host["sh_dc"][:, None], host["sh_rest"]], axis=1),
-    )
+    sh = np.concatenate([host["sh_dc"][:, None], host["sh_rest"]], axis=1)
+    return Gaussians(host["means"], host["quaternions"], host["log_scales"], host["opacity_logits"], sh)

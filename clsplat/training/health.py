@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians import limit_of
+from clsplat.gaussians import GROUPS
 
 PATIENCE = 5
 """Troubled steps among the last WINDOW with which training goes back to a checkpoint."""
@@ -53,7 +53,7 @@ def examine(parameters: Model, first: Model, second: Model) -> Findings:
     count = len(parameters["means"])
     broken, refused = np.zeros(count, bool), np.zeros(count, bool)
     for group, values in parameters.items():
-        broken |= ~(np.abs(values) < limit_of(group)).reshape(count, -1).all(axis=1)
+        broken |= ~(np.abs(values) < GROUPS[group].limit).reshape(count, -1).all(axis=1)
     for moments in (first, second):
         for values in moments.values():
             refused |= ~np.isfinite(values).reshape(count, -1).all(axis=1)

@@ -296,14 +296,8 @@ class Trainer:
         cooled = optimiser.cooldown_to ** (into / optimiser.cooldown) if into > 0 else 1.0
         fraction = min(self.step / optimiser.means_rate_steps, 1.0)
         means_rate = optimiser.means_rate ** (1 - fraction) * optimiser.means_rate_end**fraction
-        rates = {
-            "means": means_rate * self.scene.extent,
-            "quaternions": optimiser.quaternions_rate,
-            "log_scales": optimiser.scales_rate,
-            "opacity_logits": optimiser.opacities_rate,
-            "sh_dc": optimiser.sh_dc_rate,
-            "sh_rest": optimiser.sh_rest_rate,
-        }
+        rates = {name: getattr(optimiser, group.rate) for name, group in GROUPS.items()}
+        rates["means"] = means_rate * self.scene.extent
         return {group: rate * cooled * self.watch.patience.rate_factor for group, rate in rates.items()}
 
     def _next_view(self) -> int:

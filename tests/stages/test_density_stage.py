@@ -62,7 +62,7 @@ def test_widen_keeps_values_and_adds_zeros(device: Device, before: int, after: i
     assert rest.shape == (65, after - 1, 3)
     np.testing.assert_array_equal(rest[:, : before - 1], host["sh_rest"])
     assert not rest[:, before - 1 :].any()
-    for name in GROUPS[:-1]:
+    for name in list(GROUPS)[:-1]:
         np.testing.assert_array_equal(got[name].get(), host[name], err_msg=name)
 
 
