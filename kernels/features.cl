@@ -1,4 +1,4 @@
-// What a Gaussian brings to the channels beside colour: a row of FEATURES floats for each visible one. FEATURE_X is the
+// A Gaussian's part in the channels beside colour: a row of FEATURES floats for each visible one. FEATURE_X is the
 // place of X in the row, where X is wanted.
 //
 // Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.

@@ -32,7 +32,7 @@ def code_of(page: Path) -> Iterator[str]:
 
 
 def spans_of(page: Path) -> Iterator[str]:
-    """What stands between backticks in the text."""
+    """Words between backticks in the text."""
     for span in re.findall(r"`([^`]+)`", FENCED.sub("", page.read_text("utf-8"))):
         yield " ".join(span.split())
 
@@ -132,6 +132,6 @@ def test_links_lead_somewhere() -> None:
 
 
 def places(page: Path) -> set[str]:
-    """What GitHub calls the headings."""
+    """Anchors that GitHub gives the headings."""
     headings = re.findall(r"^#+ (.*)$", page.read_text("utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}

@@ -103,5 +103,5 @@ def test_imports_are_at_the_top_of_their_modules() -> None:
 
 
 def test_the_hall_is_small() -> None:
-    """What is at the top of the package may be imported from every room."""
+    """Modules at the top of the package may be imported from every room."""
     assert len(list((ROOT / "clsplat").glob("*.py"))) <= 12

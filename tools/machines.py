@@ -151,7 +151,7 @@ def run_machine(machine: Machine, show: Callable[[str], None] = print) -> Result
     with tempfile.TemporaryDirectory(prefix="clsplat-machine-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         folder.chmod(0o755)  # another user's home may be in it
-        for part in ("drivers", "no-drivers", "work"):
+        for part in ("drivers", "no-drivers", "made"):
             (folder / part).mkdir()
         for driver, library in machine.drivers:
             (folder / "drivers" / f"{driver}.icd").write_text(f"{library}\n")
@@ -374,14 +374,14 @@ def machines(found: Found) -> list[Machine]:
             home_alone,
             name="lang-c",
             purpose="LANG=C, and a scene with letters beyond ASCII in its path",
-            steps=(short_test(), *ten_steps("{folder}/work/é"), smoke()),
+            steps=(short_test(), *ten_steps("{folder}/made/é"), smoke()),
             variables=(("LANG", "C"),),
         ),
         replace(
             home_alone,
             name="ascii",
             purpose="LC_ALL=C with Python kept from making UTF-8 of it",
-            steps=(short_test(), *ten_steps("{folder}/work"), smoke()),
+            steps=(short_test(), *ten_steps("{folder}/made"), smoke()),
             variables=(("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")),
         ),
     ]
@@ -400,7 +400,7 @@ def emulated(found: Found, missing: str) -> Machine:
 
     steps = tuple(
         replace(step, limit=EMULATED * step.limit, command=("{folder}/python", *step.command[1:]))
-        for step in (short_test(), *ten_steps("{folder}/work"))
+        for step in (short_test(), *ten_steps("{folder}/made"))
     )
     return Machine(
         "pypi-pocl-haswell",
@@ -422,7 +422,7 @@ def emulated(found: Found, missing: str) -> Machine:
 def no_driver() -> tuple[Step, ...]:
     """Each verb that wants a device says what to install."""
     install = "pip install 'pyopencl[pocl]'"
-    scene, train = ten_steps("{folder}/work")
+    scene, train = ten_steps("{folder}/made")
     return (
         Step("devices", (PYTHON, "-m", "clsplat", "devices"), TRAIN_LIMIT, status=2, says=install),
         scene,
@@ -447,8 +447,8 @@ def read_only_home(found: Found, alone: Machine) -> Machine:
 def full_temporary(found: Found, alone: Machine) -> Machine:
     """A TMPDIR without a byte left, for training beside it and on it."""
     script = 'mount -t tmpfs -o size=64k none "$1" && { cat /dev/zero >"$1/filler" 2>/dev/null; shift; exec "$@"; }'
-    scene, train = ten_steps("{folder}/work")
-    command = tuple("{folder}/tmp/run" if word == "{folder}/work/run" else word for word in train.command)
+    scene, train = ten_steps("{folder}/made")
+    command = tuple("{folder}/tmp/run" if word == "{folder}/made/run" else word for word in train.command)
     on_it = Step("on it", command, TRAIN_LIMIT, status=1, says="the disk is full")
     return replace(
         alone,
@@ -489,7 +489,7 @@ def _no_stranger(found: Found) -> str:
 
 
 def _give_away(folder: Path) -> None:
-    for name in ("home", "tmp", "work"):
+    for name in ("home", "tmp", "made"):
         os.chown(folder / name, 65534, 65534)
 
 

@@ -174,7 +174,7 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
     if seen:
         told.append(f"{len(seen):,} of {len(views):,} views were trained on ({examples(seen)}): they score too well")
     if changed:
-        told.append(f"{_listed('with another photograph than at the training', changed)}")
+        told.append(_listed("with another photograph than at the training", changed))
     if was and not known:
         told.append(f"none of the views is of the scene that {run.path} began with")
     return told

@@ -38,13 +38,15 @@ BORDER = 0.9
 def of_scene(scene: Scene, background: Background) -> list[str]:
     """Doubts about the scene's points, cameras and photographs, or about the background for them."""
     lenses = absurd([(view.name, view.lens) for view in scene.views])
+    looked = spread(scene.train_views, LOOKED_AT)
+    pictures = [_pixels(view) for view in looked]
     found = (
         _coincident(scene),
         _principal_points(scene),
         lenses,
         _one_place(scene),
-        _empty(scene, background),
-        _background(scene, background),
+        _empty(looked, pictures, background),
+        _background(pictures, background),
     )
     return [text for text in found if text]
 
@@ -124,10 +126,9 @@ def _one_place(scene: Scene) -> str:
     )
 
 
-def _empty(scene: Scene, background: Background) -> str:
-    views = spread(scene.train_views, LOOKED_AT)
+def _empty(views: Sequence[View], pictures: Sequence[NDArray[np.float32]], background: Background) -> str:
     colour = background_colour(background)
-    if not all(_is_flat(composite(_pixels(view), colour)) for view in views):
+    if not all(_is_flat(composite(pixels, colour)) for pixels in pictures):
         return ""
     return (
         f"the {len(views)} training photographs that were looked at are of one colour, or transparent, so that there "
@@ -135,10 +136,9 @@ def _empty(scene: Scene, background: Background) -> str:
     )
 
 
-def _background(scene: Scene, background: Background) -> str:
+def _background(pictures: Sequence[NDArray[np.float32]], background: Background) -> str:
     edges = []
-    for view in spread(scene.train_views, LOOKED_AT):
-        pixels = _pixels(view)
+    for pixels in pictures:
         if pixels.shape[2] == 4 and pixels[:, :, 3].min() < 1:
             return ""  # composited over whatever it is trained on
         edges.append(np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])[:, :3])

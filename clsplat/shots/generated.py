@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -16,15 +16,22 @@ from clsplat.shots.keys import Key, interpolate
 from clsplat.shots.viewpoints import WIDEST_GAP, covered_arc, focus_point, look_at, up_axis
 
 
-def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A closed camera path around what the cameras look at, `frames` views with the first camera's intrinsics.
+@dataclass(frozen=True, eq=False)
+class _Ring:
+    """The cameras about the point that they look at. up, east (towards the first camera), north and focus (3,); offsets
+    (N, 3) from the focus, of which heights (N,) along up and radii (N,) from its axis; azimuths (N,), radians."""
 
-    It keeps the cameras' median distance and height. Where they stand all around it goes round once. Where they leave a
-    wide gap it swings to and fro over the arc that they cover, as no camera has seen the rest. It begins near the first
-    camera. Raises ValueError for no cameras or no frames.
-    """
-    if not cameras or frames < 1:
-        raise ValueError(f"a turntable of {frames} frames from {len(cameras)} cameras: expected at least one of each")
+    up: Float64
+    east: Float64
+    north: Float64
+    focus: Float64
+    offsets: Float64
+    heights: Float64
+    radii: Float64
+    azimuths: Float64
+
+
+def _ring(cameras: Sequence[Camera]) -> _Ring:
     up, focus = up_axis(cameras), focus_point(cameras)
     offsets = np.stack([camera.position for camera in cameras]) - focus
     heights = offsets @ up
@@ -34,7 +41,21 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     east = first / np.linalg.norm(first)
     north = np.cross(up, east)
     azimuths = np.arctan2(level @ north, level @ east)
-    radius, height = float(np.median(np.linalg.norm(level, axis=1))), float(np.median(heights))
+    return _Ring(up, east, north, focus, offsets, heights, np.linalg.norm(level, axis=1), azimuths)
+
+
+def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A closed camera path around what the cameras look at, `frames` views with the first camera's intrinsics.
+
+    It keeps the cameras' median distance and height. Where they stand all around it goes round once. Where they leave a
+    wide gap it swings to and fro over the arc that they cover, as no camera has seen the rest. It begins near the first
+    camera. Raises ValueError for no cameras or no frames.
+    """
+    if not cameras or frames < 1:
+        raise ValueError(f"a turntable of {frames} frames from {len(cameras)} cameras: expected at least one of each")
+    ring = _ring(cameras)
+    up, focus, azimuths = ring.up, ring.focus, ring.azimuths
+    radius, height = float(np.median(ring.radii)), float(np.median(ring.heights))
 
     time = np.arange(frames) / frames
     begin, width = covered_arc(azimuths)
@@ -48,7 +69,7 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         angles = middle + half * np.sin(2 * np.pi * time + phase)
     path = []
     for angle in angles:
-        position = focus + height * up + radius * (np.cos(angle) * east + np.sin(angle) * north)
+        position = focus + height * up + radius * (np.cos(angle) * ring.east + np.sin(angle) * ring.north)
         rotation, translation = look_at(position, focus, up)
         path.append(replace(cameras[0], rotation=rotation, translation=translation))
     return path
@@ -73,17 +94,10 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """
     if not cameras or frames < 1:
         raise ValueError(f"a spiral of {frames} frames from {len(cameras)} cameras: expected at least one of each")
-    up, focus = up_axis(cameras), focus_point(cameras)
-    offsets = np.stack([camera.position for camera in cameras]) - focus
-    heights = offsets @ up
-    level = offsets - heights[:, None] * up
-    aside = np.linalg.norm(level[0]) > 1e-9 * np.linalg.norm(offsets[0])
-    first = level[0] if aside else np.cross(up, cameras[0].rotation[0])
-    east = first / np.linalg.norm(first)
-    north = np.cross(up, east)
-    azimuths = np.arctan2(level @ north, level @ east)
-    elevations = np.clip(np.arctan2(heights, np.linalg.norm(level, axis=1)), -STEEPEST, STEEPEST)
-    distances = np.linalg.norm(offsets, axis=1)
+    ring = _ring(cameras)
+    up, focus, azimuths = ring.up, ring.focus, ring.azimuths
+    elevations = np.clip(np.arctan2(ring.heights, ring.radii), -STEEPEST, STEEPEST)
+    distances = np.linalg.norm(ring.offsets, axis=1)
 
     turn = 2 * np.pi * np.arange(frames) / frames
     begin, width = covered_arc(azimuths)
@@ -97,7 +111,7 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         distance = _between(distances, np.sin(turn))
     path = []
     for angle, height, radius in zip(azimuth, elevation, distance, strict=True):
-        outwards = np.cos(height) * (np.cos(angle) * east + np.sin(angle) * north) + np.sin(height) * up
+        outwards = np.cos(height) * (np.cos(angle) * ring.east + np.sin(angle) * ring.north) + np.sin(height) * up
         rotation, translation = look_at(focus + radius * outwards, focus, up)
         path.append(replace(cameras[0], rotation=rotation, translation=translation))
     return path

@@ -25,7 +25,7 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
     sum_gvv = fmaL(gv, v, sum_gvv);                                                                                    \
   } while (0)
 
-// What a loop over cells needs of a Gaussian, and log2 of its alpha before the cap in cell `cell`, the k-th of the
+// A Gaussian's values for a loop over cells, and log2 of its alpha before the cap in cell `cell`, the k-th of the
 // item's.
 #ifdef RAYS
 #include "shared/rays.h"
