@@ -9,10 +9,12 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Any
+
+Handler = Callable[[int, FrameType | None], object]
 
 
 def apart() -> dict[str, Any]:
@@ -51,40 +53,48 @@ def interrupt(number: int, _frame: FrameType | None) -> None:
 
 
 @contextmanager
-def terminable() -> Iterator[None]:
-    """Inside, what asks the process to end is as a Ctrl-C: temporary files go, and children end. In the main thread;
-    another one has no say in signals."""
+def handled(numbers: Iterable[int], handler: Handler) -> Iterator[None]:
+    """Inside, these signals call the handler. In the main thread; another one has no say in signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {each: signal.signal(each, interrupt) for each in endings()}
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, previous in before.items():
+            signal.signal(number, previous if previous is not None else signal.SIG_DFL)
+
+
+def terminable() -> AbstractContextManager[None]:
+    """Inside, a signal that asks the process to end is a Ctrl-C: temporary files go, and children end."""
+    return handled(endings(), interrupt)
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Inside, no signal that asks the process to end is seen to; afterwards the first that came is. What a library has
-    put in the place of our handlers is taken away again. In the main thread, as `terminable`."""
+    """Inside, signals that ask the process to end wait; afterwards the first that came is raised. Handlers that a
+    library installs inside are removed. In the main thread, as `handled`."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     came: list[int] = []
     numbers = (signal.SIGINT, *endings())
-    before = {each: signal.signal(each, lambda number, _: came.append(number)) for each in numbers}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers) if sys.platform != "win32" else None
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        came.append(number)
+
     try:
-        yield
+        with handled(numbers, note):
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers) if sys.platform != "win32" else None
+            try:
+                yield
+            finally:
+                for number in numbers:
+                    signal.signal(number, note)
+                if sys.platform != "win32" and mask is not None:
+                    signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # signals that have waited come now
     finally:
-        for each in before:
-            signal.signal(each, lambda number, _: came.append(number))
-        if sys.platform != "win32" and mask is not None:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # what has waited comes now
-        for number, handler in before.items():
-            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
         if came:
             signal.raise_signal(came[0])
 

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands in for scene, device, trainer, renderer and image files where only the command line is tested."""
 
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -13,15 +11,16 @@ import pytest
 from models import random_gaussians
 
 from clsplat.camera import Camera
-from clsplat.cli import render as verb_render  # noqa: F401  # imported before fakes take their modules' places
+from clsplat.cli import main as command_line
+from clsplat.cli.session import Services
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.errors import DeviceError, InputError
-from clsplat.evaluation import held_out
 from clsplat.gaussians import Gaussians
 from clsplat.images import channels as layers
 from clsplat.runs.run import Run
-from clsplat.sequence import frame_renderer
+from clsplat.sequence.frame_renderer import FrameShader
+from clsplat.sequence.task import RenderOptions
 from clsplat.shots import read
 
 
@@ -49,28 +48,21 @@ class FakeDevice:
 
 @dataclass
 class Pipeline:
-    """What the fakes were asked for, and what they are to do."""
+    """What the fakes were asked for, and what they are to do; `main` is the command line on them."""
 
     calls: list[tuple[Any, ...]] = field(default_factory=list)
     written: dict[str, np.ndarray] = field(default_factory=dict)
     cameras: dict[str, Camera] = field(default_factory=lambda: {"a.jpg": camera(), "sub/b.c.jpg": camera(20, 40)})
     training: Callable[..., None] = lambda *_: None
+    services: Services = field(default_factory=Services)
+
+    def main(self, arguments: list[str]) -> int:
+        return command_line.main(arguments, self.services)
 
     def write_layers(self, path: Path, made: dict[str, np.ndarray], *_: object) -> None:
         """In place of the real one."""
         planes = [plane if plane.ndim == 3 else plane[:, :, None] for plane in made.values()]
         self.written[str(path)] = np.concatenate(planes, axis=2)
-
-
-def stand_in(monkeypatch: pytest.MonkeyPatch, fakes: dict[str, dict[str, Any]]) -> None:
-    """Put members of modules in the places of the real ones, and where those have been imported to already."""
-    for name, members in fakes.items():
-        module = ModuleType(f"clsplat.{name}")
-        vars(module).update(members)
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-        for user in (frame_renderer, held_out):
-            for member in members.keys() & vars(user).keys():
-                monkeypatch.setattr(user, member, members[member])
 
 
 @pytest.fixture
@@ -157,21 +149,22 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             raise DeviceError("--device nosuch: no such device")
         return FakeDevice()
 
-    def write_image(path: Path, image: np.ndarray, *, alpha: str = "straight") -> None:
-        assert image.shape[2] == 3 or alpha == "associated"
-        pipe.written[str(path)] = image
+    def open_shader(
+        gaussians: Gaussians, options: RenderOptions, rasterizer: RasterizerConfig, *, device: str | None, **_: Any
+    ) -> FrameShader:
+        return FrameShader(Renderer(open_device(device), rasterizer), gaussians, options)
 
     monkeypatch.setattr(read, "read_cameras", lambda _: pipe.cameras)
     monkeypatch.setattr(layers, "write_layers", pipe.write_layers)
-    fakes: dict[str, dict[str, Any]] = {
-        "scenes.scene": {"load_scene": load_scene},
-        "api": {"train": train},
-        "rendering.renderer": {"Renderer": Renderer},
-        "device.context": {"open_device": open_device},
-        "selftest.trust": {"require": lambda device, *_: device},
-        "images.writing": {"write_image": write_image},
-    }
-    stand_in(monkeypatch, fakes)
+    pipe.services = replace(
+        pipe.services,
+        load_scene=load_scene,
+        open_device=open_device,
+        require=lambda device, *_: device,
+        train=train,
+        renderer=Renderer,
+        open_shader=open_shader,
+    )
     return pipe
 
 

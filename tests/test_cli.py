@@ -7,15 +7,17 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 from calls import Capture, command, error_line
 from fakes import Pipeline
 
-from clsplat.cli import verbs
-from clsplat.cli.main import Eval, Train, main, parse
+from clsplat.cli.eval import Eval
+from clsplat.cli.main import main, parse
+from clsplat.cli.options import DeviceOptions
+from clsplat.cli.session import Services
+from clsplat.cli.train import Train
 from clsplat.config.training import TrainConfig
 from clsplat.config.verbs import DEMO_ITERATIONS
 from clsplat.errors import ClsplatError, InputError
@@ -54,7 +56,7 @@ def test_flags_become_the_config() -> None:
     line = "train S -o R --iterations 50 --eval-at 10,20,30 --warmup 5 --optimiser.beta1 0.8 --density.every 0"
     verb = parse([*line.split(), "--density.absolute-gradients", "--background", "random", "--device", "gpu"])
     assert isinstance(verb, Train)
-    assert (verb.scene, verb.output, verb.device) == (Path("S"), Path("R"), "gpu")
+    assert (verb.scene, verb.output, verb.device) == (Path("S"), Path("R"), DeviceOptions("gpu"))
     config = verb.config
     assert (config.iterations, config.eval_at, config.warmup) == (50, (10, 20, 30), (5,))
     assert (config.optimiser.beta1, config.density.every, config.density.absolute_gradients) == (0.8, 0, True)
@@ -65,16 +67,16 @@ def test_flags_become_the_config() -> None:
     assert parse(["eval", "R"]) == Eval(Path("R"))
 
 
-def test_the_demo_takes_the_steps_it_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_takes_the_steps_it_is_given(tmp_path: Path) -> None:
     given = []
 
     def run_demo(output: Path, *, device: str | None, iterations: int) -> dict[str, object]:
         given.append((output, iterations))
         return {}
 
-    monkeypatch.setattr("clsplat.demo.run.run_demo", run_demo)
-    assert main(["demo", "-o", str(tmp_path), "--iterations", "30"]) == 0
-    assert main(["demo", "-o", str(tmp_path)]) == 0
+    services = Services(run_demo=run_demo)
+    assert main(["demo", "-o", str(tmp_path), "--iterations", "30"], services) == 0
+    assert main(["demo", "-o", str(tmp_path)], services) == 0
     assert given == [(tmp_path, 30), (tmp_path, DEMO_ITERATIONS)]
 
 
@@ -110,10 +112,10 @@ def test_settings_without_sense(flags: str, message: str, folder: str, tmp_path:
     ],
 )
 def test_exit_status(error: Exception, status: int, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    def fail(verb: object) -> int:
+    def fail(*_: object) -> int:
         raise error
 
-    monkeypatch.setattr(verbs, "run", fail)
+    monkeypatch.setattr("clsplat.cli.devices.run", fail)
     monkeypatch.delenv("CLSPLAT_DEBUG", raising=False)
     assert main(["devices"]) == status
     line = error_line(capsys)
@@ -124,10 +126,10 @@ def test_exit_status(error: Exception, status: int, monkeypatch: pytest.MonkeyPa
 
 
 def test_interrupted_anywhere(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    def interrupt(verb: object) -> int:
+    def interrupt(*_: object) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(verbs, "run", interrupt)
+    monkeypatch.setattr("clsplat.cli.devices.run", interrupt)
     assert main(["devices"]) == 130
     assert capsys.readouterr().err == "clsplat: interrupted\n"
 
@@ -135,11 +137,11 @@ def test_interrupted_anywhere(monkeypatch: pytest.MonkeyPatch, capsys: Capture) 
 def test_warnings_are_lines(model: str, folder: str, pipeline: Pipeline, capsys: Capture) -> None:
     with open(model, "ab") as file:
         file.write(b"more")
-    assert main(["eval", model, "--scene", folder]) == 0
+    assert pipeline.main(["eval", model, "--scene", folder]) == 0
     assert f"clsplat: warning: {model}: 4 bytes after the last Gaussian ignored\n" in capsys.readouterr().err
 
 
-def test_sfm(folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+def test_sfm(folder: str, tmp_path: Path, capsys: Capture) -> None:
     calls = []
 
     def reconstruct(photos: Path, output: Path, *, progress: Callable[..., None], **options: object) -> Path:
@@ -149,10 +151,8 @@ def test_sfm(folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
         (output / "sfm.json").write_text('{"photos": 3}')
         return output
 
-    fake = ModuleType("clsplat.scenes.sfm")
-    vars(fake).update(reconstruct=reconstruct, RECORD="sfm.json")
-    monkeypatch.setitem(sys.modules, "clsplat.scenes.sfm", fake)
-    assert main(["sfm", folder, "-o", str(tmp_path / "out"), "--matching", "sequential", "--json"]) == 0
+    services = Services(reconstruct=reconstruct)
+    assert main(["sfm", folder, "-o", str(tmp_path / "out"), "--matching", "sequential", "--json"], services) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out) == {"photos": 3}
     assert captured.err.splitlines()[0] == "matching photos 50 %"
@@ -164,7 +164,7 @@ def test_sfm(folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
 
 def test_train(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
     run = tmp_path / "runs" / "a"
-    assert main(["train", folder, "-o", str(run), "--iterations", "9", "--json"]) == 0
+    assert pipeline.main(["train", folder, "-o", str(run), "--iterations", "9", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["mean"]["psnr"] == 20
     assert "clsplat: warning: one photo is dark" in captured.err
@@ -175,39 +175,41 @@ def test_train(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture)
 
 def test_an_output_that_is_a_run(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
     run = tmp_path / "run"
-    assert main(["train", folder, "-o", str(run), "--iterations", "9", "--seed", "3"]) == 0
+    assert pipeline.main(["train", folder, "-o", str(run), "--iterations", "9", "--seed", "3"]) == 0
     before = (run / "model.ply").read_bytes()
     capsys.readouterr()
     pipeline.calls.clear()
-    assert main(["train", folder, "-o", str(run)]) == 2
+    assert pipeline.main(["train", folder, "-o", str(run)]) == 2
     assert "already a run, use --resume" in error_line(capsys)
-    assert main(["train", folder, "-o", str(run), "--resume", "--overwrite"]) == 2
+    assert pipeline.main(["train", folder, "-o", str(run), "--resume", "--overwrite"]) == 2
     assert "exclude each other" in error_line(capsys)
-    assert main(["train", folder, "-o", folder, "--resume"]) == 2
+    assert pipeline.main(["train", folder, "-o", folder, "--resume"]) == 2
     assert "no run to resume" in error_line(capsys)
     for wrong in (["/no/such/scene"], [folder, "--device", "nosuch"], []):
-        assert main(["train", *wrong, "-o", str(run), "--overwrite"]) == 2
+        assert pipeline.main(["train", *wrong, "-o", str(run), "--overwrite"]) == 2
         assert "expected" in error_line(capsys) or wrong
     assert (run / "model.ply").read_bytes() == before
     assert not any(call[0] == "train" for call in pipeline.calls)
 
-    assert main(["train", folder, "-o", str(run), "--overwrite", "--iterations", "5"]) == 0
+    assert pipeline.main(["train", folder, "-o", str(run), "--overwrite", "--iterations", "5"]) == 0
     assert pipeline.calls[-1] == ("train", 5, 0, False)
 
 
 def test_resume_takes_the_runs_settings(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
     run = str(tmp_path / "run")
     flags = ["--iterations", "9", "--seed", "3", "--density.absolute-gradients", "--warmup", "2,4"]
-    assert main(["train", folder, "-o", run, *flags]) == 0
-    assert main(["train", "--resume", "-o", run, "--iterations", "20"]) == 0
+    assert pipeline.main(["train", folder, "-o", run, *flags]) == 0
+    assert pipeline.main(["train", "--resume", "-o", run, "--iterations", "20"]) == 0
     assert pipeline.calls[-2:] == [("load_scene", folder, 0, 8), ("train", 20, 3, True)]
-    assert main(["train", folder, "-o", run, *flags, "--resume"]) == 0  # the first call again, with one flag more
+    assert (
+        pipeline.main(["train", folder, "-o", run, *flags, "--resume"]) == 0
+    )  # the first call again, with one flag more
     assert pipeline.calls[-1] == ("train", 9, 3, True)
     config = Run.open(run).config
     assert config.density.absolute_gradients
     assert config.warmup == (2, 4)
     capsys.readouterr()
-    assert main(["train", "--resume", "-o", run, "--seed", "4"]) == 2
+    assert pipeline.main(["train", "--resume", "-o", run, "--seed", "4"]) == 2
     assert "seed is 3 there" in error_line(capsys)
 
 
@@ -218,28 +220,28 @@ def test_ctrl_c_leaves_a_resumable_run(folder: str, tmp_path: Path, pipeline: Pi
 
     pipeline.training = interrupt
     run = str(tmp_path / "run")
-    assert main(["train", folder, "-o", run]) == 130
+    assert pipeline.main(["train", folder, "-o", run]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == f"clsplat: interrupted at step 4; go on with: clsplat train -o {run} --resume"
     pipeline.training = lambda *_: None
-    assert main(["train", "-o", run, "--resume"]) == 0
+    assert pipeline.main(["train", "-o", run, "--resume"]) == 0
 
 
 def test_eval_of_a_run(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:
     run = tmp_path / "run"
-    assert main(["train", folder, "-o", str(run), "--background", "white", "--iterations", "9"]) == 0
+    assert pipeline.main(["train", folder, "-o", str(run), "--background", "white", "--iterations", "9"]) == 0
     (run / "eval.json").unlink()
     capsys.readouterr()
-    assert main(["eval", str(run), "--json"]) == 0
+    assert pipeline.main(["eval", str(run), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result == json.loads((run / "eval.json").read_text())
     assert (result["step"], result["gaussians"], result["seconds"]) == (9, 4, 2.5)
     assert [view["name"] for view in result["views"]] == ["0.jpg"]
     assert result["mean"]["psnr"] == pytest.approx(-20 * np.log10(0.25))
     assert pipeline.calls[-1] == ("render", 4, 32, 24, (1, 1, 1))
-    assert list(pipeline.written) == [str(run / "test" / "0.png")]
+    assert [path.name for path in (run / "test").iterdir()] == ["0.png"]
 
-    assert main(["eval", str(run / "model.ply"), "--background", "black", "--resolution", "99"]) == 0
+    assert pipeline.main(["eval", str(run / "model.ply"), "--background", "black", "--resolution", "99"]) == 0
     looked = ("render", 4, 8, 6, (0, 0, 0))  # small, to warn of views that do not see the model
     assert pipeline.calls[-3:] == [("load_scene", folder, 99, 8), looked, ("render", 4, 32, 24, (0, 0, 0))]
     assert "1 held-out views  PSNR 12.04 dB" in capsys.readouterr().out
@@ -254,10 +256,10 @@ def test_eval_that_cannot_be(folder: str, model: str, pipeline: Pipeline, tmp_pa
         ([folder], "not a run"),
     ]
     for arguments, message in cases:
-        assert main(["eval", *arguments]) == 2, arguments
+        assert pipeline.main(["eval", *arguments]) == 2, arguments
         assert message in capsys.readouterr().err.splitlines()[-1]
     Run.create(tmp_path / "new", TrainConfig(), scene=folder)
-    assert main(["eval", str(tmp_path / "new")]) == 2
+    assert pipeline.main(["eval", str(tmp_path / "new")]) == 2
     assert "has not written its model yet" in error_line(capsys)
 
 
@@ -275,7 +277,7 @@ def test_bad_models(verb: str, trouble: str, model: str, folder: str, pipeline: 
     }[trouble]
     path.write_bytes(content)
     rest = ["--scene", folder] if verb == "eval" else ["--cameras", folder, "-o", "{name}.png"]
-    assert main([verb, model, *rest]) == 2
+    assert pipeline.main([verb, model, *rest]) == 2
     line = error_line(capsys)
     assert message in line
     assert model in line

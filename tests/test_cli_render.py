@@ -11,7 +11,8 @@ import pytest
 from calls import Capture, error_line
 from fakes import Pipeline, camera
 
-from clsplat.cli.main import Render, main, parse
+from clsplat.cli.main import main, parse
+from clsplat.cli.render import Render
 from clsplat.cli.render_request import resizer
 from clsplat.config.presets import PRESETS
 from clsplat.config.rasterizer import RasterizerConfig
@@ -21,7 +22,9 @@ from clsplat.runs.run import Run
 
 def test_render(model: str, folder: str, pipeline: Pipeline, tmp_path: Path, capsys: Capture) -> None:
     pattern = str(tmp_path / "out" / "x_{name}_y.exr")
-    assert main(["render", model, "--cameras", folder, "-o", pattern, "--background", "0.5,0,1", "--json"]) == 0
+    assert (
+        pipeline.main(["render", model, "--cameras", folder, "-o", pattern, "--background", "0.5,0,1", "--json"]) == 0
+    )
     records = json.loads(capsys.readouterr().out)
     assert [record["name"] for record in records] == ["a.jpg", "sub/b.c.jpg"]
     assert [Path(record["path"]) for record in records] == [
@@ -61,7 +64,9 @@ def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture)
 
 @pytest.mark.parametrize("extension", ["exr", "png"])
 def test_render_with_alpha(extension: str, model: str, folder: str, pipeline: Pipeline, tmp_path: Path) -> None:
-    assert main(["render", model, "--cameras", folder, "-o", f"{tmp_path}/{{name}}.{extension}", "--alpha"]) == 0
+    assert (
+        pipeline.main(["render", model, "--cameras", folder, "-o", f"{tmp_path}/{{name}}.{extension}", "--alpha"]) == 0
+    )
     image = pipeline.written[f"{tmp_path}/a.{extension}"]
     np.testing.assert_allclose(image, np.broadcast_to([0.25] * 3 + [0.5], (24, 32, 4)))
 
@@ -79,7 +84,7 @@ def test_render_sizes(
     flags: str, size: tuple[int, int], model: str, folder: str, pipeline: Pipeline, tmp_path: Path
 ) -> None:
     pipeline.cameras = {"a.jpg": camera()}
-    assert main(["render", model, "--cameras", folder, "-o", str(tmp_path / "one.png"), *flags.split()]) == 0
+    assert pipeline.main(["render", model, "--cameras", folder, "-o", str(tmp_path / "one.png"), *flags.split()]) == 0
     assert pipeline.calls == [("render", 4, *size, (0, 0, 0))]
 
 
@@ -94,12 +99,15 @@ def test_render_of_a_camera_path(model: str, pipeline: Pipeline, tmp_path: Path,
     cameras = tmp_path / "camera_path.json"
     cameras.write_text(json.dumps(PATH))
     out = str(tmp_path / "shot" / "beauty.####.exr")
-    assert main(["render", model, "--cameras", str(cameras), "-o", out, "--frames", "3,8-11:2", "--json"]) == 0
+    assert pipeline.main(["render", model, "--cameras", str(cameras), "-o", out, "--frames", "3,8-11:2", "--json"]) == 0
     records = json.loads(capsys.readouterr().out)
     assert [record["frame"] for record in records] == [3, 8, 10]
     assert sorted(pipeline.written) == [str(tmp_path / "shot" / f"beauty.{i:04d}.exr") for i in (3, 8, 10)]
     assert pipeline.calls == [("render", 4, 40, 30, (0, 0, 0))] * 3
-    assert main(["render", model, "--cameras", str(cameras), "-o", out, "--frames", "12-13", "--width", "80"]) == 0
+    assert (
+        pipeline.main(["render", model, "--cameras", str(cameras), "-o", out, "--frames", "12-13", "--width", "80"])
+        == 0
+    )
     assert pipeline.calls[3:] == [("render", 4, 80, 60, (0, 0, 0))]
     captured = capsys.readouterr()
     assert captured.err == (
@@ -110,7 +118,7 @@ def test_render_of_a_camera_path(model: str, pipeline: Pipeline, tmp_path: Path,
 @pytest.mark.parametrize("path", ["turntable", "spiral", "through"])
 def test_render_along_a_path(path: str, model: str, folder: str, pipeline: Pipeline, tmp_path: Path) -> None:
     out = str(tmp_path / "%02d.png")
-    assert main(["render", model, "--cameras", folder, "-o", out, "--path", path, "--count", "5"]) == 0
+    assert pipeline.main(["render", model, "--cameras", folder, "-o", out, "--path", path, "--count", "5"]) == 0
     assert sorted(pipeline.written) == [str(tmp_path / f"{i:02d}.png") for i in range(1, 6)]
     assert pipeline.calls == [("render", 4, 32, 24, (0, 0, 0))] * 5
 
@@ -121,7 +129,7 @@ def test_render_of_frames_that_begin_negative(model: str, pipeline: Pipeline, tm
     cameras = tmp_path / "cameras.json"
     cameras.write_text(json.dumps({"clsplat_cameras": 1, "width": 8, "height": 6, "keys": keys}))
     out = str(tmp_path / "{frame}.png")
-    assert main(["render", model, "--cameras", str(cameras), "-o", out, "--frames=-2-1"]) == 0
+    assert pipeline.main(["render", model, "--cameras", str(cameras), "-o", out, "--frames=-2-1"]) == 0
     assert set(pipeline.written) == {str(tmp_path / f"{i}.png") for i in (-2, -1, 0, 1)}
 
 
@@ -139,9 +147,9 @@ def test_cameras_that_cannot_be_rendered(model: str, pipeline: Pipeline, tmp_pat
     ]
     for changes, arguments, message in cases:
         cameras.write_text(json.dumps({**PATH, **changes}))
-        assert main(["render", model, "--cameras", str(cameras), *arguments]) == 2, arguments
+        assert pipeline.main(["render", model, "--cameras", str(cameras), *arguments]) == 2, arguments
         assert message in error_line(capsys)
-    assert main(["render", model, "--cameras", str(cameras), *out, "--path", "zigzag"]) == 2
+    assert pipeline.main(["render", model, "--cameras", str(cameras), *out, "--path", "zigzag"]) == 2
     assert "zigzag" in error_line(capsys)
     assert not pipeline.written
     assert not (tmp_path / "shot").exists()
@@ -162,7 +170,7 @@ def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_
         (["--cameras", folder, "-o", out, "--device", "nosuch"], "no such device"),
     ]
     for arguments, message in cases:
-        assert main(["render", model, *arguments]) == 2, arguments
+        assert pipeline.main(["render", model, *arguments]) == 2, arguments
         assert message in error_line(capsys)
     for names, message in [
         (["a.jpg", "a.png"], "would be both a.jpg and a.png"),
@@ -170,7 +178,7 @@ def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_
         ([], "has no images"),
     ]:
         pipeline.cameras = {name: camera() for name in names}
-        assert main(["render", model, "--cameras", folder, "-o", out]) == 2
+        assert pipeline.main(["render", model, "--cameras", folder, "-o", out]) == 2
         assert message in error_line(capsys)
     assert not pipeline.written
 

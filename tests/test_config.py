@@ -136,8 +136,9 @@ def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> 
 def test_a_setting_that_two_places_have_has_one_default() -> None:
     import inspect
 
-    from clsplat.cli.main import Render, Train
-    from clsplat.cli.options import Convert, View
+    from clsplat.cli.convert import Convert
+    from clsplat.cli.options import PageOptions
+    from clsplat.cli.render import Render
     from clsplat.config.pictures import Encoding
     from clsplat.scenes.scene import load_scene
     from clsplat.viewer.server import Address
@@ -145,8 +146,8 @@ def test_a_setting_that_two_places_have_has_one_default() -> None:
     def default(owner: type, name: str) -> object:
         return next(field.default for field in fields(owner) if field.name == name)
 
-    assert [default(each, "port") for each in (Train, View, Address)] == [8080] * 3
-    assert [default(each, "host") for each in (Train, View, Address)] == ["127.0.0.1"] * 3
+    assert [default(each, "port") for each in (PageOptions, Address)] == [8080] * 2
+    assert [default(each, "host") for each in (PageOptions, Address)] == ["127.0.0.1"] * 2
     held_out = inspect.signature(load_scene).parameters["test_every"].default
     assert [default(each, "test_every") for each in (TrainConfig, Convert)] == [held_out] * 2 == [8] * 2
     names = {"exr": "depth", "parts": "parts", "compression": "compression", "bits": "bits", "quality": "quality"}

@@ -112,9 +112,7 @@ def test_what_is_ignored_stays_so() -> None:
 
 @posix
 def test_every_verb_ends_with_the_signals_number(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    from clsplat.cli import verbs
-
-    monkeypatch.setattr(verbs, "run", lambda _verb: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr("clsplat.cli.devices.run", lambda *_: signal.raise_signal(signal.SIGTERM))
     assert main(["devices"]) == 143
     assert capsys.readouterr().err == "clsplat: interrupted\n"
 
@@ -172,10 +170,10 @@ def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
         "from clsplat.__main__ import main\n"
         "from clsplat.process import terminable\n"
         "from clsplat.cli import main as cli\n"
-        "from clsplat.cli import verbs\n"
-        "def work(verb):\n"
+        "from clsplat.cli import train\n"
+        "def work(*_):\n"
         "    import clsplat.scenes.lens\n"
-        "verbs.run = work\n"
+        "train.run = work\n"
         "sys.exit(main())\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

@@ -19,7 +19,7 @@ from models import random_gaussians
 from packaging.requirements import Requirement
 
 from clsplat import files, process
-from clsplat.cli.main import _unboxed
+from clsplat.cli.parsing import _unboxed
 from clsplat.device import packaged
 from clsplat.device.advice import driver_advice
 from clsplat.errors import InputError

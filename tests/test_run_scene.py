@@ -15,7 +15,8 @@ from calls import train as command_train
 from quick import quick
 from tiny import short, write_scene
 
-from clsplat.cli.main import Train, main, parse
+from clsplat.cli.main import main, parse
+from clsplat.cli.train import Train
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.images.reading import read_image

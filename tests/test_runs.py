@@ -11,7 +11,8 @@ import pytest
 from models import random_gaussians
 
 import clsplat
-from clsplat.cli.main import Train, main, parse
+from clsplat.cli.main import main, parse
+from clsplat.cli.train import Train
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import TEMPORARY_SUFFIX

@@ -20,7 +20,8 @@ from systems import posix
 from tiny import CONFIG
 from viewer_browser import clsplat
 
-from clsplat.cli.main import Train, main, parse
+from clsplat.cli.main import main, parse
+from clsplat.cli.train import Train
 from clsplat.runs.run import Run
 from clsplat.viewer.server import Address, refused
 
@@ -224,9 +225,9 @@ def test_the_flags_of_a_trainings_page(tmp_path: Path) -> None:
     for more in ([], ["--preset", "fast"], ["--schedule", "short"]):
         verb = parse(["train", "scene", "-o", "run", "--view", "--port", "81", "--host", "::1", *more])
         assert isinstance(verb, Train)
-        assert (verb.view, verb.port, verb.host) == (True, 81, "::1")
+        assert (verb.view, verb.page.port, verb.page.host) == (True, 81, "::1")
     run = tmp_path / "run"
     Run.create(run, CONFIG, scene=tmp_path)
     verb = parse(["train", "-o", str(run), "--resume", "--view", "--paths", str(tmp_path)])
     assert isinstance(verb, Train)
-    assert (verb.view, verb.resume, verb.paths, verb.config) == (True, True, tmp_path, CONFIG)
+    assert (verb.view, verb.resume, verb.page.paths, verb.config) == (True, True, tmp_path, CONFIG)

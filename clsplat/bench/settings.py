@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.bench.stages import columns, held_kind, picture_of, trainer_of, wall_ms
+from clsplat.bench.stages import held_kind, picture_of, trainer_of, wall_ms
 from clsplat.bench.subject import Progress, Subject
 from clsplat.camera import Camera
 from clsplat.config.presets import PRESETS
@@ -30,6 +30,7 @@ from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.rendering.renderer import held_sh
 from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
+from clsplat.terminal import aligned
 
 if TYPE_CHECKING:
     from clsplat.reference.project import Projected
@@ -245,7 +246,7 @@ def settings_table(result: dict[str, Any]) -> str:
         f"error against {result['error_is_against']}; exact against float64 on {width}x{height} pixels: "
         f"{known['psnr']:.1f} dB, {known['max_abs']:.2g}"
     )
-    lines = [*columns(rows), "", note]
+    lines = [*aligned(rows), "", note]
     if (faster := result["exact_switches_faster"]) is not None:
         each = f"a frame {faster['frame']:.2f} times faster, a training step {faster['iteration']:.2f} times"
         lines.append(f"the exact switches together: {each}")

@@ -30,6 +30,7 @@ from clsplat.scenes.scene import Scene, View
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.stages.limit import Limits, measure_limits
+from clsplat.terminal import aligned
 from clsplat.training.trainer import Trainer
 
 FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")
@@ -245,20 +246,8 @@ def table(result: dict[str, Any]) -> str:
                 "" if rate is None else f"{row['share_of_arithmetic']:.0%}",
             )
         )
-    lines += columns(rows)
+    lines += aligned(rows)
     note = "ms by events" if result["timer"] == "events" else "ms by wall time: the driver's events have none"
     times = f"frame {result['frame_ms']:.2f} ms, training step {result['iteration_ms']:.2f} ms"
     load = f"load average {result['load_average'] or 0:.1f}"
     return "\n".join([*lines, "", f"{times}: medians of {result['repeat']}; {note}; {load}"])
-
-
-def columns(rows: list[tuple[str, ...]]) -> list[str]:
-    """Aligned: the first column to the left, the others to the right."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return [
-        "  ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]

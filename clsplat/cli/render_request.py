@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import clsplat
 from clsplat.camera import Camera
-from clsplat.cli.main import Render
+from clsplat.cli.render import Render
+from clsplat.cli.session import warn
 from clsplat.config.memory import parse_bytes
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig, VideoConfig
 from clsplat.config.rasterizer import RasterizerConfig
@@ -309,8 +309,3 @@ def reshaped(camera: Camera, width: int, height: int) -> Camera:
     middle = 0.5 * width + (camera.cx - 0.5 * camera.width) * scale
     fx, fy, cy = camera.fx * scale, camera.fy * scale, camera.cy * scale
     return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=middle, cy=cy)
-
-
-def warn(text: str) -> None:
-    """A line for the user, on standard error."""
-    print(f"clsplat: warning: {text}", file=sys.stderr)

@@ -1,52 +1,58 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat report` and `clsplat compare`: pages of runs, and the same figures as JSON."""
+"""`clsplat report`: the page of a run."""
 
 from __future__ import annotations
 
 import sys
 from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-from clsplat.cli.options import Compare, Report
+from tyro.conf import Positional, arg
+
+from clsplat.cli.options import Flag, OutputFile, Verb
+from clsplat.cli.session import Services, warn
 from clsplat.errors import InputError, plain
-from clsplat.files import check_new
-from clsplat.runs.locks import locked
-from clsplat.runs.run import Run
 
 
-def report(verb: Report) -> int:
-    """Write the page of a run."""
+@dataclass(frozen=True)
+class Report(Verb):
+    """Write a run's report: one HTML file with curves, pictures, figures and settings, that loads nothing else.
+
+    docs/report.md says what is in it. A run that is not finished has a report too.
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A run's folder."""
+    output: OutputFile = None
+    """The file; report.html in the run's folder if not given."""
+    overwrite: Flag = False
+    """Replace the file of --output that is there."""
+    views: int = 8
+    """Number of held-out views that are shown with pictures, at most: the worst, the best and some between. The table
+    has all views."""
+    json: Flag = False
+    """Print the figures as JSON."""
+
+
+def run(verb: Report, _: Services) -> int:
+    """Write the page."""
+    from clsplat.files import check_new
+    from clsplat.report.page import json_text, write_report
+    from clsplat.runs.locks import locked
+    from clsplat.runs.run import Run
+
     run = Run.open(verb.run)
     if verb.views < 0:
         raise InputError(f"--views {verb.views}: expected at least 0")
     path = verb.output or run.path / "report.html"
     check_new(path, overwrite=verb.overwrite or verb.output is None)
-    from clsplat.report.page import json_text, write_report
-
     with nullcontext() if verb.output else locked(run.path, "report"):
         figures = write_report(run, path, views=verb.views)
     if verb.json:
         print(json_text(figures.document()))
     for note in figures.notes:
-        print(f"clsplat: warning: {plain(note)}", file=sys.stderr)
+        warn(plain(note))
     print(f"report in {path}", file=sys.stderr)
-    return 0
-
-
-def compare(verb: Compare) -> int:
-    """Print runs side by side, and write their page."""
-    if len(verb.runs) < 2:
-        raise InputError(f"{verb.runs[0]}: expected at least two runs to compare")
-    runs = [Run.open(path) for path in verb.runs]
-    if verb.output is not None:
-        check_new(verb.output, overwrite=verb.overwrite)
-    from clsplat.report.compare import compare_runs, comparison_table, write_comparison
-    from clsplat.report.page import json_text
-
-    found = compare_runs(runs)
-    if verb.output is not None:
-        write_comparison(found, verb.output)
-        print(f"page in {verb.output}", file=sys.stderr)
-    print(json_text(found.document()) if verb.json else comparison_table(found))
-    for note in found.notes:
-        print(f"clsplat: warning: {plain(note)}", file=sys.stderr)
     return 0

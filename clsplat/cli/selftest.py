@@ -5,24 +5,49 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Annotated
 
-from clsplat.cli.main import Selftest
-from clsplat.device.advice import no_device
-from clsplat.device.context import DeviceInfo, find_device, list_devices
-from clsplat.selftest.result import Result
-from clsplat.selftest.trust import Report, examine_device
+from tyro.conf import arg
+
+from clsplat.cli.options import Flag, Verb
+from clsplat.cli.session import Services
+from clsplat.terminal import aligned
+
+if TYPE_CHECKING:
+    from clsplat.device.context import DeviceInfo
+    from clsplat.selftest.result import Result
+    from clsplat.selftest.trust import Report
 
 HEADER = ("stage", "worst error", "ulp", "allowed", "bits", "ms", "worst in")
 
 
-def selftest(verb: Selftest) -> int:
+@dataclass(frozen=True)
+class Selftest(Verb):
+    """Test every device: build the kernels, run each stage on frozen scenes, compare with float64 and stored digests.
+
+    Exit status 1 where a driver cannot be trusted. train, eval, render, view, bench, demo and, where it renders,
+    convert make a short form of this test the first time they meet a device; CLSPLAT_TRUST_DRIVER=1 leaves that out. A
+    shape of the kernels in which a driver failed is tried anew here.
+    """
+
+    device: Annotated[str | None, arg(metavar="DEVICE")] = "all"
+    """all, or one of them: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them."""
+    json: Flag = False
+    """Print the result as JSON."""
+
+
+def run(verb: Selftest, _: Services) -> int:
     """Test the devices one after the other; 1 if one of them cannot be trusted."""
-    found = list_devices() if verb.device in (None, "all") else [find_device(verb.device)]
-    if not found:
+    from clsplat.device.advice import no_device
+    from clsplat.device.context import find_device, list_devices
+    from clsplat.selftest.trust import examine_device
+
+    devices = list_devices() if verb.device in (None, "all") else [find_device(verb.device)]
+    if not devices:
         raise no_device()
     reports: list[Report] = []
-    for info in found:
+    for info in devices:
         if not verb.json:
             print(f"{'' if not reports else chr(10)}{info.index}: {name_of(info)}, {info.shape}", flush=True)
         report = examine_device(info.index)
@@ -33,11 +58,11 @@ def selftest(verb: Selftest) -> int:
             if report.remembered:
                 print(f"The shape is not used all the same: {report.remembered}.", flush=True)
     if verb.json:
-        print(json.dumps([record(info, report) for info, report in zip(found, reports, strict=True)], indent=2))
-    failed = [name_of(info) for info, report in zip(found, reports, strict=True) if report.failure]
+        print(json.dumps([record(info, report) for info, report in zip(devices, reports, strict=True)], indent=2))
+    failed = [name_of(info) for info, report in zip(devices, reports, strict=True) if report.failure]
     if failed:
         print(
-            f"clsplat: error: {len(failed)} of {len(found)} drivers cannot be trusted: {'; '.join(failed)}",
+            f"clsplat: error: {len(failed)} of {len(devices)} drivers cannot be trusted: {'; '.join(failed)}",
             file=sys.stderr,
         )
     return 1 if failed else 0
@@ -69,15 +94,7 @@ def table(report: Report) -> str:
     rows += [_row(result) for result in report.results]
     done = {result.stage for result in report.results}
     rows += [(name, "not run", "", "", "", "", "") for name in report.wanted if name not in done]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADER))]
-    lines = []
-    for row in rows:
-        cells = [
-            cell.ljust(w) if i in (0, 4, 6) else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)
+    return "\n".join(aligned(rows, left=(0, 4, 6)))
 
 
 def _row(result: Result) -> tuple[str, ...]:

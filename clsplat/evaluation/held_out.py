@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,25 +17,12 @@ from clsplat.files import identity
 from clsplat.images.alpha import Image, composite
 from clsplat.images.colour import displayed
 from clsplat.images.writing import write_image
-
-
-class EvaluatedView(Protocol):
-    """The members of a view that evaluation uses, `clsplat.scenes.scene.View` for one."""
-
-    @property
-    def name(self) -> str: ...
-
-    def load(self) -> Image:
-        """(H, W, 3) or, with straight alpha, (H, W, 4); float in [0, 1] or an integer type."""
-        ...
-
-
-ViewT = TypeVar("ViewT", bound=EvaluatedView)
+from clsplat.scenes.scene import View
 
 
 def evaluate(
-    render: Callable[[ViewT], Image],
-    views: Sequence[ViewT],
+    render: Callable[[View], Image],
+    views: Sequence[View],
     background: ArrayLike,
     save_dir: Path | None = None,
     *,

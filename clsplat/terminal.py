@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress on standard error: a live bar on a terminal, a plain line every ten seconds elsewhere."""
+"""Text for the terminal: tables, and progress as a live bar, or as a plain line every ten seconds elsewhere."""
 
 from __future__ import annotations
 
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from types import TracebackType
-from typing import Any, Literal, Protocol, TextIO
+from typing import Any, Literal, TextIO
 
 PLAIN_INTERVAL = 10.0
 """Seconds between plain lines."""
@@ -17,23 +17,8 @@ SMOOTHING = 0.1
 """Weight of the newest report in the shown PSNR and loss, which jump from view to view."""
 
 
-class StepReport(Protocol):
-    """The figures shown of a training step, `clsplat.training.loop.StepReport` for one; seconds: of training so far."""
-
-    @property
-    def step(self) -> int: ...
-    @property
-    def loss(self) -> float: ...
-    @property
-    def psnr(self) -> float: ...
-    @property
-    def gaussians(self) -> int: ...
-    @property
-    def seconds(self) -> float: ...
-
-
 class TrainProgress:
-    """A context manager; call it with each `StepReport`, every step or now and then.
+    """A context manager; call it with each `training.loop.StepReport`, every step or now and then.
 
     total: the last step; stream: standard error unless given; clock: seconds, for tests.
     """
@@ -44,8 +29,8 @@ class TrainProgress:
 
         self.total, self.clock = total, clock
         self.stream = stream if stream is not None else sys.stderr
-        self.first: StepReport | None = None
-        self.last: StepReport | None = None
+        self.first: Any = None
+        self.last: Any = None
         self.loss, self.psnr = 0.0, 0.0
         self.printed_at, self.printed_step = clock(), -1
         self.live: Progress | None = None
@@ -69,7 +54,7 @@ class TrainProgress:
         elif self.last is not None and self.last.step != self.printed_step:
             self._print_line()
 
-    def __call__(self, report: StepReport) -> None:
+    def __call__(self, report: Any) -> None:
         if self.first is None:
             self.first = report
             self.loss, self.psnr = report.loss, report.psnr
@@ -85,10 +70,9 @@ class TrainProgress:
         """Steps a second since the first report; 0 before there are two."""
         if self.first is None or self.last is None or self.last.seconds <= self.first.seconds:
             return 0.0
-        return (self.last.step - self.first.step) / (self.last.seconds - self.first.seconds)
+        return float((self.last.step - self.first.step) / (self.last.seconds - self.first.seconds))
 
     def _numbers(self) -> str:
-        assert self.last is not None
         numbers = (
             f"step {self.last.step}/{self.total}  loss {self.loss:.4f}  PSNR {self.psnr:.2f}  "
             f"{self.last.gaussians:,} Gaussians"
@@ -97,7 +81,6 @@ class TrainProgress:
         return f"{numbers}  {rate:.{1 if rate >= 1 else 3}f} steps/s" if rate > 0 else numbers
 
     def _print_line(self) -> None:
-        assert self.last is not None
         rate = self.rate()
         left = f"  {duration((self.total - self.last.step) / rate)} left" if rate > 0 else ""
         with suppress(OSError):  # its reader has gone: a training goes on, or comes to its checkpoint
@@ -129,27 +112,8 @@ class StageProgress:
             self.stage, self.printed_at = stage, now
 
 
-class FrameRecord(Protocol):
-    """The figures shown of a frame, `clsplat.sequence.task.Record` for one; seconds: time that it took."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def frame(self) -> int: ...
-    @property
-    def path(self) -> str: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def seconds(self) -> float: ...
-    @property
-    def skipped(self) -> bool: ...
-
-
 class FrameProgress:
-    """A context manager; call it with each `FrameRecord` when its file is complete.
+    """A context manager; call it with each `sequence.task.Record` when its file is complete.
 
     total: frames, skipped ones too; style: auto, a bar on standard error where that is a terminal, and a line for each
     frame written on `lines` unless that is None or both are one terminal; json, an object a line there; openjd, what
@@ -192,7 +156,7 @@ class FrameProgress:
         if self.live is not None:
             self.live.stop()
 
-    def __call__(self, record: FrameRecord) -> None:
+    def __call__(self, record: Any) -> None:
         self.done += 1
         if self.live is not None:
             self.live.update(self.task, completed=self.done, description=f"frame {record.frame}")
@@ -217,3 +181,13 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
+    """A line for each row. The columns `left` are aligned to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    sides = ["<" if index in left else ">" for index in range(len(widths))]
+    return [
+        "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)).rstrip()
+        for row in rows
+    ]

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat bench`: the time of each stage."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from clsplat.cli.options import DeviceOptions, Flag, Verb, with_given
+from clsplat.cli.session import Services
+from clsplat.config.memory import parse_bytes
+from clsplat.config.presets import PRESETS, Preset
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.errors import InputError
+
+
+@dataclass(frozen=True)
+class Bench(Verb):
+    """Measure each stage of a frame and of a training step, and the device's own limits in the same run.
+
+    docs/performance.md says what the figures mean.
+    """
+
+    source: Annotated[Positional[Path | None], arg(metavar="SCENE|RUN|MODEL")] = None
+    """A scene as training starts it, a run, or a model file; a made-up scene if not given."""
+    gaussians: int = 200_000
+    """Gaussians of the made-up scene."""
+    size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
+    """Size of the frame in pixels. If not given: the camera's, or 1024x768 for the made-up scene."""
+    repeat: int = 5
+    """Measurements of each kind of frame and step; the median of their times is printed."""
+    preset: Preset = "default"
+    """Bundle of rasterizer settings: exact and default approximate nothing, fast does a little. A --rasterizer flag
+    overrides it."""
+    plot: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Measure every setting of the rasterizer too, and draw two plots, .svg or .png. For NAME.svg: NAME-switches.svg,
+    what each exact switch is worth, and NAME-error.svg, time against error of the approximate settings."""
+    overwrite: Flag = False
+    """Replace plots that are there."""
+    device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
+    json: Flag = False
+    """Print the result as JSON."""
+    rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
+
+    def completed(self, given: Collection[str]) -> Bench:
+        """The rasterizer's settings are those of the preset."""
+        return replace(self, rasterizer=with_given(PRESETS[self.preset], self.rasterizer, given, "rasterizer."))
+
+
+def run(verb: Bench, services: Services) -> int:
+    """Measure. What can be wrong with the call is found before anything is."""
+    from clsplat.bench import settings as tradeoff
+    from clsplat.bench import stages as bench_stages
+    from clsplat.bench import subject as bench_subject
+    from clsplat.bench.plots import check_plot, plot_files, plot_settings
+    from clsplat.device.context import Device, select
+    from clsplat.files import check_new
+    from clsplat.terminal import StageProgress
+
+    size, limit = parse_size(verb.size), parse_bytes(verb.device.max_device_mem)
+    if verb.gaussians < 1:
+        raise InputError(f"--gaussians {verb.gaussians}: expected at least 1")
+    if verb.repeat < 1:
+        raise InputError(f"--repeat {verb.repeat}: expected at least 1")
+    verb.rasterizer.check()
+    if verb.plot is not None:
+        check_plot(verb.plot)
+        for file in plot_files(verb.plot):
+            check_new(file, overwrite=verb.overwrite)
+    if verb.source is not None and not verb.source.exists():
+        raise InputError(f"{verb.source}: no such file or folder, expected a scene, a run or a model file")
+    progress = StageProgress()
+    device = services.require(Device(select(verb.device.selector), profile=True))
+    device.memory.limit = limit
+    most = int(device.cl_device.global_mem_size) // bench_stages.GAUSSIAN_BYTES
+    if verb.source is None and verb.gaussians > most:
+        raise InputError(f"--gaussians {verb.gaussians}: expected at most {most}, which fill {device.name}'s memory")
+    if verb.source is None:
+        subject = bench_subject.synthetic(verb.gaussians, *(size or (1024, 768)))
+    else:
+        subject = bench_subject.load_subject(verb.source, size, progress)
+    result = bench_stages.bench(subject, device, verb.rasterizer, repeat=verb.repeat, progress=progress)
+    if verb.plot is not None:
+        result["settings"] = tradeoff.compare(subject, device, repeat=verb.repeat, progress=progress)
+        size_text = f"{result['width']}x{result['height']}, {result['gaussians']:,} Gaussians"
+        title = f"{subject.name}, {size_text}\n{device.name}, {device.driver.split('  ')[0]}"
+        for file in plot_settings(verb.plot, result["settings"], title):
+            print(f"plot in {file}", file=sys.stderr)
+    if verb.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    print(bench_stages.table(result))
+    if "settings" in result:
+        print("\n" + tradeoff.settings_table(result["settings"]))
+    return 0
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """(width, height) of WIDTHxHEIGHT. Raises InputError."""
+    if text is None:
+        return None
+    words = text.split("x")
+    if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
+        raise InputError(f"--size {text}: expected a width and a height in pixels such as 1024x768")
+    return int(words[0]), int(words[1])

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat compare`: runs side by side."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from clsplat.cli.options import Flag, OutputFile, Verb
+from clsplat.cli.session import Services, warn
+from clsplat.errors import InputError, plain
+
+
+@dataclass(frozen=True)
+class Compare(Verb):
+    """Print runs side by side: scores, Gaussians, times, and the settings that differ."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN")]
+    """Folders of runs, two or more."""
+    output: OutputFile = None
+    """Write a page too, with the curves overlaid and time against error: one HTML file that loads nothing else."""
+    overwrite: Flag = False
+    """Replace the page that is there."""
+    json: Flag = False
+    """Print JSON instead of the table."""
+
+
+def run(verb: Compare, _: Services) -> int:
+    """Print runs side by side, and write their page."""
+    from clsplat.files import check_new
+    from clsplat.report.compare import compare_runs, comparison_table, write_comparison
+    from clsplat.report.page import json_text
+    from clsplat.runs.run import Run
+
+    if len(verb.runs) < 2:
+        raise InputError(f"{verb.runs[0]}: expected at least two runs to compare")
+    runs = [Run.open(path) for path in verb.runs]
+    if verb.output is not None:
+        check_new(verb.output, overwrite=verb.overwrite)
+    comparison = compare_runs(runs)
+    if verb.output is not None:
+        write_comparison(comparison, verb.output)
+        print(f"page in {verb.output}", file=sys.stderr)
+    print(json_text(comparison.document()) if verb.json else comparison_table(comparison))
+    for note in comparison.notes:
+        warn(plain(note))
+    return 0

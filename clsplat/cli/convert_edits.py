@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Edits of `clsplat convert`, and its measurement on a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import Camera
+from clsplat.cli.convert import Convert
+from clsplat.cli.options import DeviceOptions
+from clsplat.cli.session import Services, load_scene, warn
+from clsplat.errors import InputError
+from clsplat.evaluation.metrics import psnr
+from clsplat.files import is_file, read_document
+from clsplat.gaussians import Gaussians
+from clsplat.images import colour
+from clsplat.images.alpha import background_colour, composite
+from clsplat.models import edit
+from clsplat.rendering.contributions import largest_contributions
+from clsplat.selftest.result import FORWARD
+from clsplat.shots import choose_shot
+
+MAX_MATRIX = 1 << 16
+"""Bytes of a file with a matrix."""
+NamedModel = tuple[Path, Gaussians]
+
+
+def edited(
+    verb: Convert, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
+) -> Gaussians:
+    """The source's Gaussians after all edits, in the order that --help names. Raises InputError where none is left."""
+    gaussians = source[1]
+    if others:
+        for other in others:
+            _warn_of_mismatch(other, source)
+        gaussians = edit.merge([gaussians, *(other for _, other in others)])
+    gaussians = _thinned(verb, services, gaussians)
+    if matrix is not None:
+        gaussians = edit.transform(gaussians, matrix)
+    return gaussians if verb.drop_sh is None else edit.drop_sh(gaussians, verb.drop_sh)
+
+
+def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
+    """Warn where a model that is merged is in another colour space, or far from the source."""
+    (path, other), (first_path, first) = merged, source
+    space, expected = colour.recorded_space(path), colour.recorded_space(first_path)
+    if space != expected:
+        warn(
+            f"--merge {path}: its colours are of {space}, those of {first_path} of {expected}, as which all will count"
+        )
+    distance = float(np.linalg.norm(other.origin - first.origin))
+    if len(other) and distance > edit.FAR * float(other.means.std(axis=0).max()):
+        step = float(np.spacing(np.float32(distance)))
+        warn(
+            f"--merge {path}: counts from a place {distance:.6g} world units from that of {first_path}; its positions "
+            f"are rounded to {step:.2g}. Is only one of the two georeferenced?"
+        )
+
+
+def similarity(verb: Convert) -> Float64 | None:
+    """--transform, then --scale, as one (4, 4); None without them. Raises InputError."""
+    if verb.transform is None and verb.scale is None:
+        return None
+    matrix = np.eye(4) if verb.transform is None else _matrix(verb.transform)
+    try:
+        edit.decompose(matrix)
+    except InputError as error:
+        raise InputError(f"--transform {verb.transform}: {error}") from None
+    return matrix if verb.scale is None else edit.scaling(verb.scale) @ matrix
+
+
+def _matrix(text: str) -> Float64:
+    words = text
+    if is_file(text):
+        words = read_document(Path(text), "a text file of 16 numbers", MAX_MATRIX)
+    return np.array(_numbers("transform", words, 16)).reshape(4, 4)
+
+
+def _numbers(flag: str, text: str, count: int) -> list[float]:
+    """Finite numbers with commas or blanks between them, brackets passed over. Raises InputError."""
+    words = text.translate(str.maketrans("[],;", "    ")).split()
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(isfinite, values)):
+        raise InputError(f"--{flag} {text[:80]}: expected {count} numbers with commas")
+    return values
+
+
+def _thinned(verb: Convert, services: Services, gaussians: Gaussians) -> Gaussians:
+    """Cropped and pruned. Raises InputError where nothing is left."""
+
+    def keep(flag: str, rows: Any) -> None:
+        nonlocal gaussians
+        if not rows.any():
+            raise InputError(f"--{flag}: none of the {len(gaussians):,} Gaussians is left")
+        gaussians = gaussians if rows.all() else edit.take(gaussians, rows)
+
+    if verb.crop is not None:
+        corners = _numbers("crop", verb.crop, 6)
+        if any(low > high for low, high in zip(corners[:3], corners[3:], strict=True)):
+            raise InputError(f"--crop {verb.crop}: expected X0 <= X1, Y0 <= Y1 and Z0 <= Z1")
+        keep("crop", edit.in_box(gaussians, corners[:3], corners[3:]))
+    if verb.crop_sphere is not None:
+        *centre, radius = _numbers("crop-sphere", verb.crop_sphere, 4)
+        keep("crop-sphere", edit.in_sphere(gaussians, centre, radius))
+    if verb.prune_opacity is not None:
+        keep("prune-opacity", edit.opaque(gaussians, verb.prune_opacity))
+    if verb.prune_contribution is not None:
+        keep("prune-contribution", _contributions(verb, services, gaussians) >= verb.prune_contribution)
+    return gaussians
+
+
+def _contributions(verb: Convert, services: Services, gaussians: Gaussians) -> Float32:
+    assert verb.cameras is not None
+    shot = choose_shot(verb.cameras)
+    for text in shot.warnings:
+        warn(text)
+    device = DeviceOptions(verb.device, verb.max_device_mem).trusted(services)
+    return largest_contributions(gaussians, shot.cameras, device)
+
+
+def measured(
+    verb: Convert, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
+) -> dict[str, Any]:
+    """PSNR in dB of the model as it was read and of the one that was written, against the photographs and against each
+    other: of each view, and the means. The cameras of the written model move along with it."""
+    device = DeviceOptions(verb.device, verb.max_device_mem).open(services)
+    assert verb.scene is not None
+    scene = load_scene(services, verb.scene, verb.resolution, verb.test_every)
+    renderer = services.renderer(services.require(device, FORWARD))
+    background = background_colour(verb.background)
+
+    def images(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Float32]:
+        return [renderer.render(gaussians, camera, background).image for camera in cameras]
+
+    views = scene.test_views or scene.views
+    cameras = [view.camera for view in views]
+    moved = cameras if matrix is None else [edit.transform_camera(camera, matrix) for camera in cameras]
+    records: list[dict[str, Any]] = []
+    for view, before, after in zip(views, images(original, cameras), images(read, moved), strict=True):
+        photograph = composite(view.load(), background)
+        scores = {"before": psnr(before, photograph), "after": psnr(after, photograph), "between": psnr(before, after)}
+        records.append({"name": view.name, **scores})
+    mean = {key: float(np.mean([record[key] for record in records])) for key in ("before", "after", "between")}
+    return {**mean, "least_between": min(record["between"] for record in records), "views": records}

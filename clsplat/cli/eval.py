@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat eval`: a model measured on held-out views."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import arg
+
+from clsplat.cli.options import DeviceOptions, Flag, OptionalInt, RunOrModel, ScenePath, Verb
+from clsplat.cli.session import Services, load_scene, warn
+from clsplat.config.training import TrainConfig
+from clsplat.errors import CapacityError, InputError, plain
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from clsplat.camera import Camera
+
+
+@dataclass(frozen=True)
+class Eval(Verb):
+    """Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS where the extra is installed.
+
+    Given a run, eval.json and test/ are written anew.
+    """
+
+    model: RunOrModel
+    """A run's folder or a model file; for a file in a run's folder that run's settings hold."""
+    scene: ScenePath = None
+    """Folder with the scene; the one the run was trained on if not given."""
+    test_every: OptionalInt = None
+    """Every n-th view by name is held out, and measured. If not given: the run's setting, else 8."""
+    resolution: OptionalInt = None
+    """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""
+    background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
+    """Background behind the Gaussians and behind images with alpha. If not given: the run's setting, else black."""
+    device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
+    json: Flag = False
+    """Print the result as JSON, as in eval.json."""
+
+
+def run(verb: Eval, services: Services) -> int:
+    """Measure. A run's folder is locked."""
+    from clsplat.runs.locks import locked
+    from clsplat.runs.run import is_run
+
+    with locked(verb.model, "eval") if is_run(verb.model) else nullcontext():
+        return _evaluate(verb, services)
+
+
+def _evaluate(verb: Eval, services: Services) -> int:
+    from clsplat import report
+    from clsplat.evaluation.held_out import evaluate
+    from clsplat.gaussians import Gaussians
+    from clsplat.images.alpha import background_colour
+    from clsplat.images.colour import recorded_space
+    from clsplat.report import last
+    from clsplat.runs import scene_record
+    from clsplat.runs.run import Run, is_run, model_file
+    from clsplat.scenes import doubts
+    from clsplat.selftest.result import FORWARD
+
+    file = model_file(verb.model)
+    given_run = Run.open(verb.model) if is_run(verb.model) else None
+    trained = given_run or (Run.open(verb.model.parent) if is_run(verb.model.parent) else None)
+    gaussians = Gaussians.load(file)
+    config = trained.config if trained else TrainConfig()
+    source = verb.scene or (trained.scene if trained else None)
+    if source is None:
+        raise InputError(f"{verb.model}: the scene it was trained on is not known, expected --scene SCENE")
+    resolution = config.resolution if verb.resolution is None else verb.resolution
+    test_every = config.test_every if verb.test_every is None else verb.test_every
+    device = verb.device.open(services)
+    scene = load_scene(services, source, resolution, test_every)
+    views = [view for view in scene.views if view.split == "test"]
+    if not views:
+        raise InputError(f"{source}: no view is held out with --test-every {test_every}")
+    device = services.require(device, FORWARD)
+    tell_of_lpips()
+    renderer = services.renderer(device, config=config.rasterizer)
+    background = background_colour(verb.background or config.background)
+
+    def draw(camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+        result = renderer.render(gaussians, camera, background)
+        return result.image, result.alpha
+
+    warnings = scene_record.of_evaluation(trained, views) if trained else []
+    with suppress(CapacityError):
+        warnings.append(doubts.of_pictures(draw, views, "held-out"))
+    for text in filter(None, warnings):
+        warn(plain(text))
+    model_record = given_run.model_record() if given_run else {}
+    result = evaluate(
+        lambda view: draw(view.camera)[0],
+        views,
+        background,
+        given_run.test_path if given_run else None,
+        step=model_record.get("step"),
+        gaussians=len(gaussians),
+        seconds=model_record.get("seconds"),
+        space=recorded_space(file),
+    )
+    if given_run:
+        given_run.write_eval(result)
+        if (given_run.path / report.NAME).exists():
+            last.write_last(given_run, scene, gaussians)
+    if verb.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    for record in result["views"]:
+        print(f"{record['name']}  {_scores(record)}")
+    print_summary(result)
+    return 0
+
+
+def tell_of_lpips() -> None:
+    """Say once, before the work, that there will be no LPIPS, and why."""
+    from clsplat.evaluation.metrics import prepare_lpips
+
+    if reason := prepare_lpips():
+        print(f"no LPIPS: {reason}", file=sys.stderr)
+
+
+def print_summary(result: dict[str, Any]) -> None:
+    """Print the mean scores of eval.json, where there are any."""
+    if result["views"]:
+        print(f"{len(result['views'])} held-out views  {_scores(result['mean'])}  {result['gaussians']:,} Gaussians")
+
+
+def _scores(record: dict[str, Any]) -> str:
+    names = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.4f}", "lpips": "LPIPS {:.4f}"}
+    return "  ".join(text.format(record[key]) for key, text in names.items() if key in record)

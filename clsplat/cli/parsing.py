@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line's verbs, and the parsing of their arguments by tyro."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Union, get_args, get_origin
+
+import tyro
+from tyro.conf import subcommand
+
+from clsplat.cli.options import Verb
+
+DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
+VERBS = (
+    "devices",
+    "demo",
+    "sfm",
+    "train",
+    "eval",
+    "render",
+    "view",
+    "report",
+    "compare",
+    "convert",
+    "info",
+    "bench",
+    "tune",
+    "selftest",
+)
+"""The verbs, as --help lists them. Each is a module of `clsplat.cli`, with a class of its name and a function `run`."""
+
+
+def verb_module(name: str) -> Any:
+    """The module of a verb: its arguments and its function."""
+    return import_module(f"clsplat.cli.{name}")
+
+
+def verb_class(name: str) -> type[Verb]:
+    """The arguments of a verb."""
+    kind: type[Verb] = getattr(verb_module(name), name.capitalize())
+    return kind
+
+
+def parse(arguments: Sequence[str]) -> Verb:
+    """The verb that the command line asks for. Raises InputError, and SystemExit with the trouble reported in one line,
+    or after the help has been printed."""
+    commands: Any = Union[tuple(Annotated[verb_class(name), subcommand(name)] for name in VERBS)]  # noqa: UP007
+    report = io.StringIO()
+    helping = not {"-h", "--help"}.isdisjoint(arguments)
+    try:
+        with _comma_separated(), contextlib.redirect_stderr(report), _columns(None if helping else 10_000):
+            verb: Verb = tyro.cli(commands, args=list(arguments), prog="clsplat", description=DESCRIPTION)
+    except SystemExit as error:
+        if error.code == 2:
+            tell(f"clsplat: error: {_unboxed(report.getvalue())}")
+        else:
+            sys.stderr.write(report.getvalue())
+        raise
+    flags = [word.partition("=")[0][2:].replace("-", "_") for word in arguments if word.startswith("--")]
+    return verb.completed({*flags, *(re.sub(r"(^|\.)no_", r"\1", flag) for flag in flags)})
+
+
+def _comma_separated() -> tyro.constructors.ConstructorRegistry:
+    """Lists of steps are written 500,1000,2000, tyro by itself wants spaces; a path that is empty, as a shell makes it
+    of a variable that is not set, is not the folder one is in."""
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.primitive_rule
+    def path(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        if info.type is not Path:
+            return None
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="PATH",
+            instance_from_str=lambda words: _path(words[0]),
+            is_instance=lambda value: isinstance(value, Path),
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    @registry.primitive_rule
+    def steps(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        if get_origin(info.type) is not tuple or not set(get_args(info.type)) <= {int, Ellipsis}:
+            return None
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="STEP,STEP,...",
+            instance_from_str=lambda words: _steps(words[0]),
+            is_instance=lambda value: isinstance(value, tuple),
+            str_from_instance=lambda value: [",".join(map(str, value))],
+        )
+
+    return registry
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise ValueError("the path is empty, expected a name")
+    return Path(text)
+
+
+def _steps(text: str) -> tuple[int, ...]:
+    try:
+        steps = tuple(int(word) for word in text.split(",") if word.strip())
+    except ValueError:
+        raise ValueError(f"{text!r} is not a list of steps, expected such as 500,1000,2000") from None
+    return steps
+
+
+@contextlib.contextmanager
+def _columns(count: int | None) -> Iterator[None]:
+    """Make the terminal look `count` columns wide: a report to be joined to one line must not be wrapped first."""
+    before = os.environ.get("COLUMNS")
+    if count is not None:
+        os.environ["COLUMNS"] = str(count)
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ["COLUMNS"] = before
+        elif count is not None:
+            del os.environ["COLUMNS"]
+
+
+def _unboxed(report: str) -> str:
+    """The message of one of tyro's boxes as one line: its frame and its further advice taken off."""
+    words: list[str] = []
+    titled = "╭" in report  # else, where standard output is not UTF-8, the first rule is below the title
+    for line in report.splitlines():
+        text = line.strip("│ ").strip()
+        if text.startswith("╭") or not text:
+            continue
+        if text.startswith(("─", "╰")) or not text.strip("-"):
+            if titled:
+                break
+            titled = True
+            words.clear()
+        else:
+            words.append(text)
+    return " ".join(" ".join(words).split()) or "the call is wrong, see clsplat --help"
+
+
+def tell(line: str) -> None:
+    """Print on standard error, if that takes it: the status says the same."""
+    try:
+        print(line, file=sys.stderr, flush=True)
+    except OSError:  # what is left of it would make the interpreter end with a status of its own
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())

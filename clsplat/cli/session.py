@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The surroundings of a verb: the services it calls, and its warnings."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clsplat.terminal import StageProgress
+
+if TYPE_CHECKING:
+    from clsplat.device.context import Device
+    from clsplat.gaussians import Gaussians
+    from clsplat.rendering.renderer import Renderer
+    from clsplat.scenes.scene import Scene
+
+
+def imported(name: str) -> Callable[..., Any]:
+    """The function of this dotted name, imported when it is called: --help must be quick."""
+    module, _, member = name.rpartition(".")
+
+    def call(*arguments: Any, **named: Any) -> Any:
+        return getattr(import_module(module), member)(*arguments, **named)
+
+    return call
+
+
+@dataclass(frozen=True)
+class Services:
+    """The functions of the package that compute for the verbs. Tests hand in others."""
+
+    load_scene: Callable[..., Scene] = imported("clsplat.scenes.scene.load_scene")
+    open_device: Callable[..., Device] = imported("clsplat.device.context.open_device")
+    require: Callable[..., Device] = imported("clsplat.selftest.trust.require")
+    reconstruct: Callable[..., Path] = imported("clsplat.scenes.sfm.reconstruct")
+    train: Callable[..., Gaussians] = imported("clsplat.api.train")
+    renderer: Callable[..., Renderer] = imported("clsplat.rendering.renderer.Renderer")
+    open_shader: Callable[..., Any] = imported("clsplat.sequence.frame_renderer.open_shader")
+    run_demo: Callable[..., dict[str, Any]] = imported("clsplat.demo.run.run_demo")
+
+
+def load_scene(services: Services, path: Path, resolution: int, test_every: int) -> Scene:
+    """The scene, with its warnings printed."""
+    scene = services.load_scene(path, resolution=resolution, test_every=test_every, progress=StageProgress())
+    for text in scene.warnings:
+        warn(text)
+    return scene
+
+
+def warn(text: str) -> None:
+    """Print a warning on standard error."""
+    print(f"clsplat: warning: {text}", file=sys.stderr)

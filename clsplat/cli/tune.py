@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat tune`: the quickest shape of the kernels for a device."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict, dataclass, field
+from typing import Annotated
+
+from tyro.conf import arg
+
+from clsplat.cli.options import DeviceChoice, Flag, Verb
+from clsplat.cli.session import Services
+
+
+@dataclass(frozen=True)
+class Tune(Verb):
+    """Find the quickest shape of the kernels for a device by a short trial, and keep it for later runs.
+
+    A shape is how many pixels a kernel works on at once, and how many work-items share a tile. A run that is resumed,
+    or repeated for the same bytes, wants the shape that it had. CLSPLAT_SHAPE=LANESxITEMS overrides what is kept.
+    """
+
+    device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
+    forget: Flag = False
+    """Go back to the default shape, without a trial."""
+    json: Flag = False
+    """Print the result as JSON."""
+
+
+def run(verb: Tune, _: Services) -> int:
+    """Print what each shape of the kernels takes, and keep the quickest."""
+    from clsplat.bench.shapes import tune
+    from clsplat.device.context import all_devices, find_device
+    from clsplat.device.shapes import default_shape, save_shape, saved_path
+
+    info = find_device(verb.device.selector)
+    device = all_devices()[info.index]
+    if verb.forget:
+        save_shape(device, None)
+        print(f"{info.name} ({info.version.split('  ')[0]}): the default, {default_shape(device)}", file=sys.stderr)
+        return 0
+    trials, best = tune(
+        device, info.index, lambda shape: print(f"trying {shape.lanes} lanes x {shape.items} items", file=sys.stderr)
+    )
+    if verb.json:
+        records = [{"lanes": trial.shape.lanes, "items": trial.shape.items, "ms": trial.ms} for trial in trials]
+        document = {"device": info.name, "version": info.version, "best": asdict(best), "trials": records}
+        print(json.dumps(document, indent=2))
+        return 0
+    for trial in trials:
+        text = "failed" if trial.ms is None else f"{trial.ms:8.2f} ms"
+        mark = "  <- kept" if trial.shape == best else ""
+        print(f"{trial.shape.lanes:2d} lanes x {trial.shape.items:3d} items  {text}{mark}")
+    print(f"in {saved_path()}", file=sys.stderr)
+    return 0
