@@ -8,8 +8,12 @@ import sys
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from types import TracebackType
-from typing import Any, Literal, TextIO
+from typing import TYPE_CHECKING, Any, Literal, TextIO, TypeVar
+
+from typing_extensions import Self
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 PLAIN_INTERVAL = 10.0
 """Seconds between plain lines."""
@@ -17,41 +21,53 @@ SMOOTHING = 0.1
 """Weight of the newest report in the shown PSNR and loss, which jump from view to view."""
 
 
-class TrainProgress:
-    """A context manager; call it with each `training.loop.StepReport`, every step or now and then.
+BarT = TypeVar("BarT", bound="_Bar")
+
+
+class _Bar:
+    """A context manager with a live bar where the stream is a terminal; `live` is None elsewhere."""
+
+    live: Progress | None = None
+
+    def __init__(self, stream: TextIO, description: str, total: int, *, counted: bool = False) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        if stream.isatty():
+            count = [MofNCompleteColumn()] if counted else []
+            columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *count, TimeRemainingColumn())
+            self.live = Progress(*columns, console=Console(file=stream), refresh_per_second=4, speed_estimate_period=60)
+            self.task = self.live.add_task(description, total=total)
+
+    def __enter__(self) -> Self:
+        if self.live is not None:
+            self.live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.live is not None:
+            with suppress(OSError):
+                self.live.stop()
+
+
+class TrainProgress(_Bar):
+    """Progress of a training; call it with each `training.loop.StepReport`, every step or now and then.
 
     total: the last step; stream: standard error unless given; clock: seconds, for tests.
     """
 
     def __init__(self, total: int, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
         self.total, self.clock = total, clock
         self.stream = stream if stream is not None else sys.stderr
+        super().__init__(self.stream, f"step 0/{total}", total)
         self.first: Any = None
         self.last: Any = None
         self.loss, self.psnr = 0.0, 0.0
         self.printed_at, self.printed_step = clock(), -1
-        self.live: Progress | None = None
-        if self.stream.isatty():
-            columns = (TextColumn("{task.fields[numbers]}"), BarColumn(bar_width=None), TimeRemainingColumn())
-            console = Console(file=self.stream)
-            self.live = Progress(*columns, console=console, refresh_per_second=4, speed_estimate_period=60)
-            self.task = self.live.add_task("train", total=total, numbers=f"step 0/{total}")
 
-    def __enter__(self) -> TrainProgress:  # noqa: PYI034  # Self came with 3.11
-        if self.live is not None:
-            self.live.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self.live is not None:
-            with suppress(OSError):
-                self.live.stop()
-        elif self.last is not None and self.last.step != self.printed_step:
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        if self.live is None and self.last is not None and self.last.step != self.printed_step:
             self._print_line()
 
     def __call__(self, report: Any) -> None:
@@ -62,7 +78,7 @@ class TrainProgress:
         self.loss += SMOOTHING * (report.loss - self.loss)
         self.psnr += SMOOTHING * (report.psnr - self.psnr)
         if self.live is not None:
-            self.live.update(self.task, completed=report.step, numbers=self._numbers())
+            self.live.update(self.task, completed=report.step, description=self._numbers())
         elif self.clock() - self.printed_at >= PLAIN_INTERVAL:
             self._print_line()
 
@@ -112,8 +128,8 @@ class StageProgress:
             self.stage, self.printed_at = stage, now
 
 
-class FrameProgress:
-    """A context manager; call it with each `sequence.task.Record` when its file is complete.
+class FrameProgress(_Bar):
+    """Progress of frames; call it with each `sequence.task.Record` when its file is complete.
 
     total: frames, skipped ones too; style: auto, a bar on standard error where that is a terminal, and a line for each
     frame written on `lines` unless that is None or both are one terminal; json, an object a line there; openjd, what
@@ -128,33 +144,11 @@ class FrameProgress:
         lines: TextIO | None = None,
         stream: TextIO | None = None,
     ) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
         self.total, self.style, self.lines, self.done = total, style, lines, 0
-        stream = stream if stream is not None else sys.stderr
-        self.live: Progress | None = None
-        if style == "auto" and stream.isatty():
-            columns = (
-                TextColumn("{task.description}"),
-                BarColumn(bar_width=None),
-                MofNCompleteColumn(),
-                TimeRemainingColumn(),
-            )
-            self.live = Progress(*columns, console=Console(file=stream), refresh_per_second=4, speed_estimate_period=60)
-            self.task = self.live.add_task("frames", total=total)
-            self.lines = None if lines is not None and lines.isatty() else lines
-
-    def __enter__(self) -> FrameProgress:  # noqa: PYI034  # as above
-        if self.live is not None:
-            self.live.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self.live is not None:
-            self.live.stop()
+        if style == "auto":
+            super().__init__(stream if stream is not None else sys.stderr, "frames", total, counted=True)
+        if self.live is not None and lines is not None and lines.isatty():
+            self.lines = None
 
     def __call__(self, record: Any) -> None:
         self.done += 1

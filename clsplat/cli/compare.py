@@ -31,8 +31,8 @@ class Compare(Verb):
 
 def run(verb: Compare, _: Services) -> int:
     """Print runs side by side, and write their page."""
-    from clsplat.files import check_new
-    from clsplat.report.compare import compare_runs, comparison_table, write_comparison
+    from clsplat.files import atomic_write, check_new
+    from clsplat.report.compare import compare_runs, comparison_page, comparison_table
     from clsplat.report.page import json_text
     from clsplat.runs.run import Run
 
@@ -43,7 +43,7 @@ def run(verb: Compare, _: Services) -> int:
         check_new(verb.output, overwrite=verb.overwrite)
     comparison = compare_runs(runs)
     if verb.output is not None:
-        write_comparison(comparison, verb.output)
+        atomic_write(verb.output, comparison_page(comparison).encode("utf-8", "replace"))
         print(f"page in {verb.output}", file=sys.stderr)
     print(json_text(comparison.document()) if verb.json else comparison_table(comparison))
     for note in comparison.notes:

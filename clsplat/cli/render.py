@@ -158,7 +158,7 @@ def run(verb: Render, services: Services) -> int:
     shaders = []
     if not job.on_farm:
         how: dict[str, Any] = {"memory_limit": job.memory_limit, "profile": verb.profile}
-        model = (job.gaussians, job.options, job.rasterizer)
+        model = (job.gaussians, job.options, job.verb.rasterizer)
         shaders = [services.open_shader(*model, device=selector, **how) for selector in job.devices]
         for shader in shaders:
             shader.check(job.tasks)
@@ -221,7 +221,7 @@ def _on_farm(job: Job, tasks: Sequence[Task], done: Callable[[Record], None], vi
     if verb.profile:
         warn("--profile is not used: it is for devices of this process")
     model = str(job.model.absolute())
-    scene = Scene(model, job.digest, job.options, job.rasterizer, job.devices[0], job.memory_limit)
+    scene = Scene(model, job.digest, job.options, job.verb.rasterizer, job.devices[0], job.memory_limit)
     render_on_farm(tasks, scene, done, scheduler=verb.scheduler, workers=verb.workers, video=video)
 
 

@@ -4,22 +4,27 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clsplat.cli.render_request import Job, frames_there
 from clsplat.config.pictures import FPS
+from clsplat.device.context import open_device
 from clsplat.errors import amount, examples
+from clsplat.frame.deep_exr import deep_rows
 from clsplat.frame.draw import COLOUR, renderer_channels
+from clsplat.frame.strips import strip_rows
 from clsplat.frame.supersample import finer
 from clsplat.frame.window import crop, on_tiles
+from clsplat.rendering.memory_needs import plan_frame
+from clsplat.rendering.memory_plan import Plan
+from clsplat.rendering.renderer import held_sh
 from clsplat.sequence import workers
 from clsplat.sequence.task import picture_camera
 from clsplat.shots.frame_numbers import ranges
-
-if TYPE_CHECKING:
-    from clsplat.camera import Camera
-    from clsplat.rendering.memory_plan import Plan
+from clsplat.stages.channels import Features
+from clsplat.stages.deep import DEEP_FLOATS
 
 
 @dataclass(frozen=True)
@@ -34,48 +39,23 @@ class DevicePlan:
 
 def dry_run(job: Job) -> int:
     """Print the plan. Raises DeviceError, and CapacityError where a frame does not fit."""
-    verb, tasks, options = job.verb, job.tasks, job.options
-    there = frames_there(job)
-    plans = [] if job.on_farm else [plan_of(job, device) for device in job.devices]
-    if job.verb.json:
-        print(json.dumps(document(job, there, plans), indent=2))
-        return 0
-    _, held = workers.frames_ahead(tasks, options, len(job.devices))
-    host = held * max(workers.frame_bytes(task, options) for task in tasks)
-    print(f"model     {job.model}: {len(job.gaussians):,} Gaussians, SHA-256 {job.digest[:12]}")
-    cameras = [picture_camera(task, options) for task in tasks]
-    print(f"frames    {len(tasks)}: {ranges([task.number for task in tasks])}; {examples(_sizes(cameras))}")
-    print(f"files     {tasks[0].path}" + (f" to {tasks[-1].path}" if tasks[-1].path != tasks[0].path else ""))
-    if job.is_video:
-        from clsplat.images.video import rate_of
-
-        print(f"video     {rate_of(job.video.fps or FPS)} frames a second")
-    deep = f" in {options.deep.bins} slices by depth" if options.deep else ""
-    print(f"channels  {', '.join(options.channels)}{deep}")
-    model, output = job.spaces
-    print(f"colour    {model}" + (f" to {output}" if output != model else ""))
-    if samples := _samples(job):
-        print(f"samples   {samples}")
-    for each in plans:
-        strips = f"; {each.strips} strips a frame" if each.strips > 1 else ""
-        print(f"device    {each.device}: {each.plan}{strips}")
-    print(f"host      about {amount(host)} for frames that wait to be written")
-    if verb.skip_existing:
-        listed = f": {ranges(sorted(there))}" if there else ""
-        print(f"skipped   {len(there)}{listed}")
+    plans = [] if job.on_farm else [_device_plan(job, selector) for selector in job.devices]
+    document = _document(job, plans)
+    print(json.dumps(document, indent=2) if job.verb.json else "\n".join(_lines(job, document, plans)))
     return 0
 
 
-def document(job: Job, there: set[int], plans: list[DevicePlan]) -> dict[str, Any]:
-    """The plan for JSON. there: numbers of the frames that are left out."""
+def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
+    """The plan for --json."""
     tasks, options = job.tasks, job.options
-    writers, held = workers.frames_ahead(tasks, options, len(job.devices))
+    skipped = frames_there(job)
+    writers, waiting = workers.frames_ahead(tasks, options, len(job.devices))
     model, output = job.spaces
     frames = []
     for task in tasks:
         camera = picture_camera(task, options)
         frame = {"name": task.name, "frame": task.number, "path": str(task.path)}
-        frame |= {"width": camera.width, "height": camera.height, "skipped": task.number in there}
+        frame |= {"width": camera.width, "height": camera.height, "skipped": task.number in skipped}
         if window := camera.window:
             frame["window"] = [window.x, window.y, window.width, window.height]
         frames.append(frame)
@@ -93,59 +73,77 @@ def document(job: Job, there: set[int], plans: list[DevicePlan]) -> dict[str, An
         "frames": frames,
         "devices": [
             {
-                "device": each.device,
-                "needed": each.plan.needed,
-                "allowed": each.plan.allowed,
-                "pieces": any(each.plan.pieces),
-                "strips": each.strips,
+                "device": device.device,
+                "needed": device.plan.needed,
+                "allowed": device.plan.allowed,
+                "pieces": any(device.plan.pieces),
+                "strips": device.strips,
             }
-            for each in plans
+            for device in plans
         ],
-        "host_bytes": held * max(workers.frame_bytes(task, options) for task in tasks),
+        "host_bytes": waiting * max(workers.frame_bytes(task, options) for task in tasks),
         "writers": writers,
     }
 
 
-def plan_of(job: Job, selector: str | None) -> DevicePlan:
-    """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
-    from clsplat.device.context import open_device
-    from clsplat.frame.deep_exr import deep_rows
-    from clsplat.frame.strips import strip_rows
-    from clsplat.rendering.memory_needs import plan_frame
-    from clsplat.rendering.renderer import held_sh
-    from clsplat.stages.channels import Features
-    from clsplat.stages.deep import DEEP_FLOATS
+def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> Iterator[str]:
+    """The plan for people."""
+    frames = document["frames"]
+    paths = dict.fromkeys((frames[0]["path"], frames[-1]["path"]))
+    spaces = dict.fromkeys((document["model_colorspace"], document["colorspace"]))
+    deep = f" in {document['deep_bins']} slices by depth" if document["deep_bins"] else ""
+    yield f"model     {document['model']}: {document['gaussians']:,} Gaussians, SHA-256 {document['digest'][:12]}"
+    yield f"frames    {len(frames)}: {ranges([frame['frame'] for frame in frames])}; {examples(_sizes(frames))}"
+    yield f"files     {' to '.join(paths)}"
+    if job.is_video:
+        from clsplat.images.video import rate_of
 
+        yield f"video     {rate_of(document['fps'])} frames a second"
+    yield f"channels  {', '.join(document['channels'])}{deep}"
+    yield f"colour    {' to '.join(spaces)}"
+    if samples := _samples(job):
+        yield f"samples   {samples}"
+    for device in plans:
+        strips = f"; {device.strips} strips a frame" if device.strips > 1 else ""
+        yield f"device    {device.device}: {device.plan}{strips}"
+    yield f"host      about {amount(document['host_bytes'])} for frames that wait to be written"
+    if job.verb.skip_existing:
+        skipped = sorted(frame["frame"] for frame in frames if frame["skipped"])
+        yield f"skipped   {len(skipped)}" + (f": {ranges(skipped)}" if skipped else "")
+
+
+def _device_plan(job: Job, selector: str | None) -> DevicePlan:
+    """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
     device, options = open_device(selector, job.memory_limit), job.options
-    floats = held_sh(job.gaussians, job.rasterizer).floats
+    floats = held_sh(job.gaussians, job.verb.rasterizer).floats
     framing, names = options.pictures.framing, set(options.channels)
-    beside = Features.of(renderer_channels(options.channels)).floats if names - set(COLOUR) else 0
-    cameras = {(each.width, each.height): each for each in (picture_camera(task, options) for task in job.tasks)}
-    found = []
-    for camera in cameras.values():
+    features = Features.of(renderer_channels(options.channels)).floats if names - set(COLOUR) else 0
+    plans = []
+    cameras = [picture_camera(task, options) for task in job.tasks]
+    for camera in {(camera.width, camera.height): camera for camera in cameras}.values():
         if options.deep:
             rows, planes = deep_rows(device, camera, options.deep.bins), 4 * DEEP_FLOATS * options.deep.bins
         else:
             rows, planes = strip_rows(device, camera, options.channels, framing), 0
         strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
-        drawn = [(strip, beside)]
+        drawn = [(strip, features)]
         if framing.supersample > 1 and names & set(COLOUR):
             drawn.append((finer(strip, framing), 0))
-        for each, features in drawn:
-            sizes = (on_tiles(each)[0], job.rasterizer, features, planes)
+        for part, floats_beside in drawn:
+            sizes = (on_tiles(part)[0], job.verb.rasterizer, floats_beside, planes)
             plan = plan_frame(device, len(job.gaussians), floats, *sizes)
-            found.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
-    return max(found, key=lambda each: each.plan.needed)
+            plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
+    return max(plans, key=lambda each: each.plan.needed)
 
 
-def _sizes(cameras: list[Camera]) -> list[str]:
+def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
     """Sizes of the pictures, and of the frames that they are a part of."""
-    sizes = set()
-    for camera in cameras:
-        window = camera.window
-        of = f" at {window.x},{window.y} of {window.width}x{window.height}" if window else ""
-        sizes.add((camera.width, camera.height, of))
-    return [f"{width}x{height}{of}" for width, height, of in sorted(sizes)]
+    sizes = {(frame["width"], frame["height"], tuple(frame.get("window", ()))) for frame in frames}
+    texts = []
+    for width, height, window in sorted(sizes):
+        place = " at {},{} of {}x{}".format(*window) if window else ""
+        texts.append(f"{width}x{height}{place}")
+    return texts
 
 
 def _samples(job: Job) -> str:

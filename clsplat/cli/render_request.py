@@ -14,7 +14,6 @@ from clsplat.cli.render import Render
 from clsplat.cli.session import warn
 from clsplat.config.memory import parse_bytes
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig, VideoConfig
-from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError, examples
 from clsplat.files import check_new, digest
 from clsplat.frame.supersample import finer
@@ -44,7 +43,6 @@ class Job:
 
     verb: Render
     options: RenderOptions
-    rasterizer: RasterizerConfig
     model: Path
     gaussians: Gaussians
     tasks: list[Task]
@@ -107,7 +105,7 @@ def read_job(verb: Render) -> Job:
     options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer))
     spaces = (colours.model, colours.output)
     video = _video(verb, whole)
-    return Job(verb, options, verb.rasterizer, model, gaussians, tasks, devices, limit, spaces, video)
+    return Job(verb, options, model, gaussians, tasks, devices, limit, spaces, video)
 
 
 def frames_there(job: Job) -> set[int]:

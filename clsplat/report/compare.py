@@ -11,11 +11,11 @@ from typing import Any
 from markupsafe import Markup
 
 from clsplat.errors import InputError, examples, plain
-from clsplat.files import atomic_write
 from clsplat.report.figures import SCORES, Figures, read_figures, settings_of, smooth
 from clsplat.report.page import TITLES, duration, render_page, score, setting_text
 from clsplat.report.svg import COLORS, Series, chart
 from clsplat.runs.run import Run
+from clsplat.terminal import aligned
 
 MAX_RUNS = 24
 MAX_ROWS = 100
@@ -24,36 +24,40 @@ MAX_ROWS = 100
 
 @dataclass
 class Comparison:
-    """runs; labels: a name of each that no other has; notes: what makes figures hard to compare."""
+    """Runs by their labels, which are unique; notes: what makes figures hard to compare."""
 
-    runs: list[Figures]
-    labels: list[str]
+    runs: dict[str, Figures]
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def scores(self) -> list[str]:
+        """The scores that a run has a mean of."""
+        return [name for name in SCORES if any(_mean(figures, name) is not None for figures in self.runs.values())]
 
     @property
     def differing(self) -> dict[str, list[Any]]:
         """Values of each run by flag, where they are not all the same."""
-        settings = [dict(settings_of(each.run.config)) for each in self.runs]
-        return {name: [each[name] for each in settings] for name in settings[0]
-                if any(each[name] != settings[0][name] for each in settings)}  # fmt: skip
+        settings = [dict(settings_of(figures.run.config)) for figures in self.runs.values()]
+        values = {name: [setting[name] for setting in settings] for name in settings[0]}
+        return {name: listed for name, listed in values.items() if any(value != listed[0] for value in listed)}
 
     def document(self) -> dict[str, Any]:
         """The comparison for --json and for the page's data."""
         runs = [
             {
                 "run": label,
-                "step": each.step,
-                "iterations": each.run.config.iterations,
-                "gaussians": each.gaussians,
-                "seconds": each.seconds,
-                "elapsed": each.elapsed,
-                "mean": each.evaluation["mean"] if each.evaluation else None,
-                "views": each.evaluation["views"] if each.evaluation else [],
-                "evaluations": each.evaluations,
-                "device": each.sessions[-1].get("device") if each.sessions else None,
-                "notes": each.notes,
+                "step": figures.step,
+                "iterations": figures.run.config.iterations,
+                "gaussians": figures.gaussians,
+                "seconds": figures.seconds,
+                "elapsed": figures.elapsed,
+                "mean": figures.evaluation["mean"] if figures.evaluation else None,
+                "views": figures.evaluation["views"] if figures.evaluation else [],
+                "evaluations": figures.evaluations,
+                "device": figures.sessions[-1].get("device") if figures.sessions else None,
+                "notes": figures.notes,
             }
-            for label, each in zip(self.labels, self.runs, strict=True)
+            for label, figures in self.runs.items()
         ]
         return {"runs": runs, "settings": self.differing, "notes": self.notes}
 
@@ -63,126 +67,104 @@ def compare_runs(runs: Sequence[Run]) -> Comparison:
     if len(runs) > MAX_RUNS:
         raise InputError(f"{len(runs)} runs: expected at most {MAX_RUNS} to compare")
     figures = [read_figures(run, describe=False) for run in runs]
-    found = Comparison(figures, _labels([run.path for run in runs]))
-    for label, each in zip(found.labels, figures, strict=True):
-        found.notes += [f"{label}: {note}" for note in each.notes if note.startswith(("Not finished", "eval.json"))]
+    comparison = Comparison(dict(zip(_labels([run.path for run in runs]), figures, strict=True)))
+    notes = comparison.notes
+    for label, each in comparison.runs.items():
+        notes += [f"{label}: {note}" for note in each.notes if note.startswith(("Not finished", "eval.json"))]
     scenes = {each.run.scene.name for each in figures if each.run.scene is not None}
     if len(scenes) > 1:
-        found.notes.append(f"The runs are of different scenes: {examples(sorted(scenes))}.")
+        notes.append(f"The runs are of different scenes: {examples(sorted(scenes))}.")
     held_out = {frozenset(view["name"] for view in each.evaluation["views"]) for each in figures if each.evaluation}
     if len(held_out) > 1:
-        found.notes.append("The runs do not hold out the same views: their scores are not of the same pictures.")
+        notes.append("The runs do not hold out the same views: their scores are not of the same pictures.")
     for name in ("resolution", "background"):
         if len({getattr(each.run.config, name) for each in figures}) > 1:
-            found.notes.append(f"--{name} differs: scores are not of the same pictures.")
+            notes.append(f"--{name} differs: scores are not of the same pictures.")
     if len({each.sessions[-1].get("device") for each in figures if each.sessions}) > 1:
-        found.notes.append("The runs are of different devices: their times are not of one machine.")
-    return found
+        notes.append("The runs are of different devices: their times are not of one machine.")
+    return comparison
 
 
-def write_comparison(found: Comparison, path: Path) -> None:
-    """Write the page, atomically. Raises OSError as writing does."""
-    atomic_write(path, comparison_page(found).encode("utf-8", "replace"))
-
-
-def comparison_page(found: Comparison) -> str:
+def comparison_page(comparison: Comparison) -> str:
     """The page's HTML."""
-    columns = [
-        name for name in SCORES if any(each.evaluation and name in each.evaluation["mean"] for each in found.runs)
-    ]
-    views = view_rows(found)
+    columns, runs = comparison.scores, comparison.runs
+    views = view_rows(comparison)
     return render_page(
         "compare.html",
-        labels=found.labels,
-        notes=found.notes,
+        labels=list(runs),
+        notes=comparison.notes,
         columns=[(name, TITLES[name]) for name in columns],
         rows=[
-            (index % COLORS, label, each, [_mean(each, name) for name in columns])
-            for index, (label, each) in enumerate(zip(found.labels, found.runs, strict=True))
+            (index % COLORS, label, figures, [_mean(figures, name) for name in columns])
+            for index, (label, figures) in enumerate(runs.items())
         ],
-        best=[_best([_mean(each, name) for each in found.runs], name) for name in columns],
-        charts=[each for each in charts(found) if each],
-        settings=[(name, list(map(setting_text, values))) for name, values in found.differing.items()],
+        best=[_best([_mean(figures, name) for figures in runs.values()], name) for name in columns],
+        charts=[figure for figure in charts(comparison) if figure],
+        settings=[(name, list(map(setting_text, values))) for name, values in comparison.differing.items()],
         views=views[:MAX_ROWS],
         views_left_out=max(len(views) - MAX_ROWS, 0),
-        machine=[(label, _machine(each)) for label, each in zip(found.labels, found.runs, strict=True)],
-        data=found.document(),
+        machine=[(label, _machine(figures)) for label, figures in runs.items()],
+        data=comparison.document(),
     )
 
 
-def charts(found: Comparison) -> list[Markup]:
+def charts(comparison: Comparison) -> list[Markup]:
     """Time against error first, then what a run's own page has, by step."""
-    made = []
-    for x, title in (("seconds", "Time against error"), ("step", "Held-out PSNR")):
+    drawn = []
+    for x, title, x_label in (
+        ("seconds", "Time against error", "seconds of training"),
+        ("step", "Held-out PSNR", "step"),
+    ):
         series = [
-            Series(label, _points(each.evaluations, x), "dots", index)
-            for index, (label, each) in enumerate(zip(found.labels, found.runs, strict=True))
+            Series(label, figures.held_out(x), "dots", index)
+            for index, (label, figures) in enumerate(comparison.runs.items())
         ]
-        label = {"seconds": "seconds of training", "step": "step"}[x]
-        made.append(chart(title, series, label, "PSNR of the held-out views, dB"))
-    wanted = (
+        drawn.append(chart(title, series, x_label, "PSNR of the held-out views, dB"))
+    curves = (
         ("Loss", "loss", "loss", True),
         ("PSNR of training views", "psnr", "PSNR, dB", False),
         ("Number of Gaussians", "gaussians", "Gaussians", False),
         ("Time", "seconds", "seconds of training", False),
     )
-    for title, name, label, log_y in wanted:
+    for title, name, y_label, log_y in curves:
+        is_noisy = name in ("loss", "psnr")
         series = []
-        for index, (run, each) in enumerate(zip(found.labels, found.runs, strict=True)):
-            steps, values = each.curves["step"], each.curves[name]
-            around = max(len(steps) // 50, 5)
-            if name in ("loss", "psnr") and len(steps) > 20:
-                values = smooth(values, around)
-            series.append(Series(run, list(zip(steps, values, strict=True)), "line", index))
-        note = "means of neighbouring records" if name in ("loss", "psnr") else ""
-        zero = name in ("gaussians", "seconds")
-        made.append(chart(title, series, "step", label, log_y=log_y, from_zero=zero, note=note))
-    return made
+        for index, (label, figures) in enumerate(comparison.runs.items()):
+            steps, values = figures.curves["step"], figures.curves[name]
+            if is_noisy and len(steps) > 20:
+                values = smooth(values, max(len(steps) // 50, 5))
+            series.append(Series(label, list(zip(steps, values, strict=True)), "line", index))
+        note = "means of neighbouring records" if is_noisy else ""
+        drawn.append(chart(title, series, "step", y_label, log_y=log_y, from_zero=not is_noisy, note=note))
+    return drawn
 
 
-def view_rows(found: Comparison) -> list[tuple[str, list[float | None], float | None]]:
+def view_rows(comparison: Comparison) -> list[tuple[str, list[float | None], float | None]]:
     """Rows of the views that two runs or more have: name, PSNR in each, and the best of them."""
-    of = [
-        {v["name"]: v.get("psnr") for v in each.evaluation["views"]} if each.evaluation else {} for each in found.runs
-    ]
-    names = dict.fromkeys(name for each in of for name in each)
+    views = [figures.evaluation["views"] if figures.evaluation else [] for figures in comparison.runs.values()]
+    scores = [{view["name"]: view.get("psnr") for view in listed} for listed in views]
     rows = []
-    for name in names:
-        values = [each.get(name) for each in of]
+    for name in dict.fromkeys(name for by_name in scores for name in by_name):
+        values = [by_name.get(name) for by_name in scores]
         if sum(value is not None for value in values) > 1:
             rows.append((name, values, _best(values, "psnr")))
     return rows
 
 
-def comparison_table(found: Comparison) -> str:
+def comparison_table(comparison: Comparison) -> str:
     """Text table for the terminal."""
-    columns = [
-        name for name in SCORES if any(each.evaluation and name in each.evaluation["mean"] for each in found.runs)
-    ]
-    header = ["run", "steps", *(name.upper() for name in columns), "Gaussians", "training"]
-    rows = [header]
-    for label, each in zip(found.labels, found.runs, strict=True):
-        values = [_mean(each, name) for name in columns]
-        scores = ["-" if value is None else score(value, name) for value, name in zip(values, columns, strict=True)]
-        gaussians = "-" if each.gaussians is None else f"{each.gaussians:,}"
-        rows.append([plain(label), f"{each.step:,}", *scores, gaussians, duration(each.seconds)])
-    lines = _aligned(rows)
-    if found.differing:
-        named = [["setting", *map(plain, found.labels)]]
-        named += [[name, *map(setting_text, values)] for name, values in found.differing.items()]
-        lines += ["", *_aligned(named)]
+    columns = comparison.scores
+    rows = [["run", "steps", *(name.upper() for name in columns), "Gaussians", "training"]]
+    for label, figures in comparison.runs.items():
+        means = {name: _mean(figures, name) for name in columns}
+        scores = ["-" if value is None else score(value, name) for name, value in means.items()]
+        gaussians = "-" if figures.gaussians is None else f"{figures.gaussians:,}"
+        rows.append([plain(label), f"{figures.step:,}", *scores, gaussians, duration(figures.seconds)])
+    lines = aligned(rows)
+    if comparison.differing:
+        settings = [[name, *map(setting_text, values)] for name, values in comparison.differing.items()]
+        lines += ["", *aligned([["setting", *map(plain, comparison.runs)], *settings])]
     return "\n".join(lines)
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return [
-        "  ".join(
-            cell.ljust(width) if index == 0 else cell.rjust(width)
-            for index, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
@@ -204,11 +186,6 @@ def _best(values: Sequence[float | None], name: str) -> float | None:
     if len(known) < 2:
         return None
     return min(known) if name == "lpips" else max(known)
-
-
-def _points(evaluations: Sequence[dict[str, Any]], x: str) -> list[tuple[float, float]]:
-    found = [(each.get(x), each.get("psnr")) for each in evaluations]
-    return [(float(a), b) for a, b in found if a is not None and b is not None]
 
 
 def _machine(figures: Figures) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
 from clsplat.files import digest, parse_json, read_document
 from clsplat.gaussians import Gaussians
@@ -72,12 +71,16 @@ class Figures:
         last = next(reversed(self.curves["gaussians"]), None)
         return None if last is None else int(last)
 
+    def held_out(self, x: str) -> list[tuple[float, float]]:
+        """PSNR of the held-out views by `x`, seconds or step, where both are known."""
+        points = [(evaluation.get(x), evaluation.get("psnr")) for evaluation in self.evaluations]
+        return [(float(at), psnr) for at, psnr in points if at is not None and psnr is not None]
+
     def document(self) -> Record:
         """Everything for --json."""
-        found = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "run"}
-        found["settings"] = asdict(self.run.config)
-        found["scene"] = self.run.scene.name if self.run.scene is not None else None
-        return found
+        document = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "run"}
+        scene = self.run.scene.name if self.run.scene is not None else None
+        return {**document, "settings": asdict(self.run.config), "scene": scene}
 
 
 def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = True) -> Figures:
@@ -93,8 +96,8 @@ def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = T
         stages = record.get("stages")
         if isinstance(stages, dict) and (times := _numbers(stages, MAX_STAGES)).get("all"):
             figures.stages.append({"step": int(record["step"]), "ms": times})
-        if (found := _evaluation(record.get("eval"))) is not None:
-            figures.evaluations.append({**_summary(found), "step": int(record["step"])})
+        if (evaluation := _evaluation(record.get("eval"))) is not None:
+            figures.evaluations.append({**_summary(evaluation), "step": int(record["step"])})
         if isinstance(session := record.get("session"), dict):
             figures.sessions.append(_session(session))
     for listed in (figures.stages, figures.evaluations):
@@ -137,11 +140,6 @@ def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]
             yield name, value
 
 
-def default_settings() -> dict[str, Any]:
-    """Default of every setting, by name."""
-    return dict(settings_of(TrainConfig()))
-
-
 def smooth(values: list[float], count: int) -> list[float]:
     """The mean of `count` values about each, fewer at the ends."""
     sums = np.concatenate([[0.0], np.cumsum(np.asarray(values, np.float64))])
@@ -155,13 +153,14 @@ def _is_complete(record: Mapping[str, Any]) -> bool:
     return all(number(record.get(name)) is not None for name in CURVES)
 
 
-def _text(value: object) -> str | None:
-    return value[:MAX_NAME] if isinstance(value, str) else None
+def _texts(values: Mapping[str, Any]) -> Record:
+    pairs = list(values.items())[:MAX_STAGES]
+    return {name[:MAX_NAME]: value[:MAX_NAME] for name, value in pairs if isinstance(value, str)}
 
 
 def _numbers(values: Mapping[str, Any], limit: int) -> dict[str, float]:
-    found = {name[:MAX_NAME]: number(value) for name, value in list(values.items())[:limit]}
-    return {name: value for name, value in found.items() if value is not None}
+    numbers = {name[:MAX_NAME]: number(value) for name, value in list(values.items())[:limit]}
+    return {name: value for name, value in numbers.items() if value is not None}
 
 
 def _evaluation(value: object) -> Record | None:
@@ -174,11 +173,9 @@ def _evaluation(value: object) -> Record | None:
             return None
         views.append({"name": name, **_numbers({key: view.get(key) for key in SCORES}, len(SCORES))})
     mean, missing = value.get("mean"), value.get("lpips_missing")
-    step = number(value.get("step"))
-    gaussians = number(value.get("gaussians"))
+    counts = {name: number(value.get(name)) for name in ("step", "gaussians")}
     return {
-        "step": None if step is None else int(step),
-        "gaussians": None if gaussians is None else int(gaussians),
+        **{name: None if count is None else int(count) for name, count in counts.items()},
         "seconds": number(value.get("seconds")),
         "mean": _numbers({key: mean.get(key) for key in SCORES}, len(SCORES)) if isinstance(mean, dict) else {},
         "views": views,
@@ -192,14 +189,12 @@ def _summary(evaluation: Record) -> Record:
 
 def _session(value: Mapping[str, Any]) -> Record:
     names = ("started", "device", "driver", "kind", "shape", "system")
-    found: Record = {name: text for name in names if (text := _text(value.get(name))) is not None}
-    found["from_step"] = int(number(value.get("from_step")) or 0)
-    found["memory_limit"] = number(value.get("memory_limit"))
-    versions = value.get("versions")
-    if isinstance(versions, dict):
-        pairs = list(versions.items())[:MAX_STAGES]
-        found["versions"] = {name[:MAX_NAME]: text for name, each in pairs if (text := _text(each)) is not None}
-    return found
+    session: Record = _texts({name: value.get(name) for name in names})
+    session["from_step"] = int(number(value.get("from_step")) or 0)
+    session["memory_limit"] = number(value.get("memory_limit"))
+    if isinstance(versions := value.get("versions"), dict):
+        session["versions"] = _texts(versions)
+    return session
 
 
 def _elapsed(records: list[Record]) -> float | None:
@@ -220,22 +215,22 @@ def _add_evaluation(figures: Figures) -> None:
         figures.notes.append("eval.json is not there: no held-out view has been measured at the end.")
         return
     try:
-        found = _evaluation(parse_json(read_document(run.eval_path, "the evaluation of a run")))
+        evaluation = _evaluation(parse_json(read_document(run.eval_path, "the evaluation of a run")))
     except (InputError, ValueError):
-        found = None
-    if found is None:
+        evaluation = None
+    if evaluation is None:
         figures.notes.append("eval.json is damaged, and left out.")
         return
-    figures.evaluation = found
-    if not found["views"]:
+    figures.evaluation = evaluation
+    if not evaluation["views"]:
         figures.notes.append("eval.json has no held-out views.")
-    step = found["step"]
+    if (step := evaluation["step"]) is None:
+        return
+    others = [other for other in figures.evaluations if other["step"] != step]
+    figures.evaluations = sorted([*others, {**_summary(evaluation), "step": step}], key=lambda record: record["step"])
     last = figures.curves["step"][-1] if figures.curves["step"] else None
-    if step is not None:
-        others = [each for each in figures.evaluations if each["step"] != step]
-        figures.evaluations = sorted([*others, {**_summary(found), "step": step}], key=lambda each: each["step"])
-        if last is not None and step != last:
-            figures.notes.append(f"eval.json is of step {step:,}, metrics.jsonl goes to step {int(last):,}.")
+    if last is not None and step != last:
+        figures.notes.append(f"eval.json is of step {step:,}, metrics.jsonl goes to step {int(last):,}.")
 
 
 def _add_model(figures: Figures, model: Gaussians | None) -> None:
@@ -265,14 +260,22 @@ def _histogram(values: NDArray[Any], edges: NDArray[np.float64]) -> Record:
 
 
 def _add_contributions(figures: Figures, records: list[Record]) -> None:
-    found = records[-1].get("contributions") if records else None
-    if isinstance(found, dict):
-        edges, counts = found.get("edges"), found.get("counts")
-        if isinstance(edges, list) and isinstance(counts, list) and len(edges) == len(counts) + 1 > 1:
-            values = [[number(each) for each in part] for part in (edges, counts)]
-            rest = [number(found.get(name)) for name in ("views", "of", "none")]
-            if None not in [*values[0], *values[1], *rest] and values[0] == sorted(values[0], key=lambda x: x or 0.0):
-                views, of, none = (int(each or 0) for each in rest)
-                whole = [int(each or 0) for each in values[1]]
-                known = {"edges": values[0], "counts": whole, "views": views, "of": of, "none": none}
-                figures.histograms["contribution"] = known
+    record = records[-1].get("contributions") if records else None
+    if not isinstance(record, dict):
+        return
+    edges, counts = _list(record.get("edges")), _list(record.get("counts"))
+    sums = _list([record.get(name) for name in ("views", "of", "none")])
+    if edges is None or counts is None or sums is None:
+        return
+    if len(edges) == len(counts) + 1 > 1 and edges == sorted(edges):
+        views, total, none = map(int, sums)
+        histogram = {"edges": edges, "counts": list(map(int, counts)), "views": views, "of": total, "none": none}
+        figures.histograms["contribution"] = histogram
+
+
+def _list(value: object) -> list[float] | None:
+    """The value as a list of numbers, or None."""
+    if not isinstance(value, list):
+        return None
+    numbers = [known for item in value if (known := number(item)) is not None]
+    return numbers if len(numbers) == len(value) else None

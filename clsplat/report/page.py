@@ -13,6 +13,7 @@ from typing import Any
 from markupsafe import Markup
 
 import clsplat
+from clsplat.config.training import TrainConfig
 from clsplat.errors import amount
 from clsplat.files import atomic_write
 from clsplat.gaussians import Gaussians
@@ -23,7 +24,6 @@ from clsplat.report.figures import (
     MAX_STAGES,
     SCORES,
     Figures,
-    default_settings,
     read_figures,
     settings_of,
     smooth,
@@ -150,7 +150,7 @@ def charts(figures: Figures) -> list[Markup]:
             Series("training views, mean" if series else "training view", list(zip(steps, means, strict=True)))
         )
         if name == "psnr":
-            series.append(Series("held-out views", _held_out(figures, "step"), "dots", 1))
+            series.append(Series("held-out views", figures.held_out("step"), "dots", 1))
         title = {"loss": "Loss", "psnr": "PSNR"}[name]
         made.append(chart(title, series, "step", label, log_y=name == "loss", note=note))
     grown = Series("Gaussians", list(zip(steps, curves["gaussians"], strict=True)), color=2)
@@ -160,7 +160,7 @@ def charts(figures: Figures) -> list[Markup]:
     if steps:
         made.append(chart("Time", [trained], "step", "seconds of training", from_zero=True))
     made.append(
-        chart("Time against PSNR", [Series("held-out views", _held_out(figures, "seconds"), "dots", 1)],
+        chart("Time against PSNR", [Series("held-out views", figures.held_out("seconds"), "dots", 1)],
               "seconds of training", "PSNR, dB")
     )  # fmt: skip
     return made
@@ -216,7 +216,7 @@ def histograms(figures: Figures) -> list[Markup]:
 
 def setting_rows(figures: Figures) -> list[tuple[str, str, str, bool]]:
     """Flag, value, default and whether they differ."""
-    defaults = default_settings()
+    defaults = dict(settings_of(TrainConfig()))
     return [
         (name, setting_text(value), setting_text(defaults[name]), value != defaults[name])
         for name, value in settings_of(figures.run.config)
@@ -279,11 +279,6 @@ def score(value: float, name: str) -> str:
 def count(value: float) -> str:
     """A count with thousands' commas."""
     return f"{value:,.0f}"
-
-
-def _held_out(figures: Figures, x: str) -> list[tuple[float, float]]:
-    found = [(each.get(x), each.get("psnr")) for each in figures.evaluations]
-    return [(float(a), b) for a, b in found if a is not None and b is not None]
 
 
 def _bars(histogram: dict[str, Any]) -> list[tuple[float, float]]:
