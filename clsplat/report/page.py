@@ -28,7 +28,7 @@ from clsplat.report.figures import (
     settings_of,
     smooth,
 )
-from clsplat.report.svg import Series, chart, short
+from clsplat.report.svg import Series, chart, short, templates
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 
@@ -103,19 +103,11 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
 
 def render_page(name: str, **values: Any) -> str:
     """A template filled in, with everything escaped that is not Markup."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("clsplat.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(short=short, duration=duration, score=score, count=count)
+    pages = templates()
+    pages.filters.update(short=short, duration=duration, score=score, count=count)
     folder = Path(__file__).parent / "templates"
     style, script = ((folder / file).read_text("utf-8") for file in ("style.css", "page.js"))
-    return environment.get_template(name).render(
+    return pages.get_template(name).render(
         style=Markup(style),  # noqa: S704  # our own files
         script=Markup(script),  # noqa: S704
         hashes=[_hash(style), _hash(script)],

@@ -6,10 +6,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 WIDTH, HEIGHT = 420, 250
@@ -60,38 +62,52 @@ def chart(
 ) -> Markup:
     """A figure with a legend: title, labels of both axes. log_y: a logarithmic axis, values that are not positive are
     left out; from_zero: y begins there; powers: x are powers of ten. "" where there are no points at all."""
-    drawn = [Series(each.name, _kept(each.points, log_y), each.kind, each.color) for each in series]
-    drawn = [each for each in drawn if each.points]
+    drawn = [replace(curve, points=_kept(curve.points, log_y)) for curve in series]
+    drawn = [curve for curve in drawn if curve.points]
     if not drawn:
         return Markup("")
-    xs = [point[0] for each in drawn for point in each.points]
-    ys = [_y(point[1], log_y) for each in drawn for point in each.points]
-    if from_zero or any(each.kind in ("area", "bars") for each in drawn):
+    xs = [point[0] for curve in drawn for point in curve.points]
+    ys = [_y(point[1], log_y) for curve in drawn for point in curve.points]
+    if from_zero or any(curve.kind in ("area", "bars") for curve in drawn):
         ys.append(0.0)
     across, up = _axis(xs, LEFT, RIGHT, powers=powers), _axis(ys, BOTTOM, TOP, powers=log_y)
-    parts = [_grid(across, up, x, y)]
-    parts += [_shape(each, drawn, across, up, log_y=log_y) for each in _back_to_front(drawn)]
-    legend = Markup("").join(
-        Markup('<li class="c{} {}"><i></i>{}</li>').format(each.color % COLORS, each.kind, each.name) for each in drawn
+    html = (
+        templates()
+        .get_template("chart.html")
+        .render(
+            {
+                "title": title,
+                "drawn": drawn,
+                "across": across,
+                "up": up,
+                "x": x,
+                "y": y,
+                "powers": powers,
+                "note": note,
+            },
+            label=f"{title}: {y} by {x}. " + " ".join(_described(curve) for curve in drawn if curve.kind != "faint"),
+            shapes=[_shape(curve, drawn, across, up, log_y=log_y) for curve in _back_to_front(drawn)],
+            colors=COLORS,
+            width=WIDTH,
+            height=HEIGHT,
+            left=LEFT,
+            right=RIGHT,
+            top=TOP,
+            bottom=BOTTOM,
+        )
     )
-    described = f"{title}: {y} by {x}. " + " ".join(_described(each) for each in drawn if each.kind != "faint")
-    return Markup(
-        '<figure class="chart"><figcaption>{title}</figcaption><ul class="legend">{legend}</ul>'
-        '<svg viewBox="0 0 {w} {h}" role="img" aria-label="{label}" data-x="{x}" data-powers="{powers}">'
-        '{parts}<line class="cross" x1="0" x2="0" y1="{top}" y2="{bottom}"/></svg>'
-        '<output class="values" aria-hidden="true">{note}</output></figure>'
-    ).format(
-        title=title,
-        legend=legend,
-        w=WIDTH,
-        h=HEIGHT,
-        label=described,
-        x=x,
-        powers=int(powers),
-        parts=Markup("").join(parts),
-        top=TOP,
-        bottom=BOTTOM,
-        note=note,
+    return Markup(html)  # noqa: S704  # escaped by the template
+
+
+@cache
+def templates() -> Environment:
+    """The pages' templates, which escape everything that is not Markup."""
+    return Environment(
+        loader=PackageLoader("clsplat.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
 
 
@@ -109,12 +125,12 @@ def thinned(points: Points, limit: int = MAX_POINTS) -> Points:
     if len(points) <= limit:
         return points
     stretch = math.ceil(2 * len(points) / limit)
-    found = [points[0]]
+    kept = [points[0]]
     for start in range(0, len(points), stretch):
         part = range(start, min(start + stretch, len(points)))
         ends = {min(part, key=lambda index: points[index][1]), max(part, key=lambda index: points[index][1])}
-        found += [points[index] for index in sorted(ends)]
-    return [*found, points[-1]]
+        kept += [points[index] for index in sorted(ends)]
+    return [*kept, points[-1]]
 
 
 def _kept(points: Points, log_y: bool) -> Points:
@@ -151,68 +167,45 @@ def _step(span: float, count: int) -> float:
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * 0.999)
 
 
-def _grid(across: Axis, up: Axis, x: str, y: str) -> Markup:
-    parts = []
-    for value, label in up.ticks:
-        at = up(value)
-        line = Markup('<path class="grid" d="M{} {:.1f}H{}"/><text class="tick end" x="{}" y="{:.1f}">{}</text>')
-        parts.append(line.format(LEFT, at, RIGHT, LEFT - 5, at + 4, label))
-    for value, label in across.ticks:
-        at = across(value)
-        side = " end" if at > RIGHT - 10 else " middle"
-        line = Markup('<path class="grid" d="M{:.1f} {}v4"/><text class="tick{}" x="{:.1f}" y="{}">{}</text>')
-        parts.append(line.format(at, BOTTOM, side, at, BOTTOM + 17, label))
-    labels = Markup('<text class="end" x="{}" y="{}">{}</text><text x="{}" y="{}">{}</text>')
-    parts.append(labels.format(RIGHT, HEIGHT - 3, x, 4, 12, y))
-    parts.append(Markup('<path class="axis" d="M{} {}H{}"/>').format(LEFT, BOTTOM, RIGHT))
-    return Markup("").join(parts)
-
-
 def _back_to_front(drawn: Sequence[Series]) -> list[Series]:
-    """Areas from the highest, faint lines, then the rest as they come."""
-    areas = [each for each in drawn if each.kind == "area"]
-    faint = [each for each in drawn if each.kind == "faint"]
-    return [*reversed(areas), *faint, *(each for each in drawn if each.kind not in ("area", "faint"))]
+    """Areas from the highest, faint lines, then the others in their order."""
+    areas = [curve for curve in drawn if curve.kind == "area"]
+    return [*reversed(areas), *sorted((c for c in drawn if c.kind != "area"), key=lambda curve: curve.kind != "faint")]
 
 
-def _shape(each: Series, drawn: Sequence[Series], across: Axis, up: Axis, *, log_y: bool) -> Markup:
-    points = each.points if each.kind == "bars" else thinned(each.points)
-    at = [(across(x), up(_y(y, log_y))) for x, y in points]
-    color, shown = each.color % COLORS, points
-    if each.kind == "area":
-        below = _below(each, drawn)
-        shown = [(x, y - low) for (x, y), low in zip(each.points, below, strict=True)]
-        at = [(across(x), up(y)) for x, y in each.points]
-        back = [(across(x), up(low)) for (x, _), low in zip(each.points, below, strict=True)]
-        path = _line([*at, *reversed(back)]) + "Z"
-    elif each.kind == "bars":
+def _shape(curve: Series, drawn: Sequence[Series], across: Axis, up: Axis, *, log_y: bool) -> dict[str, Any]:
+    """A series in pixels, for the template; shown: the values that the page's script shows, at these places."""
+    points = curve.points if curve.kind in ("area", "bars") else thinned(curve.points)
+    pixels = [(across(x), up(_y(y, log_y))) for x, y in points]
+    values, path = points, _line(pixels)
+    if curve.kind == "area":
+        areas = [other for other in drawn if other.kind == "area"]
+        index = areas.index(curve)
+        below = [y for _, y in areas[index - 1].points] if index else [0.0] * len(points)
+        values = [(x, y - low) for (x, y), low in zip(points, below, strict=True)]
+        lower = [(across(x), up(low)) for (x, _), low in zip(points, below, strict=True)]
+        path = _line([*pixels, *reversed(lower)]) + "Z"
+    elif curve.kind == "bars":
         floor = f"{up(0.0):.1f}"
-        tops = [f"V{y:.1f}H{end:.1f}" for (_, y), (end, _) in pairwise(at)]
-        path = f"M{at[0][0]:.1f} {floor}{''.join(tops)}V{floor}Z"
-    else:
-        path = _line(at)
-    values = " ".join(f"{x:.7g} {y:.7g}" for x, y in shown)
-    name = Markup('<path class="c{} {}" d="{}" data-name="{}" data-values="{}" data-at="{}"/>')
-    places = " ".join(f"{x:.1f}" for x, _ in at)
-    parts = [name.format(color, each.kind, path, each.name, values, places)]
-    if each.kind == "dots" or len(at) == 1:
-        dot = Markup('<circle class="c{} dot" cx="{:.1f}" cy="{:.1f}" r="3.5"/>')
-        parts += [dot.format(color, x, y) for x, y in at]
-    return Markup("").join(parts)
+        tops = [f"V{y:.1f}H{end:.1f}" for (_, y), (end, _) in pairwise(pixels)]
+        path = f"M{pixels[0][0]:.1f} {floor}{''.join(tops)}V{floor}Z"
+    return {
+        "name": curve.name,
+        "kind": curve.kind,
+        "color": curve.color % COLORS,
+        "path": path,
+        "shown": " ".join(f"{x:.7g} {y:.7g}" for x, y in values),
+        "places": " ".join(f"{x:.1f}" for x, _ in pixels),
+        "dots": pixels if curve.kind == "dots" or len(pixels) == 1 else [],
+    }
 
 
-def _below(each: Series, drawn: Sequence[Series]) -> list[float]:
-    areas = [other for other in drawn if other.kind == "area"]
-    index = areas.index(each)
-    return [y for _, y in areas[index - 1].points] if index else [0.0] * len(each.points)
+def _line(pixels: Sequence[tuple[float, float]]) -> str:
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in pixels)
 
 
-def _line(at: Sequence[tuple[float, float]]) -> str:
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in at)
-
-
-def _described(each: Series) -> str:
-    if each.kind == "bars":
-        top = max(each.points, key=lambda point: point[1])
-        return f"{each.name}: most, {short(top[1])}, from {short(top[0])} on."
-    return f"{each.name}: {short(each.points[0][1])} at first, {short(each.points[-1][1])} at last."
+def _described(curve: Series) -> str:
+    if curve.kind == "bars":
+        top = max(curve.points, key=lambda point: point[1])
+        return f"{curve.name}: most, {short(top[1])}, from {short(top[0])} on."
+    return f"{curve.name}: {short(curve.points[0][1])} at first, {short(curve.points[-1][1])} at last."
