@@ -7,6 +7,7 @@ import base64
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -79,16 +80,16 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         if len(shown) < len(wanted):
             notes.append(f"{len(wanted) - len(shown)} renders of held-out views are not in test/, or cannot be read.")
     scores = {view["name"]: view for view in listed}
-    places = {each.name: place for place, each in enumerate(shown, 1)}
+    places = {view.name: place for place, view in enumerate(shown, 1)}
     return render_page(
         "report.html",
         figures=figures,
         notes=notes,
         summary=summary(figures),
-        charts=[each for each in charts(figures) if each],
-        histograms=[each for each in histograms(figures) if each],
+        charts=list(filter(None, charts(figures))),
+        histograms=list(filter(None, histograms(figures))),
         stages=stage_rows(figures),
-        shown=[(place, each, scores[each.name]) for place, each in enumerate(shown, 1)],
+        shown=[(place, view, scores[view.name]) for place, view in enumerate(shown, 1)],
         places=places,
         left_out=len(listed) - len(shown),
         white_error=thumbnails.WHITE_ERROR,
@@ -96,7 +97,6 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         views=listed[:MAX_ROWS],
         views_left_out=max(len(listed) - MAX_ROWS, 0),
         settings=setting_rows(figures),
-        machine=machine_rows(figures),
         data=_data(figures),
     )
 
@@ -104,7 +104,7 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
 def render_page(name: str, **values: Any) -> str:
     """A template filled in, with everything escaped that is not Markup."""
     pages = templates()
-    pages.filters.update(short=short, duration=duration, score=score, count=count)
+    pages.filters.update(short=short, duration=duration, score=score, count="{:,.0f}".format, amount=amount)
     folder = Path(__file__).parent / "templates"
     style, script = ((folder / file).read_text("utf-8") for file in ("style.css", "page.js"))
     return pages.get_template(name).render(
@@ -134,16 +134,13 @@ def charts(figures: Figures) -> list[Markup]:
     around = max(len(steps) // 50, 5)
     note = f"each tenth step, of one view; the line is the mean of {around} records" if len(steps) > 20 else ""
     made = []
-    for name, label in (("loss", "loss"), ("psnr", "PSNR, dB")):
-        rows = list(zip(steps, curves[name], strict=True))
-        series = [Series("training view", rows, "faint", 0)] if len(steps) > 20 else []
-        means = smooth(curves[name], around) if len(steps) > 20 else curves[name]
-        series.append(
-            Series("training views, mean" if series else "training view", list(zip(steps, means, strict=True)))
-        )
+    for title, name, label in (("Loss", "loss", "loss"), ("PSNR", "psnr", "PSNR, dB")):
+        series = [Series("training view", list(zip(steps, curves[name], strict=True)))]
+        if len(steps) > 20:
+            means = list(zip(steps, smooth(curves[name], around), strict=True))
+            series = [replace(series[0], kind="faint"), Series("training views, mean", means)]
         if name == "psnr":
             series.append(Series("held-out views", figures.held_out("step"), "dots", 1))
-        title = {"loss": "Loss", "psnr": "PSNR"}[name]
         made.append(chart(title, series, "step", label, log_y=name == "loss", note=note))
     grown = Series("Gaussians", list(zip(steps, curves["gaussians"], strict=True)), color=2)
     made.append(chart("Number of Gaussians", [grown], "step", "Gaussians", from_zero=True))
@@ -151,10 +148,8 @@ def charts(figures: Figures) -> list[Markup]:
     trained = Series("training", [(0.0, 0.0), *zip(steps, curves["seconds"], strict=True)], color=4)
     if steps:
         made.append(chart("Time", [trained], "step", "seconds of training", from_zero=True))
-    made.append(
-        chart("Time against PSNR", [Series("held-out views", figures.held_out("seconds"), "dots", 1)],
-              "seconds of training", "PSNR, dB")
-    )  # fmt: skip
+    series = [Series("held-out views", figures.held_out("seconds"), "dots", 1)]
+    made.append(chart("Time against PSNR", series, "seconds of training", "PSNR, dB"))
     return made
 
 
@@ -164,13 +159,13 @@ def stage_chart(figures: Figures) -> Markup:
         return Markup("")
     names = [name for name, *_ in stage_rows(figures)]
     named = names if len(names) <= NAMED_STAGES + 1 else names[:NAMED_STAGES]
-    steps = [float(each["step"]) for each in figures.stages]
+    steps = [float(record["step"]) for record in figures.stages]
     tops, series = [0.0] * len(steps), []
     groups = [(name, [name]) for name in named]
     if rest := names[len(named) :]:
         groups.append((f"{len(rest)} smaller ones", rest))
     for color, (label, members) in enumerate(groups):
-        added = [sum(each["ms"].get(name, 0.0) for name in members) for each in figures.stages]
+        added = [sum(record["ms"].get(name, 0.0) for name in members) for record in figures.stages]
         tops = [top + more for top, more in zip(tops, added, strict=True)]
         series.append(Series(label, list(zip(steps, tops, strict=True)), "area", color))
     return chart("Time per stage", series, "step", "ms of a step", note="waiting for the device after each stage")
@@ -181,10 +176,10 @@ def stage_rows(figures: Figures) -> list[tuple[str, float, float, float]]:
     if not figures.stages:
         return []
     last = figures.stages[-1]["ms"]
-    names = sorted({name for each in figures.stages for name in each["ms"]} - {"all"})[:MAX_STAGES]
+    names = sorted({name for record in figures.stages for name in record["ms"]} - {"all"})[:MAX_STAGES]
     rows = []
     for name in names:
-        values = sorted(each["ms"].get(name, 0.0) for each in figures.stages)
+        values = sorted(record["ms"].get(name, 0.0) for record in figures.stages)
         now = last.get(name, 0.0)
         rows.append((name, values[len(values) // 2], now, now / last["all"]))
     return sorted(rows, key=lambda row: -row[2])
@@ -192,17 +187,18 @@ def stage_rows(figures: Figures) -> list[tuple[str, float, float, float]]:
 
 def histograms(figures: Figures) -> list[Markup]:
     """Scales, opacities, contributions."""
-    found = figures.histograms
-    scales = [Series(name, _bars(found[name]), "bars", color)
-              for color, name in ((0, "largest scale"), (1, "smallest scale")) if name in found]  # fmt: skip
-    made = [chart("Scales", scales, "world units", "Gaussians", powers=True, note="standard deviations")]
-    if "opacity" in found:
-        made.append(chart("Opacity", [Series("opacity", _bars(found["opacity"]), "bars", 2)], "opacity", "Gaussians"))
-    if "contribution" in found:
-        of = found["contribution"]
-        note = f"largest to one of {of['views']} of {of['of']} training views; {of['none']:,} contribute to none"
-        series = Series("contribution", _bars(of), "bars", 3)
-        made.append(chart("Contribution", [series], "pixels", "Gaussians", powers=True, note=note))
+    bars = {name: _bars(histogram) for name, histogram in figures.histograms.items()}
+    scales = (("largest scale", 0), ("smallest scale", 1))
+    series = [Series(name, bars[name], "bars", color) for name, color in scales if name in bars]
+    made = [chart("Scales", series, "world units", "Gaussians", powers=True, note="standard deviations")]
+    if "opacity" in bars:
+        made.append(chart("Opacity", [Series("opacity", bars["opacity"], "bars", 2)], "opacity", "Gaussians"))
+    if "contribution" in bars:
+        record = figures.histograms["contribution"]
+        views = f"{record['views']} of {record['of']} training views"
+        note = f"largest to one of {views}; {record['none']:,} contribute to none"
+        series = [Series("contribution", bars["contribution"], "bars", 3)]
+        made.append(chart("Contribution", series, "pixels", "Gaussians", powers=True, note=note))
     return made
 
 
@@ -222,37 +218,6 @@ def setting_text(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def machine_rows(figures: Figures) -> list[tuple[str, str]]:
-    """Device, driver, versions, model, seed, time."""
-    run, rows = figures.run, []
-    for index, each in enumerate(figures.sessions):
-        after = f", from step {each['from_step']:,}" if len(figures.sessions) > 1 or each["from_step"] else ""
-        label = "trained" if index == 0 else "then"
-        words = [each.get("started", "").replace("T", " ").replace("+00:00", " UTC") + after]
-        rows.append((label, words[0].strip(", ")))
-        if index == 0 or each.get("device") != figures.sessions[index - 1].get("device"):
-            rows += [("device", f"{each.get('device', 'not known')} ({each.get('kind', '?')})")]
-        rows += [("driver", each.get("driver", "not known").split("  ")[0])]
-        rows += [("kernels' shape", each["shape"])] if "shape" in each else []
-        rows += [("system", each["system"])] if "system" in each else []
-        if each["memory_limit"] is not None:
-            rows.append(("memory limit", amount(each["memory_limit"])))
-        versions = each.get("versions", {})
-        rows.append(("versions", ", ".join(f"{name} {text}" for name, text in versions.items()) or "not known"))
-    rows.append(("seed", str(run.config.seed)))
-    if figures.seconds is not None:
-        rows.append(("time of training", f"{duration(figures.seconds)}, steps alone"))
-    if figures.elapsed is not None:
-        rows.append(("wall time", f"{duration(figures.elapsed)} until the last step, with evaluations and checkpoints"))
-    if run.scene is not None:
-        rows.append(("scene", run.scene.name))
-    if figures.model is not None:
-        model = figures.model
-        size = f"{model['bytes'] / 1e6:,.1f} MB, {model['gaussians']:,} Gaussians, SH degree {model['sh_degree']}"
-        rows += [("model.ply", size), ("its SHA-256", model["sha256"])]
-    return rows
-
-
 def duration(seconds: float | None) -> str:
     """12.3 s, 4 min 5 s, 2 h 3 min."""
     if seconds is None:
@@ -266,11 +231,6 @@ def duration(seconds: float | None) -> str:
 def score(value: float, name: str) -> str:
     """A score with the digits that mean something."""
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
-
-
-def count(value: float) -> str:
-    """A count with thousands' commas."""
-    return f"{value:,.0f}"
 
 
 def _bars(histogram: dict[str, Any]) -> list[tuple[float, float]]:
