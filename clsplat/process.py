@@ -30,8 +30,8 @@ def endings() -> tuple[signal.Signals, ...]:
     Windows has no SIGTERM from outside: there it is Ctrl-Break. Signals that are ignored, as under nohup, are left out.
     """
     names = ("SIGTERM", "SIGHUP", "SIGBREAK")
-    found = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    return tuple(each for each in found if signal.getsignal(each) != signal.SIG_IGN)
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    return tuple(number for number in numbers if signal.getsignal(number) != signal.SIG_IGN)
 
 
 class Interrupted(KeyboardInterrupt):

@@ -145,7 +145,7 @@ def _check(verb: Convert) -> None:
         raise InputError(f"--drop-sh {verb.drop_sh}: expected 0 to {MAX_SH_DEGREE}")
     if (verb.prune_contribution is None) != (verb.cameras is None):
         raise InputError("--prune-contribution and --cameras go together: contributions are to these cameras")
-    defaults = {each.name: each.default for each in fields(verb)}
+    defaults = {field.name: field.default for field in fields(verb)}
     names = [name for name in ("test_every", "resolution", "background") if getattr(verb, name) != defaults[name]]
     if verb.scene is None and names:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)

@@ -10,7 +10,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from clsplat.cli.options import Flag, Verb
-from clsplat.cli.session import Services
+from clsplat.cli.session import Services, chosen_devices
 from clsplat.terminal import aligned
 
 
@@ -27,12 +27,7 @@ class Devices(Verb):
 
 def run(verb: Devices, _: Services) -> int:
     """Print the table of devices."""
-    from clsplat.device.advice import no_device
-    from clsplat.device.context import find_device, list_devices
-
-    devices = list_devices() if verb.device is None else [find_device(verb.device)]
-    if not devices:
-        raise no_device()
+    devices = chosen_devices(verb.device)
     if verb.json:
         print(json.dumps([asdict(info) for info in devices], indent=2))
         return 0

@@ -81,10 +81,10 @@ class PageOptions:
 def with_given(settings: Settings, parsed: Settings, given: Collection[str], prefix: str = "") -> Settings:
     """The settings of a run or a bundle, and of the command line those whose flags are `given`."""
     changes: dict[str, Any] = {}
-    for each in fields(settings):  # type: ignore[arg-type]
-        value, flag = getattr(settings, each.name), prefix + each.name
+    for field in fields(settings):  # type: ignore[arg-type]
+        value, flag = getattr(settings, field.name), prefix + field.name
         if is_dataclass(value):
-            changes[each.name] = with_given(value, getattr(parsed, each.name), given, f"{flag}.")
+            changes[field.name] = with_given(value, getattr(parsed, field.name), given, f"{flag}.")
         elif flag not in given:
-            changes[each.name] = value
+            changes[field.name] = value
     return replace(parsed, **changes)  # type: ignore[type-var]

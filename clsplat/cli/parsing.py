@@ -56,7 +56,7 @@ def parse(arguments: Sequence[str]) -> Verb:
     report = io.StringIO()
     helping = not {"-h", "--help"}.isdisjoint(arguments)
     try:
-        with _comma_separated(), contextlib.redirect_stderr(report), _columns(None if helping else 10_000):
+        with _text_rules(), contextlib.redirect_stderr(report), contextlib.nullcontext() if helping else _wide():
             verb: Verb = tyro.cli(commands, args=list(arguments), prog="clsplat", description=DESCRIPTION)
     except SystemExit as error:
         if error.code == 2:
@@ -68,33 +68,28 @@ def parse(arguments: Sequence[str]) -> Verb:
     return verb.completed({*flags, *(re.sub(r"(^|\.)no_", r"\1", flag) for flag in flags)})
 
 
-def _comma_separated() -> tyro.constructors.ConstructorRegistry:
-    """Lists of steps are written 500,1000,2000, tyro by itself wants spaces; a path that is empty, as a shell makes it
-    of a variable that is not set, is not the folder one is in."""
+def _text_rules() -> tyro.constructors.ConstructorRegistry:
+    """Rules for flags of one word: lists of steps are written 500,1000,2000, where tyro expects spaces. An empty path,
+    as a shell makes it of a variable that is not set, is refused: it is not the working directory."""
     registry = tyro.constructors.ConstructorRegistry()
 
     @registry.primitive_rule
-    def path(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-        if info.type is not Path:
+    def rule(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        kind: Any
+        value_of: Any
+        text_of: Any
+        if info.type is Path:
+            kind, metavar, value_of, text_of = Path, "PATH", _path, str
+        elif get_origin(info.type) is tuple and set(get_args(info.type)) <= {int, Ellipsis}:
+            kind, metavar, value_of, text_of = tuple, "STEP,STEP,...", _steps, lambda steps: ",".join(map(str, steps))
+        else:
             return None
         return tyro.constructors.PrimitiveConstructorSpec(
             nargs=1,
-            metavar="PATH",
-            instance_from_str=lambda words: _path(words[0]),
-            is_instance=lambda value: isinstance(value, Path),
-            str_from_instance=lambda value: [str(value)],
-        )
-
-    @registry.primitive_rule
-    def steps(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-        if get_origin(info.type) is not tuple or not set(get_args(info.type)) <= {int, Ellipsis}:
-            return None
-        return tyro.constructors.PrimitiveConstructorSpec(
-            nargs=1,
-            metavar="STEP,STEP,...",
-            instance_from_str=lambda words: _steps(words[0]),
-            is_instance=lambda value: isinstance(value, tuple),
-            str_from_instance=lambda value: [",".join(map(str, value))],
+            metavar=metavar,
+            instance_from_str=lambda words: value_of(words[0]),
+            is_instance=lambda value: isinstance(value, kind),
+            str_from_instance=lambda value: [text_of(value)],
         )
 
     return registry
@@ -115,22 +110,20 @@ def _steps(text: str) -> tuple[int, ...]:
 
 
 @contextlib.contextmanager
-def _columns(count: int | None) -> Iterator[None]:
-    """Make the terminal look `count` columns wide: a report to be joined to one line must not be wrapped first."""
+def _wide() -> Iterator[None]:
+    """Make the terminal look wide: a report that becomes one line must not be wrapped first."""
     before = os.environ.get("COLUMNS")
-    if count is not None:
-        os.environ["COLUMNS"] = str(count)
+    os.environ["COLUMNS"] = "10000"
     try:
         yield
     finally:
+        del os.environ["COLUMNS"]
         if before is not None:
             os.environ["COLUMNS"] = before
-        elif count is not None:
-            del os.environ["COLUMNS"]
 
 
 def _unboxed(report: str) -> str:
-    """The message of one of tyro's boxes as one line: its frame and its further advice taken off."""
+    """The message of one of tyro's boxes as one line, without the frame and the advice below."""
     words: list[str] = []
     titled = "╭" in report  # else, where standard output is not UTF-8, the first rule is below the title
     for line in report.splitlines():

@@ -74,13 +74,8 @@ def read_job(verb: Render) -> Job:
     limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
     devices = _devices(verb)
-    whole = choose_shot(
-        verb.cameras,
-        path=verb.path,
-        count=verb.count,
-        size=(verb.width, verb.height),
-        usd_camera=verb.usd_camera,
-    )
+    size = (verb.width, verb.height)
+    whole = choose_shot(verb.cameras, path=verb.path, count=verb.count, size=size, usd_camera=verb.usd_camera)
     chosen = whole if verb.frames is None else whole.only(verb.frames)
     sampling = options.pictures.sampling
     tasks = task_list.make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
@@ -88,9 +83,9 @@ def read_job(verb: Render) -> Job:
     existing.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
         check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
-    _tell_unused(verb, options.channels)
-    for warning in chosen.warnings:
-        warn(warning)
+    _warn_of_unused(verb, options.channels)
+    for text in chosen.warnings:
+        warn(text)
     model = model_file(verb.model)
     gaussians = Gaussians.load(model)
     tasks = [task.seen_from(gaussians.near) for task in tasks]
@@ -133,19 +128,19 @@ def check_foreign(job: Job, there: Collection[int]) -> None:
         )
 
 
-def _tell_unused(verb: Render, channels: Collection[str]) -> None:
+def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:
     """A warning of flags that the files have no use for."""
-    extension, usual = Path(verb.output).suffix.lower(), {each.name: each.default for each in fields(Render)}
-    given = [
+    extension, defaults = Path(verb.output).suffix.lower(), {field.name: field.default for field in fields(Render)}
+    unused = [
         name
-        for name, used in _USED_BY.items()
-        if extension not in used and getattr(verb, name) != usual[name] and not (name == "exr" and verb.deep)
+        for name, extensions in _USED_BY.items()
+        if extension not in extensions and getattr(verb, name) != defaults[name] and not (name == "exr" and verb.deep)
     ]
     if "rgb" not in channels and verb.background is not None:
-        given.append("background")
-    if given:
-        what = extension if "background" not in given else f"{extension} of these channels"
-        warn(f"not used for {what}: {', '.join(f'--{name}' for name in given)}")
+        unused.append("background")
+    if unused:
+        what = extension if "background" not in unused else f"{extension} of these channels"
+        warn(f"not used for {what}: {', '.join(f'--{name}' for name in unused)}")
 
 
 def _video(verb: Render, shot: Shot) -> VideoConfig:
@@ -256,8 +251,7 @@ def _devices(verb: Render) -> tuple[str | None, ...]:
     elif len(words) > 1:
         from clsplat.device.context import find_device
 
-        found = [find_device(word).index for word in words]
-        if len(set(found)) < len(found):
+        if len({find_device(word).index for word in words}) < len(words):
             raise InputError(f"--device {verb.device}: names a device twice, expected each once")
     return tuple(words)
 

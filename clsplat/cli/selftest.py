@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from clsplat.cli.options import Flag, Verb
-from clsplat.cli.session import Services
+from clsplat.cli.session import Services, chosen_devices
 from clsplat.terminal import aligned
 
 if TYPE_CHECKING:
@@ -39,13 +39,9 @@ class Selftest(Verb):
 
 def run(verb: Selftest, _: Services) -> int:
     """Test the devices one after the other; 1 if one of them cannot be trusted."""
-    from clsplat.device.advice import no_device
-    from clsplat.device.context import find_device, list_devices
     from clsplat.selftest.trust import examine_device
 
-    devices = list_devices() if verb.device in (None, "all") else [find_device(verb.device)]
-    if not devices:
-        raise no_device()
+    devices = chosen_devices(None if verb.device == "all" else verb.device)
     reports: list[Report] = []
     for info in devices:
         if not verb.json:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from clsplat.terminal import StageProgress
 
 if TYPE_CHECKING:
-    from clsplat.device.context import Device
+    from clsplat.device.context import Device, DeviceInfo
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
     from clsplat.scenes.scene import Scene
@@ -49,6 +49,17 @@ def load_scene(services: Services, path: Path, resolution: int, test_every: int)
     for text in scene.warnings:
         warn(text)
     return scene
+
+
+def chosen_devices(selector: str | None) -> list[DeviceInfo]:
+    """The device that `selector` names, or all devices. Raises DeviceError where there is none."""
+    from clsplat.device.advice import no_device
+    from clsplat.device.context import find_device, list_devices
+
+    devices = list_devices() if selector is None else [find_device(selector)]
+    if not devices:
+        raise no_device()
+    return devices
 
 
 def warn(text: str) -> None:

@@ -66,22 +66,24 @@ def compare_runs(runs: Sequence[Run]) -> Comparison:
     """Read them. Raises InputError as `read_figures`, and for too many."""
     if len(runs) > MAX_RUNS:
         raise InputError(f"{len(runs)} runs: expected at most {MAX_RUNS} to compare")
-    figures = [read_figures(run, describe=False) for run in runs]
-    comparison = Comparison(dict(zip(_labels([run.path for run in runs]), figures, strict=True)))
+    all_figures = [read_figures(run, describe=False) for run in runs]
+    comparison = Comparison(dict(zip(_labels([run.path for run in runs]), all_figures, strict=True)))
     notes = comparison.notes
-    for label, each in comparison.runs.items():
-        notes += [f"{label}: {note}" for note in each.notes if note.startswith(("Not finished", "eval.json"))]
-    scenes = {each.run.scene.name for each in figures if each.run.scene is not None}
+    for label, figures in comparison.runs.items():
+        notes += [f"{label}: {note}" for note in figures.notes if note.startswith(("Not finished", "eval.json"))]
+    scenes = {figures.run.scene.name for figures in all_figures if figures.run.scene is not None}
     if len(scenes) > 1:
         notes.append(f"The runs are of different scenes: {examples(sorted(scenes))}.")
-    held_out = {frozenset(view["name"] for view in each.evaluation["views"]) for each in figures if each.evaluation}
+    held_out = {
+        frozenset(view["name"] for view in figures.evaluation["views"]) for figures in all_figures if figures.evaluation
+    }
     if len(held_out) > 1:
         notes.append("The runs do not hold out the same views: their scores are not of the same pictures.")
     for name in ("resolution", "background"):
-        if len({getattr(each.run.config, name) for each in figures}) > 1:
+        if len({getattr(figures.run.config, name) for figures in all_figures}) > 1:
             notes.append(f"--{name} differs: scores are not of the same pictures.")
-    if len({each.sessions[-1].get("device") for each in figures if each.sessions}) > 1:
-        notes.append("The runs are of different devices: their times are not of one machine.")
+    if len({figures.sessions[-1].get("device") for figures in all_figures if figures.sessions}) > 1:
+        notes.append("The runs are of different devices: their times are not of figures machine.")
     return comparison
 
 

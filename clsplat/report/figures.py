@@ -53,7 +53,7 @@ class Figures:
     def step(self) -> int:
         """The last that is known of."""
         steps = [self.curves["step"][-1]] if self.curves["step"] else []
-        return int(max([*steps, *(each["step"] for each in self.evaluations)], default=0))
+        return int(max([*steps, *(record["step"] for record in self.evaluations)], default=0))
 
     @property
     def seconds(self) -> float | None:
@@ -78,7 +78,7 @@ class Figures:
 
     def document(self) -> Record:
         """Everything for --json."""
-        document = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "run"}
+        document = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "run"}
         scene = self.run.scene.name if self.run.scene is not None else None
         return {**document, "settings": asdict(self.run.config), "scene": scene}
 
@@ -132,8 +132,8 @@ def number(value: object) -> float | None:
 
 def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]:
     """Each setting by the name of its flag."""
-    for each in fields(config):  # type: ignore[arg-type]  # every caller passes a dataclass
-        value, name = getattr(config, each.name), prefix + each.name.replace("_", "-")
+    for setting in fields(config):  # type: ignore[arg-type]  # every caller passes a dataclass
+        value, name = getattr(config, setting.name), prefix + setting.name.replace("_", "-")
         if is_dataclass(value):
             yield from settings_of(value, f"{name}.")
         else:

@@ -104,7 +104,7 @@ def show(
             return None
 
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-        return [found for found in pool.map(one, wanted) if found is not None]
+        return [shown for shown in pool.map(one, wanted) if shown is not None]
 
 
 def error_colors(error: Float32) -> Float32:
@@ -112,8 +112,8 @@ def error_colors(error: Float32) -> Float32:
     at = np.clip(error / np.float32(WHITE_ERROR), 0, 1) * (len(RAMP) - 1)
     low = np.minimum(at.astype(int), len(RAMP) - 2)
     part = (at - low)[..., None]
-    found: Float32 = ((1 - part) * RAMP[low] + part * RAMP[low + 1]) / np.float32(255)
-    return found
+    colors: Float32 = ((1 - part) * RAMP[low] + part * RAMP[low + 1]) / np.float32(255)
+    return colors
 
 
 def data_uri(image: NDArray[Any]) -> str:
