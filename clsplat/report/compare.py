@@ -83,7 +83,7 @@ def compare_runs(runs: Sequence[Run]) -> Comparison:
         if len({getattr(figures.run.config, name) for figures in all_figures}) > 1:
             notes.append(f"--{name} differs: scores are not of the same pictures.")
     if len({figures.sessions[-1].get("device") for figures in all_figures if figures.sessions}) > 1:
-        notes.append("The runs are of different devices: their times are not of figures machine.")
+        notes.append("The runs are of different devices: their times are not of one machine.")
     return comparison
 
 
