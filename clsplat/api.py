@@ -10,7 +10,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.memory_plan import Plan
-from clsplat.report.last import write_last
+from clsplat.report.page import write_last
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene

@@ -25,9 +25,9 @@ def apart() -> dict[str, Any]:
 
 
 def endings() -> tuple[signal.Signals, ...]:
-    """The signals beside Ctrl-C by which managers of jobs, and a terminal that goes, ask a process to end.
+    """The signals beside Ctrl-C that ask a process to end: from managers of jobs, and from a terminal that closes.
 
-    Windows has no SIGTERM from outside: there it is Ctrl-Break. Signals that are ignored, as under nohup, are left out.
+    Windows has no SIGTERM from outside; its signal is Ctrl-Break. Ignored signals, as under nohup, are left out.
     """
     names = ("SIGTERM", "SIGHUP", "SIGBREAK")
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
@@ -43,7 +43,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def status_of(error: KeyboardInterrupt) -> int:
-    """The exit status of a process that was interrupted so, by the convention of shells: 130 for Ctrl-C."""
+    """The exit status of an interrupted process, by the convention of shells: 130 for Ctrl-C."""
     return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
 
 
@@ -54,7 +54,7 @@ def interrupt(number: int, _frame: FrameType | None) -> None:
 
 @contextmanager
 def handled(numbers: Iterable[int], handler: Handler) -> Iterator[None]:
-    """Inside, these signals call the handler. In the main thread; another one has no say in signals."""
+    """Inside, these signals call the handler. In the main thread alone: Python handles signals there."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -100,8 +100,8 @@ def undisturbed() -> Iterator[None]:
 
 
 def fill_closed_streams() -> None:
-    """Give a process that was started without standard input, output or error (`>&-`) a null device in its place: else
-    the next file that is opened takes the number, and what any library prints goes into it."""
+    """Open a null device for a standard input, output or error that the process was started without (`>&-`). Otherwise
+    the next file that is opened takes its number, and a library's prints go into that file."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -117,6 +117,6 @@ def fill_closed_streams() -> None:
 
 
 def reader_has_gone(error: OSError, *, windows: bool = sys.platform == "win32") -> bool:
-    """True if a write failed as what reads our output has ended, as `| head` does. Windows says "invalid argument", and
-    as of any stream names no file."""
+    """True if a write failed because the reader of our output has ended, as `| head` does. Windows then reports an
+    invalid argument, without a file's name."""
     return isinstance(error, BrokenPipeError) or (windows and error.errno == errno.EINVAL and error.filename is None)

@@ -23,7 +23,8 @@ from clsplat.errors import ClsplatError
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.reference.render import render_grad
-from clsplat.report import last, thumbnails
+from clsplat.report import page as report_page
+from clsplat.report import thumbnails
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import load_scene
 from clsplat.training import telemetry
@@ -357,7 +358,7 @@ def test_a_report_that_fails_does_not_fail_the_training(
     def fail(*_: object, **__: object) -> None:
         raise ClsplatError("no room")
 
-    monkeypatch.setattr(last, "write_report", fail)
+    monkeypatch.setattr(report_page, "write_report", fail)
     assert train(scene, tmp_path / "run", short(iterations=5)) == 0
     assert "warning: no report.html (no room); try again with: clsplat report" in capfd.readouterr().err
     assert (tmp_path / "run" / "eval.json").exists()

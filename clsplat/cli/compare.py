@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,6 @@ def run(verb: Compare, _: Services) -> int:
     """Print runs side by side, and write their page."""
     from clsplat.files import atomic_write, check_new
     from clsplat.report.compare import compare_runs, comparison_page, comparison_table
-    from clsplat.report.page import json_text
     from clsplat.runs.run import Run
 
     if len(verb.runs) < 2:
@@ -45,7 +45,7 @@ def run(verb: Compare, _: Services) -> int:
     if verb.output is not None:
         atomic_write(verb.output, comparison_page(comparison).encode("utf-8", "replace"))
         print(f"page in {verb.output}", file=sys.stderr)
-    print(json_text(comparison.document()) if verb.json else comparison_table(comparison))
+    print(json.dumps(comparison.document(), indent=2, allow_nan=False) if verb.json else comparison_table(comparison))
     for note in comparison.notes:
         warn(plain(note))
     return 0

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 from clsplat.cli.options import DeviceOptions, Flag, OptionalInt, RunOrModel, ScenePath, Verb
-from clsplat.cli.session import Services, load_scene, warn
+from clsplat.cli.session import Services, load_scene, run_of, warn
 from clsplat.config.training import TrainConfig
 from clsplat.errors import CapacityError, InputError, plain
 
@@ -54,20 +54,20 @@ def run(verb: Eval, services: Services) -> int:
 
 
 def _evaluate(verb: Eval, services: Services) -> int:
-    from clsplat import report
     from clsplat.evaluation.held_out import evaluate
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
     from clsplat.images.colour import recorded_space
-    from clsplat.report import last
+    from clsplat.report import NAME
+    from clsplat.report.page import write_last
     from clsplat.runs import scene_record
-    from clsplat.runs.run import Run, is_run, model_file
+    from clsplat.runs.run import model_file
     from clsplat.scenes import doubts
     from clsplat.selftest.result import FORWARD
 
     file = model_file(verb.model)
-    given_run = Run.open(verb.model) if is_run(verb.model) else None
-    trained = given_run or (Run.open(verb.model.parent) if is_run(verb.model.parent) else None)
+    trained = run_of(verb.model)
+    given_run = trained if trained and trained.path == verb.model else None
     gaussians = Gaussians.load(file)
     config = trained.config if trained else TrainConfig()
     source = verb.scene or (trained.scene if trained else None)
@@ -107,8 +107,8 @@ def _evaluate(verb: Eval, services: Services) -> int:
     )
     if given_run:
         given_run.write_eval(result)
-        if (given_run.path / report.NAME).exists():
-            last.write_last(given_run, scene, gaussians)
+        if (given_run.path / NAME).exists():
+            write_last(given_run, scene, gaussians)
     if verb.json:
         print(json.dumps(result, indent=2))
         return 0
@@ -119,7 +119,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
 
 
 def tell_of_lpips() -> None:
-    """Say once, before the work, that there will be no LPIPS, and why."""
+    """Print, before the work, why there will be no LPIPS, if so."""
     from clsplat.evaluation.metrics import prepare_lpips
 
     if reason := prepare_lpips():

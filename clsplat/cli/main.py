@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None, services: Services | None = Non
     """Run one command line, `sys.argv` if none is given; returns the exit status."""
     try:
         status = _run(list(sys.argv[1:] if arguments is None else arguments), services or Services())
-        sys.stdout.flush()  # here and not at the interpreter's end, where a reader that has gone would be a traceback
+        sys.stdout.flush()  # at the interpreter's end a reader that has gone would be a traceback
     except OSError as error:
         if not reader_has_gone(error):  # a file that standard output goes to cannot be written
             tell(f"clsplat: error: standard output: {system_trouble(error)}")

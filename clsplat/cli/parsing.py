@@ -141,8 +141,8 @@ def _unboxed(report: str) -> str:
 
 
 def tell(line: str) -> None:
-    """Print on standard error, if that takes it: the status says the same."""
+    """Print on standard error if that is possible; the exit status says the same."""
     try:
         print(line, file=sys.stderr, flush=True)
-    except OSError:  # what is left of it would make the interpreter end with a status of its own
+    except OSError:  # text left in the stream would make the interpreter end with a status of its own
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())

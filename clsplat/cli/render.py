@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat render`: its flags, and a job from its begin to its exit status.
+"""`clsplat render`: its flags, and a job from the call to the exit status.
 
-What a call means is in `clsplat.cli.render_request`, the plan of --dry-run in `clsplat.cli.render_plan`, the job's loop
-in `clsplat.sequence.workers`, one frame in `clsplat.sequence.frame_renderer`, clusters in `clsplat.sequence.farm`.
+A call is checked in `clsplat.cli.render_request`, --dry-run is in `clsplat.cli.render_plan`, the job's loop in
+`clsplat.sequence.workers`, one frame in `clsplat.sequence.frame_renderer`, clusters in `clsplat.sequence.farm`.
 """
 
 from __future__ import annotations

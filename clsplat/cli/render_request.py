@@ -104,8 +104,8 @@ def read_job(verb: Render) -> Job:
 
 
 def frames_there(job: Job) -> set[int]:
-    """The numbers of the frames that `--skip-existing` leaves out, with a warning of those whose files do not say with
-    which settings they were made."""
+    """The numbers of the frames that `--skip-existing` leaves out. Warns of files that do not record the settings they
+    were made with."""
     if not job.verb.skip_existing:
         return set()
     there = existing.complete(job.tasks, job.options)
@@ -129,7 +129,7 @@ def check_foreign(job: Job, there: Collection[int]) -> None:
 
 
 def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:
-    """A warning of flags that the files have no use for."""
+    """Warn of flags that the files have no use for."""
     extension, defaults = Path(verb.output).suffix.lower(), {field.name: field.default for field in fields(Render)}
     unused = [
         name
@@ -184,7 +184,7 @@ def _options(verb: Render) -> RenderOptions:
 
 
 def _for_workers(colour: ColourConfig) -> ColourConfig:
-    """The configuration that is meant here, for processes with other surroundings too."""
+    """The colour settings with the absolute path of the OCIO configuration, for processes in other folders."""
     source = colour.ocio_config or os.environ.get("OCIO", "")
     if source and "://" not in source:
         source = str(Path(source).absolute())
@@ -290,9 +290,9 @@ def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Ca
 
 
 def reshaped(camera: Camera, width: int, height: int) -> Camera:
-    """The camera in another size. Where that has another shape, if by rounding alone, the vertical angle of view stays
-    and so do the pixels' proportions: the picture shows more or less to the left and right. So all sizes of one shape
-    show the same. A panorama shows all around in any shape."""
+    """The camera in another size. In another shape, even if only by rounding, it keeps the vertical angle of view and
+    the pixels' proportions: the picture shows more or less to the left and right. So all sizes of one shape show the
+    same. A panorama shows all around in any shape."""
     if (width, height) == (camera.width, camera.height):
         return camera
     if width * camera.height == height * camera.width or camera.projection == "equirectangular":

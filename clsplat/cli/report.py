@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -39,7 +40,7 @@ class Report(Verb):
 def run(verb: Report, _: Services) -> int:
     """Write the page."""
     from clsplat.files import check_new
-    from clsplat.report.page import json_text, write_report
+    from clsplat.report.page import write_report
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run
 
@@ -51,7 +52,7 @@ def run(verb: Report, _: Services) -> int:
     with nullcontext() if verb.output else locked(run.path, "report"):
         figures = write_report(run, path, views=verb.views)
     if verb.json:
-        print(json_text(figures.document()))
+        print(json.dumps(figures.document(), indent=2, allow_nan=False))
     for note in figures.notes:
         warn(plain(note))
     print(f"report in {path}", file=sys.stderr)

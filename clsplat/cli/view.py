@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from clsplat.cli.options import DeviceOptions, PageOptions, RunOrModel, ScenePath, Verb
-from clsplat.cli.session import Services, warn
+from clsplat.cli.session import Services, run_of, warn
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.process import endings, handled
@@ -49,11 +49,11 @@ class View(Verb):
 
 
 def run(verb: View, services: Services) -> int:
-    """A model in the browser, until Ctrl-C, which is the way to end it."""
+    """Show a model in the browser until Ctrl-C."""
     from clsplat.device.child import TrialInterrupted
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
-    from clsplat.runs.run import Run, is_run, model_file
+    from clsplat.runs.run import model_file
     from clsplat.selftest.result import FORWARD
     from clsplat.viewer.models import HeldModel
     from clsplat.viewer.scheduler import Viewing
@@ -62,8 +62,7 @@ def run(verb: View, services: Services) -> int:
 
     address = Address(verb.page.host, verb.page.port, verb.page.paths)
     file = model_file(verb.model)
-    folder = verb.model if verb.model.is_dir() else file.parent
-    run = Run.open(folder) if is_run(folder) else None
+    run = run_of(verb.model)
     address.check()
     gaussians = Gaussians.load(file)
     if not len(gaussians):
@@ -136,7 +135,7 @@ def _world(gaussians: Gaussians, scene: Scene | None, title: str) -> World:
 
 
 def _warm(model: HeldModel, world: World) -> None:
-    """Make a picture in motion and one at rest, as the first of all wait for kernels to be built."""
+    """Make a picture in motion and one at rest: the first pictures wait for kernels to be built."""
     from clsplat.viewer.appearance import Look
     from clsplat.viewer.pose import looking
 

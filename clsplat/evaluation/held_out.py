@@ -71,8 +71,8 @@ def evaluate(
 
 
 def picture_names(names: Sequence[str], extension: str = ".png") -> list[str]:
-    """Relative file names for views: the extension replaced, sub-folders kept; where two would be one, on a file system
-    that ignores case too, added."""
+    """Relative file names for views, in their sub-folders, with the extension replaced. It is added instead where two
+    names would be one, also on a file system that ignores case."""
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
     keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names on every system
     uses = Counter(keys)

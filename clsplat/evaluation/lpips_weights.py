@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The weights of LPIPS' network: where torch looks for them, and from where they come."""
+"""The weights of LPIPS' network: their place for torch, and their download."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def place() -> Path:
 
 
 def limit() -> float:
-    """Seconds. Raises InputError for a VARIABLE that is no number from 0 up."""
+    """Seconds that the download may take. Raises InputError for a VARIABLE that is no number from 0 up."""
     text = os.environ.get(VARIABLE) or str(LONGEST)
     try:
         seconds = float(text)
@@ -76,7 +76,7 @@ class _Transfer:
     def run(self) -> None:
         try:
             self._run()
-        except Exception as error:  # noqa: BLE001  # of any kind: what is wrong is told, and evaluation goes on
+        except Exception as error:  # noqa: BLE001  # of any kind: it is reported, and evaluation goes on
             self.trouble = " ".join(str(error).split())[:100] or type(error).__name__
 
     def _run(self) -> None:

@@ -66,8 +66,8 @@ def lpips_missing() -> str | None:
 
 @functools.cache
 def prepare_lpips() -> str | None:
-    """Prepare LPIPS, in seconds but for the network's weights, which are fetched if they are missing. Returns the
-    reason that it cannot be used and what to do about it, None where it can. Loads nothing."""
+    """Prepare LPIPS: fetch the network's weights if they are missing. Loads nothing. Returns None, or the reason that
+    LPIPS cannot be used and what to do about it."""
     for name in ("lpips", "torch"):
         if find_spec(name) is None:
             return f"the optional extra is not installed (no {name}): pip install 'clsplat[lpips]'"

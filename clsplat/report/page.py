@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -61,6 +61,15 @@ def write_report(
     page = report_page(figures, scene, views)
     atomic_write(path or run.path / NAME, page.encode("utf-8", "replace"))
     return figures
+
+
+def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
+    """Write the report of a finished training. A failure is a warning: hours of training must not fail for a page."""
+    try:
+        write_report(run, scene=scene, model=model)
+    except Exception as error:  # noqa: BLE001
+        why = " ".join(str(error).split()) or type(error).__name__
+        warnings.warn(f"no {NAME} ({why}); try again with: clsplat report {run.path}", stacklevel=2)
 
 
 def report_page(figures: Figures, scene: Scene | str | None = None, views: int = MAX_VIEWS) -> str:
@@ -259,8 +268,3 @@ def _data(figures: Figures) -> dict[str, Any]:
 
 def _hash(text: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-
-
-def json_text(value: object) -> str:
-    """Text for --json."""
-    return json.dumps(value, indent=2, allow_nan=False)

@@ -74,8 +74,7 @@ def scene_of(run: Run) -> Scene | str:
 
 
 def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
-    """Indices of the views to show, at most `limit`: the worst, the best, and evenly between, in the order that they
-    have."""
+    """Indices of at most `limit` views to show, ascending: the worst, the best, and evenly between by score."""
     if len(scores) <= limit:
         return list(range(len(scores)))
     order = sorted(range(len(scores)), key=lambda index: (scores[index] is None, scores[index] or 0.0, index))
