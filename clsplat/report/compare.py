@@ -105,7 +105,7 @@ def comparison_page(comparison: Comparison) -> str:
         settings=[(name, list(map(setting_text, values))) for name, values in comparison.differing.items()],
         views=views[:MAX_ROWS],
         views_left_out=max(len(views) - MAX_ROWS, 0),
-        machine=[(label, _machine(figures)) for label, figures in runs.items()],
+        runs=runs,
         data=comparison.document(),
     )
 
@@ -188,13 +188,3 @@ def _best(values: Sequence[float | None], name: str) -> float | None:
     if len(known) < 2:
         return None
     return min(known) if name == "lpips" else max(known)
-
-
-def _machine(figures: Figures) -> str:
-    if not figures.sessions:
-        return "not known"
-    last = figures.sessions[-1]
-    versions = last.get("versions", {})
-    words = [last.get("device"), (last.get("driver") or "").split("  ")[0], last.get("shape"), last.get("system")]
-    clsplat = f"clsplat {versions['clsplat']}" if "clsplat" in versions else None
-    return "; ".join(word for word in [*words, clsplat] if word) or "not known"

@@ -89,12 +89,13 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         if len(shown) < len(wanted):
             notes.append(f"{len(wanted) - len(shown)} renders of held-out views are not in test/, or cannot be read.")
     scores = {view["name"]: view for view in listed}
+    defaults = dict(settings_of(TrainConfig()))
     places = {view.name: place for place, view in enumerate(shown, 1)}
     return render_page(
         "report.html",
         figures=figures,
         notes=notes,
-        summary=summary(figures),
+        titles=TITLES,
         charts=list(filter(None, charts(figures))),
         histograms=list(filter(None, histograms(figures))),
         stages=stage_rows(figures),
@@ -105,7 +106,10 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         columns=[(name, TITLES[name]) for name in SCORES if any(name in view for view in listed)],
         views=listed[:MAX_ROWS],
         views_left_out=max(len(listed) - MAX_ROWS, 0),
-        settings=setting_rows(figures),
+        settings=[
+            (name, setting_text(value), setting_text(defaults[name]), value != defaults[name])
+            for name, value in settings_of(figures.run.config)
+        ],
         data=_data(figures),
     )
 
@@ -123,18 +127,6 @@ def render_page(name: str, **values: Any) -> str:
         version=clsplat.__version__,
         **values,
     )
-
-
-def summary(figures: Figures) -> list[tuple[str, str, str]]:
-    """The figures at the top of the page: label, text and exact value."""
-    mean = figures.evaluation["mean"] if figures.evaluation else {}
-    rows = [(TITLES[name], score(mean[name], name), repr(mean[name])) for name in SCORES if name in mean]
-    if figures.gaussians is not None:
-        rows.append(("Gaussians", f"{figures.gaussians:,}", str(figures.gaussians)))
-    rows.append(("steps", f"{figures.step:,}", str(figures.step)))
-    if figures.seconds is not None:
-        rows.append(("training", duration(figures.seconds), repr(figures.seconds)))
-    return rows
 
 
 def charts(figures: Figures) -> list[Markup]:
@@ -209,15 +201,6 @@ def histograms(figures: Figures) -> list[Markup]:
         series = [Series("contribution", bars["contribution"], "bars", 3)]
         made.append(chart("Contribution", series, "pixels", "Gaussians", powers=True, note=note))
     return made
-
-
-def setting_rows(figures: Figures) -> list[tuple[str, str, str, bool]]:
-    """Flag, value, default and whether they differ."""
-    defaults = dict(settings_of(TrainConfig()))
-    return [
-        (name, setting_text(value), setting_text(defaults[name]), value != defaults[name])
-        for name, value in settings_of(figures.run.config)
-    ]
 
 
 def setting_text(value: object) -> str:
