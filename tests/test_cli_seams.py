@@ -19,8 +19,8 @@ from clsplat.cli.session import Services
 from clsplat.cli.train import Train
 from clsplat.config.presets import PRESETS
 from clsplat.config.training import TrainConfig
+from clsplat.progress import aligned
 from clsplat.runs.run import Run
-from clsplat.terminal import aligned
 
 
 def test_every_verb_is_a_module_with_its_arguments_and_its_function() -> None:
@@ -86,7 +86,7 @@ def test_services_are_the_packages_functions() -> None:
     calls = import_module("clsplat.cli.session")
     for each in fields(Services):
         assert callable(getattr(Services(), each.name)), each.name
-    assert calls.imported("clsplat.terminal.aligned")([["a", "b"]]) == ["a  b"]
+    assert calls.imported("clsplat.progress.aligned")([["a", "b"]]) == ["a  b"]
 
 
 def test_a_device_has_its_limit_and_is_tested() -> None:

@@ -6,8 +6,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from clsplat.progress import FrameProgress, StageProgress, TrainProgress, duration
 from clsplat.sequence.task import Record
-from clsplat.terminal import FrameProgress, StageProgress, TrainProgress, duration
 
 
 @dataclass

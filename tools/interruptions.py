@@ -57,7 +57,7 @@ VERBS = (
     Verb("demo", "demo -o {out}/demo --iterations 100", "/demo/photos"),
     Verb("sfm", "sfm {photos} -o {out}/scene", "/.scene-sfm-*/database.db"),
     Verb("train", TRAIN, "/run/metrics.jsonl"),
-    Verb("eval", "eval {out}/run", "clsplat.terminal"),
+    Verb("eval", "eval {out}/run", "clsplat.progress"),
     Verb("render", "render {model} --cameras {scene} --path turntable --count 200 -o {out}/a.####.png", "/a.0002.png"),
     Verb("view", "view {model} --port 0", "!socket.bind", writes=False),
     Verb("report", "report {out}/run", "clsplat.report.page"),

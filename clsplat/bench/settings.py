@@ -22,6 +22,7 @@ from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.gaussians import Gaussians
+from clsplat.progress import aligned
 from clsplat.reference.blend import blend
 from clsplat.reference.project import project
 from clsplat.reference.render import parameters
@@ -30,7 +31,6 @@ from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.rendering.renderer import held_sh
 from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
-from clsplat.terminal import aligned
 
 if TYPE_CHECKING:
     from clsplat.reference.project import Projected

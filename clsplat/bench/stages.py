@@ -23,6 +23,7 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
+from clsplat.progress import aligned
 from clsplat.rendering.rasterizer import Frame
 from clsplat.rendering.renderer import Renderer, held_sh
 from clsplat.scenes.lens import Lens
@@ -30,7 +31,6 @@ from clsplat.scenes.scene import Scene, View
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.stages.limit import Limits, measure_limits
-from clsplat.terminal import aligned
 from clsplat.training.trainer import Trainer
 
 FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")

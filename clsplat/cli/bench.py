@@ -61,7 +61,7 @@ def run(verb: Bench, services: Services) -> int:
     from clsplat.bench.plots import check_plot, plot_files, plot_settings
     from clsplat.device.context import Device, select
     from clsplat.files import check_new
-    from clsplat.terminal import StageProgress
+    from clsplat.progress import StageProgress
 
     size, limit = parse_size(verb.size), parse_bytes(verb.device.max_device_mem)
     if verb.gaussians < 1:

@@ -15,7 +15,7 @@ from clsplat.cli.options import Flag, Memory, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services, warn
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
-from clsplat.terminal import StageProgress
+from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians

@@ -11,7 +11,7 @@ from tyro.conf import arg
 
 from clsplat.cli.options import Flag, Verb
 from clsplat.cli.session import Services, chosen_devices
-from clsplat.terminal import aligned
+from clsplat.progress import aligned
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import examples
 from clsplat.process import status_of, terminable
-from clsplat.terminal import FrameProgress
+from clsplat.progress import FrameProgress
 
 if TYPE_CHECKING:
     from clsplat.cli.render_request import Job

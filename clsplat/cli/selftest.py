@@ -12,7 +12,7 @@ from tyro.conf import arg
 
 from clsplat.cli.options import Flag, Verb
 from clsplat.cli.session import Services, chosen_devices
-from clsplat.terminal import aligned
+from clsplat.progress import aligned
 
 if TYPE_CHECKING:
     from clsplat.device.context import DeviceInfo

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clsplat.terminal import StageProgress
+from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
     from clsplat.device.context import Device, DeviceInfo

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from clsplat.cli.options import Flag, OptionalInt, Output, Verb
 from clsplat.cli.session import Services
 from clsplat.errors import InputError
-from clsplat.terminal import StageProgress
+from clsplat.progress import StageProgress
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from clsplat.config.presets import Preset, Schedule, bundled
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.process import status_of
-from clsplat.terminal import TrainProgress
+from clsplat.progress import TrainProgress
 
 if TYPE_CHECKING:
     from clsplat.rendering.memory_plan import Plan

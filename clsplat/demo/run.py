@@ -18,13 +18,13 @@ from clsplat.errors import InputError, examples
 from clsplat.files import atomic_write, is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
+from clsplat.progress import StageProgress, TrainProgress
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
 from clsplat.scenes import sfm
 from clsplat.scenes.scene import load_scene
 from clsplat.shots.generated import turntable
-from clsplat.terminal import StageProgress, TrainProgress
 
 PHOTOS = 40
 WIDTH, HEIGHT = 320, 240

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import atomic_writer, is_file
-from clsplat.terminal import StageProgress
+from clsplat.progress import StageProgress
 
 URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 """Address of VGG-16's weights, about 530 MB. The name has the first digits of the file's SHA-256."""

@@ -11,11 +11,11 @@ from typing import Any
 from markupsafe import Markup
 
 from clsplat.errors import InputError, examples, plain
+from clsplat.progress import aligned
 from clsplat.report.figures import SCORES, Figures, read_figures, settings_of, smooth
 from clsplat.report.page import TITLES, duration, render_page, score, setting_text
 from clsplat.report.svg import COLORS, Series, chart
 from clsplat.runs.run import Run
-from clsplat.terminal import aligned
 
 MAX_RUNS = 24
 MAX_ROWS = 100

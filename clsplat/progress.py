@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text for the terminal: tables, and progress as a live bar, or as a plain line every ten seconds elsewhere."""
+"""Progress on standard error: a live bar on a terminal, a plain line every ten seconds elsewhere. And tables of text."""
 
 from __future__ import annotations
 
