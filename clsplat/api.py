@@ -30,18 +30,19 @@ def train(
     on_plan: Callable[[Plan], None] | None = None,
     between: Between | None = None,
 ) -> Gaussians:
-    """Train on a scene; the model.
+    """Train on a scene; returns the model.
 
-    config: the run's, or the defaults, where it is not given; a run is told of another one. device: open, or as
-    `clsplat devices` names it; max_device_mem: the most of its memory to use, such as "256MiB". run: a folder for
-    metrics, checkpoints, held-out renders and the model, or None for none of them; resume: go on from the run's latest
-    checkpoint, without which a run that has been trained is refused; on_step: called every
-    REPORT_EVERY steps; on_plan: told how the device's memory is used, before the first step and when that changes;
-    between: called before each step; it may render what the trainer has, and take its time, which is not counted.
-    Raises InputError for a scene without views, one that is not the resumed run's, and a run that another process
-    writes, ClsplatError where numbers are not finite again and again (docs/decisions/0016-never-a-nan.md; a warning
-    tells of what could be mended), and Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP after a
-    checkpoint has been written.
+    config: the run's, or else the defaults, unless given; a given one is written to the run. device: an open one, or a
+    name as `clsplat devices` lists them. max_device_mem: the most of its memory to use, such as "256MiB". run: a folder
+    for metrics, checkpoints, held-out renders and the model; None writes nothing. resume: go on from the run's latest
+    checkpoint; without it a run that has been trained is refused. on_step: called every REPORT_EVERY steps. on_plan:
+    called with the use of device memory, before the first step and when it changes. between: called before each step;
+    it may render the trainer's model, and its time is not counted.
+
+    Raises InputError for a scene without views, a scene that is not the resumed run's, and a run that another process
+    writes. Raises ClsplatError where numbers are not finite again and again (docs/decisions/0016-never-a-nan.md);
+    values that could be repaired give a warning. Raises Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP,
+    after a checkpoint has been written.
     """
     config = loop.checked(scene, config, run, resume=resume)
     with nullcontext() if run is None else locked(run.path, "train"):

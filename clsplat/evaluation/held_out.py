@@ -31,7 +31,7 @@ def evaluate(
     seconds: float | None,
     space: str = "sRGB",
 ) -> dict[str, Any]:
-    """Measure every view; the result is what eval.json holds.
+    """Measure every view; returns the content of eval.json.
 
     render: gives a view's image (H, W, 3), float, over `background` (3,), at the size of `view.load()`; save_dir: the
     renders go there as PNG in sRGB, under the view's name. space: the colour space of renders and photographs, in

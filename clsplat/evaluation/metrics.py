@@ -52,10 +52,7 @@ def ssim(image: Image, truth: Image) -> float:
 def lpips(image: Image, truth: Image) -> float | None:
     """LPIPS (VGG, as the paper reports), or None where it is not installed: `lpips_missing` says why."""
     model = _lpips_model()
-    if isinstance(model, str):
-        return None
-    a, b = _pair(image, truth)
-    return model(a, b)
+    return None if isinstance(model, str) else model(*_pair(image, truth))
 
 
 def lpips_missing() -> str | None:
