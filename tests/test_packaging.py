@@ -19,7 +19,7 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
-TEMPLATES = ("base.html", "compare.html", "page.js", "report.html", "style.css")
+TEMPLATES = ("base.html", "chart.html", "compare.html", "page.js", "report.html", "style.css")
 FOUND = "from clsplat.device.source import kernel_root; print(kernel_root())"
 
 

@@ -200,4 +200,4 @@ def test_all_display_options_beside_resume(tmp_path: Path) -> None:
     Run.create(tmp_path, FEW)
     verb = parse(["train", "-o", str(tmp_path), "--resume", *" ".join(DISPLAY).split()])
     assert isinstance(verb, Train)
-    assert (verb.json, verb.view, verb.port, verb.accept_changes, verb.resume) == (True, True, 9, True, True)
+    assert (verb.json, verb.view, verb.page.port, verb.accept_changes, verb.resume) == (True, True, 9, True, True)
