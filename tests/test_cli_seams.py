@@ -15,7 +15,7 @@ from calls import Capture
 from clsplat.cli import parsing
 from clsplat.cli.main import main, parse
 from clsplat.cli.options import DeviceOptions, Verb
-from clsplat.cli.session import Services
+from clsplat.cli.session import Services, imported
 from clsplat.cli.train import Train
 from clsplat.config.presets import PRESETS
 from clsplat.config.training import TrainConfig
@@ -83,10 +83,10 @@ def test_a_flag_that_repeats_the_default_changes_a_runs_setting(tmp_path: Path) 
 
 
 def test_services_are_the_packages_functions() -> None:
-    calls = import_module("clsplat.cli.session")
-    for each in fields(Services):
-        assert callable(getattr(Services(), each.name)), each.name
-    assert calls.imported("clsplat.progress.aligned")([["a", "b"]]) == ["a  b"]
+    for service in fields(Services):
+        module, _, name = getattr(Services(), service.name).__name__.rpartition(".")
+        assert callable(getattr(import_module(module), name)), service.name
+    assert imported("clsplat.progress.aligned")([["a", "b"]]) == ["a  b"]
 
 
 def test_a_device_has_its_limit_and_is_tested() -> None:

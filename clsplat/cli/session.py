@@ -27,6 +27,7 @@ def imported(name: str) -> Callable[..., Any]:
     def call(*arguments: Any, **named: Any) -> Any:
         return getattr(import_module(module), member)(*arguments, **named)
 
+    call.__name__ = name
     return call
 
 
