@@ -65,6 +65,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
     from clsplat.scenes import doubts
     from clsplat.selftest.result import FORWARD
 
+    verb.device.check()
     file = model_file(verb.model)
     trained = run_of(verb.model)
     given_run = trained if trained and trained.path == verb.model else None

@@ -65,6 +65,10 @@ class DeviceOptions(DeviceChoice):
         """The device with its memory limit, not yet tested. Raises InputError and DeviceError."""
         return services.open_device(self.selector, parse_bytes(self.max_device_mem))
 
+    def check(self) -> None:
+        """Raise InputError for a limit that is no size, before anything is read."""
+        parse_bytes(self.max_device_mem)
+
 
 @dataclass(frozen=True)
 class PageOptions:

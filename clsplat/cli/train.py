@@ -97,6 +97,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
 
+    verb.device.check()
     verb.config.check()
     page = None
     if verb.view:

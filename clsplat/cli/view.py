@@ -61,6 +61,7 @@ def run(verb: View, services: Services) -> int:
     from clsplat.viewer.training_view import LONGEST_WAIT
 
     address = Address(verb.page.host, verb.page.port, verb.page.paths)
+    verb.device.check()
     file = model_file(verb.model)
     run = run_of(verb.model)
     address.check()
