@@ -27,7 +27,7 @@ from clsplat.bench import subject as bench_subject
 from clsplat.bench.labels import LEADER, Box, Segment, place_labels
 from clsplat.cli.main import main
 from clsplat.config.presets import PRESETS
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT, TILE
 from clsplat.errors import InputError
@@ -163,7 +163,7 @@ def test_evaluated_pairs_on_a_cpu_are_those_in_the_ellipse(default_device: Devic
 def test_switches_show_in_the_counts(default_device: Device) -> None:
     scene = scenes.random_cloud(1000, 8, 100, 70)
     counts = {}
-    for name, config in {"default": RasterizerConfig(), "rows": RasterizerConfig(row_skip=False)}.items():
+    for name, config in {"default": RasterizerConfig(), "rows": BenchSwitches(row_skip=False)}.items():
         pipeline = Pipeline.run(shaped(default_device, 8, 1), scene)
         pipeline.rasterizer = Rasterizer(pipeline.rasterizer.device, config)
         counts[name] = counted(pipeline)
@@ -299,9 +299,9 @@ def test_crop_of_the_reference_is_part_of_it(crop: tuple[int, int, int, int]) ->
 def test_settings_hold_every_switch_and_preset() -> None:
     named = tradeoff.settings()
     assert "preset exact = default" in named
-    assert set(PRESETS.values()) <= set(named.values())
-    for field in RasterizerConfig.__dataclass_fields__:
-        assert any(getattr(config, field) != getattr(RasterizerConfig(), field) for config in named.values()), field
+    assert {config.switches() for config in PRESETS.values()} <= set(named.values())
+    for field in BenchSwitches.__dataclass_fields__:
+        assert any(getattr(config, field) != getattr(BenchSwitches(), field) for config in named.values()), field
 
 
 @pytest.mark.slow
@@ -309,7 +309,7 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(tradeoff, "CROP", 48)
     candidates = {
         "exact": PRESETS["exact"],
-        "no row-skip": RasterizerConfig(row_skip=False),
+        "no row-skip": BenchSwitches(row_skip=False),
         "coarse": RasterizerConfig(alpha_min=8 / 255),
     }
     result = tradeoff.compare(bench_subject.synthetic(300, 70, 50), profiled, candidates, repeat=1)
@@ -332,8 +332,8 @@ def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPat
     off = every[tradeoff.ALL_OFF]
     for field, value in asdict(off).items():
         if isinstance(value, bool | str) and field != "sh_storage":  # it and the numbers are approximations
-            assert value != getattr(RasterizerConfig(), field), field
-    assert (off.tile_test, off.alpha_min) == ("square", RasterizerConfig().alpha_min)
+            assert value != getattr(BenchSwitches(), field), field
+    assert (off.tile_test, off.alpha_min) == ("square", BenchSwitches().alpha_min)
     times = iter([50.0, 100.0, 150.0, 210.0])  # of a frame and of a step, on and off
     monkeypatch.setattr(tradeoff, "wall_ms", lambda _device, work: (work(), next(times))[1])
     candidates = {"preset exact = default": PRESETS["exact"], tradeoff.ALL_OFF: off}

@@ -44,8 +44,8 @@ def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture)
         assert (verb.model, verb.output, verb.alpha, verb.json) == (Path(str(path)), "{name}.png", True, True)
         return verb
 
-    half = ["--rasterizer.sh-storage", "half", "--rasterizer.no-frustum-cull"]
-    changes: dict[str, Any] = {"sh_storage": "half", "frustum_cull": False}
+    half = ["--rasterizer.sh-storage", "half", "--rasterizer.sh-degree-limit", "1"]
+    changes: dict[str, Any] = {"sh_storage": "half", "sh_degree_limit": 1}
     for path, bundle in ((model, RasterizerConfig()), (run, own)):
         assert parsed(path).rasterizer == bundle
         assert parsed(path, *half).rasterizer == replace(bundle, **changes)

@@ -14,7 +14,7 @@ from quick import quick
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
@@ -29,7 +29,7 @@ def cloud(count: int = 1000) -> scenes.Scene:
 
 def frame(device: Device, gaussians: Gaussians, camera: Camera, **settings: object) -> Float32:
     """By a new Renderer."""
-    config = replace(RasterizerConfig(), **settings)  # type: ignore[arg-type]
+    config = replace(BenchSwitches(), **settings)  # type: ignore[arg-type]
     return Renderer(device, config=config).render(gaussians, camera).image
 
 
@@ -68,7 +68,7 @@ def test_degrees_are_those_of_the_gaussians(shaped_device: Device) -> None:
     """Not of zero bands: each Gaussian's other coefficients are there, and would show."""
     gaussians, camera = cloud()
     degrees = np.random.default_rng(1).integers(0, 4, len(gaussians)).astype(np.uint8)
-    storage = replace(held_sh(gaussians, RasterizerConfig()), degrees=degrees)
+    storage = replace(held_sh(gaussians, BenchSwitches()), degrees=degrees)
     renderer = Renderer(shaped_device)
     got = renderer.render(upload_gaussians(shaped_device, gaussians, storage), camera).image
     assert_same_bits(got, whole(shaped_device, cut(gaussians, degrees), camera))
@@ -87,7 +87,7 @@ def test_degrees_and_the_limit_of_all(default_device: Device, limit: int) -> Non
 def test_tolerance(default_device: Device, tolerance: float) -> None:
     """A pixel's weights add up to at most 1, so that its error is at most that of a Gaussian's colour."""
     gaussians, camera = cloud()
-    renderer = Renderer(default_device, config=RasterizerConfig(sh_tolerance=tolerance))
+    renderer = Renderer(default_device, config=BenchSwitches(sh_tolerance=tolerance))
     got, wanted = renderer.render(gaussians, camera).image, whole(default_device, gaussians, camera)
     difference = np.abs(got - wanted).max()
     assert difference <= tolerance + 1e-6  # rounding of colours up to 2
@@ -105,7 +105,7 @@ def test_halves(default_device: Device, degree: int) -> None:
     gaussians, camera = scenes.random_cloud(1000, 8, 100, 70, degree=degree)
     rounded = gaussians.sh.copy()
     rounded[:, 1:] = rounded[:, 1:].astype(np.float16)
-    renderer = Renderer(default_device, config=RasterizerConfig(sh_storage="half"))
+    renderer = Renderer(default_device, config=BenchSwitches(sh_storage="half"))
     got = renderer.render(gaussians, camera).image
     assert_same_bits(got, whole(default_device, with_sh(gaussians, rounded), camera))
     assert held(renderer)["sh_rest"].nbytes == 2 * gaussians.sh[:, 1:].size
@@ -151,7 +151,7 @@ def test_a_frame_in_less_memory(default_device: Device, settings: dict[str, obje
     wanted = frame(free, gaussians, camera, **settings)
     limit = int(share * free.memory.peak)
     device = default_device.with_memory_limit(limit)
-    renderer = Renderer(device, config=replace(RasterizerConfig(), **settings))  # type: ignore[arg-type]
+    renderer = Renderer(device, config=replace(BenchSwitches(), **settings))  # type: ignore[arg-type]
     for _ in range(2):
         assert_same_bits(renderer.render(gaussians, camera).image, wanted)
     assert device.memory.peak <= limit
@@ -168,6 +168,6 @@ def test_halves_take_less_memory(default_device: Device) -> None:
     assert peaks[0] - peaks[1] == pytest.approx(6000 * 90, abs=64)
     # What fits as halves and not as floats is held on the device all the same.
     device = default_device.with_memory_limit(peaks[0] - 6000 * 60)
-    renderer = Renderer(device, config=RasterizerConfig(sh_storage="half"))
+    renderer = Renderer(device, config=BenchSwitches(sh_storage="half"))
     renderer.render(gaussians, camera)
     assert isinstance(held(renderer), DeviceGaussians)

@@ -16,7 +16,7 @@ from tiny import CONFIG, short, write_scene
 import clsplat
 from clsplat.api import train
 from clsplat.cli.main import main
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
@@ -53,7 +53,7 @@ def test_a_frame_in_less_memory(default_device: Device, share: float) -> None:
 
 
 def test_a_frame_that_sorts_all_pairs_in_less_memory(default_device: Device) -> None:
-    config = RasterizerConfig(tile_test="square", depth_sort="pairs")
+    config = BenchSwitches(tile_test="square", depth_sort="pairs")
     scene, camera = random_cloud(6000, 11, 100, 80)
     free = with_limit(default_device, None)
     wanted = Renderer(free, config=config).render(scene, camera)

@@ -11,7 +11,7 @@ from compare import assert_same_bits
 from pipeline import BACKGROUND, Pipeline
 from scenes import make_gaussians, overlap, straight_camera
 
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
@@ -80,7 +80,7 @@ def test_what_is_behind_the_camera_is_not_drawn_and_disturbs_no_order(
     """A negative depth's bits are larger than any positive one's as an unsigned key."""
     camera = overlap()[1]
     behind = np.asarray(camera.rotation.T @ (np.array([0.0, 0.0, -3.0]) - camera.translation), np.float32)
-    ways = (None, RasterizerConfig(depth_sort="pairs"), RasterizerConfig(frustum_cull=False))
+    ways = (None, BenchSwitches(depth_sort="pairs"), BenchSwitches(frustum_cull=False))
     for at in (behind, camera.position.astype(np.float32)):
         for config in ways if device is default_device else ways[:1]:  # each is a build
             assert_as_if_absent(device, with_row(model, 7, means=at), 7, config)
@@ -133,7 +133,7 @@ def test_an_infinite_scale_spoils_nothing(device: Device, model: Gaussians, log_
 def test_opacities_about_the_least_visible_one(device: Device, default_device: Device, model: Gaussians) -> None:
     """Under it the logarithm of what is left of the extent would be negative."""
     least = -np.log(np.float64(254.0))
-    ways = (None, RasterizerConfig(opacity_cull=False), RasterizerConfig(extent="constant"))
+    ways = (None, BenchSwitches(opacity_cull=False), BenchSwitches(extent="constant"))
     for logit in (-np.inf, np.nan, -100.0, -20.0, least - 1e-3):
         for config in ways if device is default_device else ways[:1]:  # each is a build
             assert_as_if_absent(device, with_row(model, 7, opacity_logits=logit), 7, config)
@@ -166,7 +166,7 @@ def test_a_colour_that_is_nan_is_not_drawn(device: Device, model: Gaussians) -> 
             changed = with_row(model, 7)
             changed.sh[7, 0, channel] = value
             assert_as_if_absent(device, changed, 7)
-            assert_as_if_absent(device, changed, 7, RasterizerConfig(frustum_cull=False))
+            assert_as_if_absent(device, changed, 7, BenchSwitches(frustum_cull=False))
 
 
 def test_a_colour_that_no_picture_has_but_that_is_finite_is_drawn(device: Device, model: Gaussians) -> None:

@@ -3,15 +3,18 @@
 
 import json
 import os
-from dataclasses import fields, replace
+import warnings
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 from models import random_gaussians
 
 import clsplat
 from clsplat.cli.main import Train, main, parse
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import TEMPORARY_SUFFIX
@@ -85,17 +88,36 @@ def test_a_setting_of_an_earlier_version_still_loads(
     assert main(["eval", str(tmp_path)]) == 2, "it has no model"
     told = [line for line in capsys.readouterr().err.splitlines() if "sh_angle" in line]
     assert len(told) <= (angle != 0)
-    assert parse_config(path.read_text(), path, tell=False)[0] == TrainConfig(iterations=9)
+    assert parse_config(path.read_text(), path)[0] == TrainConfig(iterations=9)
 
 
 def test_a_setting_of_an_earlier_version_is_told_once(tmp_path: Path) -> None:
     path = tmp_path / "config.toml"
     path.write_text('clsplat = "1"\n[train.rasterizer]\nsh_angle = 2.5\n')
-    with pytest.warns(
-        UserWarning, match=r"config\.toml: train\.rasterizer\.sh_angle is 2\.5 there and is passed over"
-    ) as told:
+    with pytest.warns(UserWarning, match=r"config\.toml: passed over, .*: train\.rasterizer\.sh_angle = 2\.5$") as told:
         assert read_config(path) == read_config(path) == (TrainConfig(), None)
     assert len(told) == 1
+
+
+def test_switches_that_only_the_bench_has_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    text = tomli_w.dumps({"clsplat": "1", "train": {"rasterizer": asdict(BenchSwitches())}})
+    path.write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_config(path) == (TrainConfig(), None), "as every earlier version wrote them"
+    path.write_text(
+        text.replace("row_skip = true", "row_skip = false")
+        .replace('extent = "opacity"', 'extent = "constant"')
+        .replace("sh_degree_limit = 3", "sh_degree_limit = 1")
+    )
+    with pytest.warns(UserWarning, match="passed over") as told:
+        assert read_config(path) == (TrainConfig(rasterizer=RasterizerConfig(sh_degree_limit=1)), None)
+    assert len(told) == 1
+    assert str(told[0].message).endswith(": train.rasterizer.extent = 'constant', train.rasterizer.row_skip = False")
+    path.write_text(text.replace('extent = "opacity"', "extent = 3"))
+    with pytest.raises(InputError, match=r"train\.rasterizer\.extent is 3, expected one of opacity, 3sigma"):
+        read_config(path)
 
 
 def test_a_run_is_not_written_over(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
 
 from clsplat.config.presets import PRESETS
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT, TILE
@@ -29,22 +29,22 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import upload_gaussians
 
 EXACT_OFF = {
-    "constant extent": RasterizerConfig(extent="constant"),
-    "box": RasterizerConfig(tile_test="box"),
-    "square": RasterizerConfig(tile_test="square"),
-    "pairs by depth": RasterizerConfig(depth_sort="pairs"),
-    "all bits": RasterizerConfig(key_bits="all"),
-    "pairs by all bits": RasterizerConfig(depth_sort="pairs", key_bits="all"),
-    "rows": RasterizerConfig(row_skip=False),
-    "columns": RasterizerConfig(column_skip=False),
-    "vectors": RasterizerConfig(vector_skip=False),
-    "early stop": RasterizerConfig(early_stop=False),
-    "last contributor": RasterizerConfig(last_contributor=False),
-    "record cells": RasterizerConfig(record_cells=False),
-    "gradient skip": RasterizerConfig(gradient_skip=False),
-    "frustum cull": RasterizerConfig(frustum_cull=False),
-    "opacity cull": RasterizerConfig(opacity_cull=False),
-    "all": RasterizerConfig(
+    "constant extent": BenchSwitches(extent="constant"),
+    "box": BenchSwitches(tile_test="box"),
+    "square": BenchSwitches(tile_test="square"),
+    "pairs by depth": BenchSwitches(depth_sort="pairs"),
+    "all bits": BenchSwitches(key_bits="all"),
+    "pairs by all bits": BenchSwitches(depth_sort="pairs", key_bits="all"),
+    "rows": BenchSwitches(row_skip=False),
+    "columns": BenchSwitches(column_skip=False),
+    "vectors": BenchSwitches(vector_skip=False),
+    "early stop": BenchSwitches(early_stop=False),
+    "last contributor": BenchSwitches(last_contributor=False),
+    "record cells": BenchSwitches(record_cells=False),
+    "gradient skip": BenchSwitches(gradient_skip=False),
+    "frustum cull": BenchSwitches(frustum_cull=False),
+    "opacity cull": BenchSwitches(opacity_cull=False),
+    "all": BenchSwitches(
         extent="constant",
         tile_test="square",
         depth_sort="pairs",
@@ -130,7 +130,7 @@ def test_every_define_is_looked_at_by_a_kernel() -> None:
 @pytest.mark.parametrize("on", [True, False])
 def test_last_contributor_is_where_the_gradient_begins(default_device: Device, on: bool) -> None:
     """A Gaussian behind an opaque tile whose colour is not a number spoils the gradient if it is looked at."""
-    config = RasterizerConfig(vector_skip=False, last_contributor=on, record_cells=False)
+    config = BenchSwitches(vector_skip=False, last_contributor=on, record_cells=False)
     pipeline = run(shaped(default_device, 8, 1), "wall", config)
     frame = pipeline.frame
     rows, stride = frame.blended.stops.shape
@@ -168,7 +168,7 @@ def test_exact_switches_change_no_bit(default_device: Device, switch: str, name:
 @pytest.mark.parametrize("extent", quick(["opacity", "constant", "3sigma"], "opacity"))
 @pytest.mark.parametrize("name", ["off_frustum", "sheaf", "cloud"])
 def test_culling_that_is_off_lists_more_gaussians(default_device: Device, name: str, extent: Any) -> None:
-    check_culling(default_device, name, RasterizerConfig(extent=extent), ((False, True), (True, False), (False, False)))
+    check_culling(default_device, name, BenchSwitches(extent=extent), ((False, True), (True, False), (False, False)))
 
 
 def test_culling_that_is_off_on_every_device(device: Device) -> None:
@@ -180,7 +180,7 @@ def check_culling(device: Device, name: str, config: RasterizerConfig, ways: tup
     default = run(device, name, config)
     in_front = default.frame.part.counted.visible
     for frustum, opacity in ways:
-        got = run(device, name, replace(config, frustum_cull=frustum, opacity_cull=opacity))
+        got = run(device, name, replace(config.switches(), frustum_cull=frustum, opacity_cull=opacity))
         assert_same_bits(got.frame.blended.image.get(), default.frame.blended.image.get())
         projected, counted = got.frame.projected, got.frame.part.counted
         np.testing.assert_array_equal(projected.tile_counts.get(), default.frame.projected.tile_counts.get())
@@ -201,7 +201,7 @@ def check_culling(device: Device, name: str, config: RasterizerConfig, ways: tup
 def test_culling_that_is_off_in_bands(default_device: Device) -> None:
     gaussians, camera = scene("sheaf")
     frames = []
-    for config in (RasterizerConfig(), RasterizerConfig(frustum_cull=False, opacity_cull=False)):
+    for config in (RasterizerConfig(), BenchSwitches(frustum_cull=False, opacity_cull=False)):
         rasterizer = Rasterizer(default_device, config)
         rasterizer.capacity = 20_000
         background = upload(default_device, np.array(BACKGROUND, np.float32))

@@ -17,7 +17,7 @@ from clsplat.bench.stages import columns, held_kind, picture_of, trainer_of, wal
 from clsplat.bench.subject import Progress, Subject
 from clsplat.camera import Camera
 from clsplat.config.presets import PRESETS
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import PLAIN_SLOTS
@@ -60,9 +60,9 @@ class Error:
         return cls(psnr, float(np.abs(difference).max()))
 
 
-def settings() -> dict[str, RasterizerConfig]:
+def settings() -> dict[str, BenchSwitches]:
     """The points of the plot: presets, and each switch away from its default alone, and the exact ones together."""
-    named = {f"preset {name}": config for name, config in PRESETS.items()}
+    named = {f"preset {name}": config.switches() for name, config in PRESETS.items()}
     changes: dict[str, dict[str, Any]] = {
         "extent constant": {"extent": "constant"},
         "tile-test box": {"tile_test": "box"},
@@ -87,8 +87,8 @@ def settings() -> dict[str, RasterizerConfig]:
     changes["sh-storage half"] = {"sh_storage": "half"}
     changes.update({f"alpha-min {steps}/255": {"alpha_min": steps / 255} for steps in (2, 4)})
     changes.update({f"transmittance-min {value:g}": {"transmittance_min": value} for value in (1e-3, 1e-2)})
-    named.update({name: replace(RasterizerConfig(), **change) for name, change in changes.items()})
-    merged: dict[RasterizerConfig, str] = {}
+    named.update({name: BenchSwitches(**change) for name, change in changes.items()})
+    merged: dict[BenchSwitches, str] = {}
     for name, config in named.items():
         merged[config] = f"{merged[config]} = {name.removeprefix('preset ')}" if config in merged else name
     return {name: config for config, name in merged.items()}
@@ -103,7 +103,7 @@ def approximate(config: RasterizerConfig) -> bool:
 def compare(
     subject: Subject,
     device: Device,
-    candidates: dict[str, RasterizerConfig] | None = None,
+    candidates: Mapping[str, RasterizerConfig] | None = None,
     *,
     repeat: int = 5,
     progress: Progress | None = None,
@@ -113,7 +113,7 @@ def compare(
     image. Where both are among the settings, also how many times faster all exact switches together make them.
     """
     say = progress or (lambda *_: None)
-    candidates = candidates or settings()
+    candidates = {name: config.switches() for name, config in (candidates or settings()).items()}
     trainer, camera = trainer_of(subject, device, PRESETS["exact"]), subject.camera
     model, work = trainer.parameters, trainer.rasterizer.work
     background = upload(device, np.zeros(3, np.float32))
@@ -168,7 +168,7 @@ def compare(
 
 
 def _points(
-    candidates: Mapping[str, RasterizerConfig],
+    candidates: Mapping[str, BenchSwitches],
     found: Mapping[str, tuple[Error, Error]],
     medians: Mapping[str, tuple[float, ...]],
     *,
@@ -193,13 +193,13 @@ def _points(
     return points
 
 
-def _exact_of(candidates: Mapping[str, RasterizerConfig]) -> str | None:
+def _exact_of(candidates: Mapping[str, BenchSwitches]) -> str | None:
     """The name of the setting that is the `exact` preset."""
-    return next((name for name, config in candidates.items() if config == PRESETS["exact"]), None)
+    return next((name for name, config in candidates.items() if config == PRESETS["exact"].switches()), None)
 
 
 def _faster(
-    candidates: Mapping[str, RasterizerConfig], medians: Mapping[str, tuple[float, ...]]
+    candidates: Mapping[str, BenchSwitches], medians: Mapping[str, tuple[float, ...]]
 ) -> dict[str, float] | None:
     on = _exact_of(candidates)
     if on is None or ALL_OFF not in medians:

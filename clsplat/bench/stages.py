@@ -50,7 +50,7 @@ def bench(
     """Measure every stage; returns what `clsplat bench --json` prints. The device's queue should have been made with
     profiling."""
     say = progress or (lambda *_: None)
-    config = config or RasterizerConfig()
+    config = (config or RasterizerConfig()).switches()
     say("limits", None)
     limits = limits or measure_limits(device)
     say("frame", None)

@@ -132,7 +132,7 @@ def _bundle_of(arrays: dict[str, NDArray[Any]], path: Path) -> Bundle:
     record = parse_json(arrays[RECORD].tobytes())
     size = record["camera"]
     lens = (size["width"], size["height"], size["fx"], size["fy"], size["cx"], size["cy"])
-    config, _ = parse_config(record["settings"], path, tell=False)
+    config, _ = parse_config(record["settings"], path)
     camera = Camera(*lens, arrays["rotation"], arrays["translation"], near=size["near"])
     models = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS}
     return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
