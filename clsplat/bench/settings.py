@@ -113,7 +113,7 @@ def compare(
     image. Where both are among the settings, also how many times faster all exact switches together make them.
     """
     say = progress or (lambda *_: None)
-    candidates = {name: config.switches() for name, config in (candidates or settings()).items()}
+    tried = {name: config.switches() for name, config in (candidates or settings()).items()}
     trainer, camera = trainer_of(subject, device, PRESETS["exact"]), subject.camera
     model, work = trainer.parameters, trainer.rasterizer.work
     background = upload(device, np.zeros(3, np.float32))
@@ -134,16 +134,14 @@ def compare(
         trainer.train_step()
 
     models: dict[tuple[object, ...], AnyGaussians] = {held_kind(PRESETS["exact"]): model}
-    for config in candidates.values():
+    for config in tried.values():
         if (kind := held_kind(config)) not in models:
             models[kind] = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
     exact = picture_of(draw(trainer.rasterizer))
-    rasterizers = {name: Rasterizer(device, config, work) for name, config in candidates.items()}
+    rasterizers = {name: Rasterizer(device, config, work) for name, config in tried.items()}
+    size = (model.count, model.coefficients, [camera])
     for rasterizer in rasterizers.values():
-        config = rasterizer.config
-        rasterizer.follow(
-            plan_step(device, model.count, model.coefficients, [camera], config, fields=PLAIN_SLOTS, agreement=False)
-        )
+        rasterizer.follow(plan_step(device, *size, rasterizer.config, fields=PLAIN_SLOTS, agreement=False))
     found = {}
     for done, (name, rasterizer) in enumerate(rasterizers.items()):
         say("settings", done / len(rasterizers))
@@ -158,12 +156,12 @@ def compare(
     medians = {name: tuple(map(statistics.median, zip(*each, strict=True))) for name, each in times.items()}
     whole = (width, height) == (camera.width, camera.height)
     return {
-        "exact": _exact_of(candidates),
-        "exact_switches_faster": _faster(candidates, medians),
+        "exact": _exact_of(tried),
+        "exact_switches_faster": _faster(tried, medians),
         "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
         "crop": list(crop),
         "exact_against_float64": asdict(errors(exact)[0]),
-        "points": _points(candidates, found, medians, whole=whole),
+        "points": _points(tried, found, medians, whole=whole),
     }
 
 

@@ -3,13 +3,90 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.config.training import DensityConfig
+from clsplat.config.training import DensityConfig, TrainConfig
+from clsplat.errors import ClsplatError
+from clsplat.training.density import HostCopy, ModelState, RowPlan, StatisticsNeeds, Strategy
+
+
+class Adaptive(Strategy):
+    """The strategy of Kerbl et al., with what `DensityConfig` adds to it."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        self.config, self.white = config.density, config.background == "white"
+
+    def needs(self, step: int = 0) -> StatisticsNeeds:
+        """Gradients as long as Gaussians are densified, the others where the settings go by them."""
+        config = self.config
+        return StatisticsNeeds(
+            gradients=step < config.stop,
+            absolute=config.absolute_gradients,
+            agreement=config.every > 0 and config.views_agree > 1,
+            threshold=config.gradient_threshold,
+            contributions=wants_contributions(config, step),
+        )
+
+    def is_due(self, step: int) -> bool:
+        """True if Gaussians are densified or pruned, or opacities are reset."""
+        rows_change = is_due(self.config, step) or is_pruning_due(self.config, step)
+        return rows_change or is_reset_due(self.config, step, white=self.white)
+
+    def before_step(self, model: ModelState) -> RowPlan:
+        """Densify or prune, then reset opacities, whichever is due."""
+        config, step, statistics = self.config, model.step, model.statistics
+        logits = model.parameters["opacity_logits"].get()
+        known: dict[str, Any] = {"opacity_logits": logits, "contributions": _contributions(statistics)}
+        chosen: Plan | None = None
+        densifies = is_due(config, step)
+        if densifies:
+            names = ("gradient_sums", "seen", "radii", "agreeing")
+            known |= {name: statistics[name].get() for name in names if name in statistics}
+            chosen = plan(config, step, model.extent, log_scales=model.parameters["log_scales"].get(), **known)
+        elif is_pruning_due(config, step):
+            chosen = plan_pruning(config, step, **known)
+        values = {}
+        if chosen is not None:
+            if len(chosen.rows) == 0:
+                raise ClsplatError(
+                    f"step {step}: every Gaussian was pruned; lower --density.min-opacity"
+                    + (" or --density.min-contribution" if config.min_contribution > 0 else "")
+                )
+            logits, values = logits[chosen.rows], _halves(config, chosen, model)
+        if resets := is_reset_due(config, step, white=self.white):
+            values["opacity_logits"] = np.arange(len(logits)), reset_opacities(config, logits)
+        return RowPlan(
+            rows=chosen.rows if chosen is not None else None,
+            fresh=chosen.fresh if chosen is not None else None,
+            values=values,
+            restarted=("opacity_logits",) if resets else (),
+            new_statistics=densifies,
+            forget_contributions=resets,
+        )
+
+
+def _contributions(statistics: Mapping[str, HostCopy]) -> Contributions | None:
+    if "whole_totals" not in statistics:
+        return None
+    largest = (statistics[f"{epoch}_largest"].get() for epoch in ("current", "whole"))
+    return Contributions(statistics["whole_totals"].get(), np.maximum(*largest))
+
+
+def _halves(config: DensityConfig, chosen: Plan, model: ModelState) -> dict[str, tuple[NDArray[Any], Float32]]:
+    """Rows of the halves of what is split, and their means and log scales."""
+    halves = np.flatnonzero(chosen.split)
+    if len(halves) == 0:
+        return {}
+    names = ("means", "quaternions", "log_scales")
+    origins = {name: model.parameters[name].get()[chosen.rows[halves]] for name in names}
+    means, log_scales = split_halves(config, **origins, rng=model.rng)
+    return {"means": (halves, means), "log_scales": (halves, log_scales)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +129,6 @@ def wants_contributions(config: DensityConfig, step: int = 0) -> bool:
     if step <= last_fraction:
         return True
     return config.min_contribution > 0 and (config.prune_every > 0 or (config.every > 0 and step < config.stop))
-
-
-def wants_agreement(config: DensityConfig) -> bool:
-    """True if the views over the threshold are to be counted."""
-    return config.every > 0 and config.views_agree > 1
 
 
 @dataclass(frozen=True, eq=False)
