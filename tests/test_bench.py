@@ -24,7 +24,7 @@ from clsplat.bench import plots
 from clsplat.bench import settings as tradeoff
 from clsplat.bench import stages as bench_stages
 from clsplat.bench import subject as bench_subject
-from clsplat.bench.labels import LEADER, Box, Segment, place_labels
+from clsplat.bench.labels import LEADER, crossed, place_labels, shared
 from clsplat.cli.main import main
 from clsplat.config.presets import PRESETS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
@@ -466,31 +466,33 @@ def test_plots_of_little(tmp_path: Path, result: dict[str, object]) -> None:
 
 def test_labels_cover_nothing() -> None:
     rng = np.random.default_rng(5)
-    frame = Box(0, 0, 700, 450)
+    frame = np.array([0.0, 0.0, 700.0, 450.0])
     crowds = [rng.uniform((50, 50), (650, 400), (20, 2)), rng.normal((300, 100), (12, 40), (12, 2))]
-    for crowd in [*crowds, np.full((4, 2), 200.0), np.array([[1.0, 1.0], [699.0, 449.0]])]:
-        points = [(float(x), float(y)) for x, y in crowd]
-        sizes = [(float(rng.uniform(60, 170)), 16.0) for _ in points]
-        line = ((300.0, 0.0), (300.0, 450.0))
-        places = place_labels(points, sizes, frame, [line])
-        assert places == place_labels(points, sizes, frame, [line])
-        for index, (place, size) in enumerate(zip(places, sizes, strict=True)):
-            box = place.box
-            assert (box.right - box.left, box.top - box.bottom) == pytest.approx(size)
-            assert frame.holds(box)
-            assert not any(box.overlaps(other.box) for other in places[index + 1 :])
-            assert not any(box.left < x < box.right and box.bottom < y < box.top for x, y in points)
-            assert not any(box.crossed(other.leader) for other in places if other.leader)
-            assert (place.leader is None) == (box.distance(points[index]) <= LEADER)
+    for points in [*crowds, np.full((4, 2), 200.0), np.array([[1.0, 1.0], [699.0, 449.0]])]:
+        sizes = np.array([(rng.uniform(60, 170), 16.0) for _ in points])
+        line = np.array([[(300.0, 0.0), (300.0, 450.0)]])
+        places, again = place_labels(points, sizes, frame, line), place_labels(points, sizes, frame, line)
+        boxes = np.array([place.box for place in places])
+        leaders = np.array([place.leader for place in places if place.leader is not None]).reshape(-1, 2, 2)
+        np.testing.assert_array_equal(boxes, [place.box for place in again])
+        np.testing.assert_allclose(boxes[:, 2:] - boxes[:, :2], sizes)
+        assert ((boxes[:, :2] >= frame[:2]) & (boxes[:, 2:] <= frame[2:])).all()
+        np.testing.assert_array_equal(shared(boxes, boxes) > 0, np.eye(len(points), dtype=bool))
+        inside = (boxes[:, None, :2] < points) & (points < boxes[:, None, 2:])
+        assert not inside.all(axis=2).any()
+        assert not crossed(boxes, leaders).any()
+        apart = np.linalg.norm(points.clip(boxes[:, :2], boxes[:, 2:]) - points, axis=1) > LEADER
+        assert [place.leader is not None for place in places] == apart.tolist()
 
 
 def test_too_many_labels_have_a_place_each() -> None:
-    places = place_labels([(50.0, 20.0)] * 6, [(60.0, 16.0)] * 6, Box(0, 0, 100, 40))
+    points, sizes = np.full((6, 2), (50.0, 20.0)), np.full((6, 2), (60.0, 16.0))
+    places = place_labels(points, sizes, np.array([0.0, 0.0, 100.0, 40.0]))
     assert len(places) == 6
 
 
 @pytest.mark.parametrize(
-    ("segment", "crossed"),
+    ("segment", "goes_through"),
     [
         (((0, 0), (4, 3)), True),
         (((0, 2), (5, 2)), True),
@@ -501,8 +503,8 @@ def test_too_many_labels_have_a_place_each() -> None:
         (((0, 3), (3, 6)), False),
     ],
 )
-def test_segments_through_a_box(segment: Segment, crossed: bool) -> None:
-    assert Box(1, 1, 4, 3).crossed(segment) is crossed
+def test_segments_through_a_box(segment: tuple[tuple[float, float], ...], goes_through: bool) -> None:
+    assert crossed(np.array([[1.0, 1.0, 4.0, 3.0]]), np.array([segment], float)).item() is goes_through
 
 
 @pytest.mark.needs("matplotlib")

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from clsplat.config.training import DensityConfig
+from clsplat.config.training import DensityConfig, TrainConfig
+from clsplat.training.density import StatisticsNeeds
 from clsplat.training.density.adaptive import (
+    Adaptive,
     Contributions,
     Plan,
     budget,
@@ -18,8 +20,6 @@ from clsplat.training.density.adaptive import (
     is_pruning_due,
     plan,
     plan_pruning,
-    wants_agreement,
-    wants_contributions,
 )
 
 CONFIG = DensityConfig()
@@ -182,12 +182,16 @@ def test_when_pruning_is_due() -> None:
     assert due == [70, *range(2000, 15_000, 2000), 15_500, *range(16_000, 20_001, 2000)]
 
 
+def needs(config: DensityConfig, step: int = 0) -> StatisticsNeeds:
+    return Adaptive(TrainConfig(density=config)).needs(step)
+
+
 def test_contributions_are_gathered_only_while_something_goes_by_them() -> None:
-    assert not wants_contributions(CONFIG)
-    assert not wants_contributions(replace(CONFIG, prune_every=100)), "that alone goes by opacity"
+    assert not needs(CONFIG).contributions
+    assert not needs(replace(CONFIG, prune_every=100)).contributions, "that alone goes by opacity"
 
     def last(config: DensityConfig) -> int:
-        wanted = [wants_contributions(config, step) for step in range(20_001)]
+        wanted = [needs(config, step).contributions for step in range(20_001)]
         assert wanted == sorted(wanted, reverse=True), "from the first step on"
         return sum(wanted) - 1
 
@@ -196,6 +200,6 @@ def test_contributions_are_gathered_only_while_something_goes_by_them() -> None:
     assert last(replace(CONFIG, min_contribution=1.0, every=0, prune_every=100)) == 20_000
     assert last(replace(CONFIG, prune_at=(900, 7000), prune_fraction=0.5)) == 7000
     assert last(replace(CONFIG, prune_at=(900,), prune_fraction=0.5, min_contribution=1.0)) == CONFIG.stop - 1
-    assert not wants_agreement(CONFIG)
-    assert wants_agreement(replace(CONFIG, views_agree=2))
-    assert not wants_agreement(replace(CONFIG, views_agree=2, every=0))
+    assert not needs(CONFIG).agreement
+    assert needs(replace(CONFIG, views_agree=2)).agreement
+    assert not needs(replace(CONFIG, views_agree=2, every=0)).agreement

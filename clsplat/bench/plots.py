@@ -13,7 +13,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from clsplat.bench.labels import Box, Place, place_labels
+import numpy as np
+
+from clsplat.bench.labels import place_labels
 from clsplat.bench.settings import ALL_OFF, PSNR_MAX, front
 from clsplat.errors import InputError
 from clsplat.files import atomic_writer
@@ -37,6 +39,7 @@ PAD = 2.0
 """Pixels around a label."""
 
 Points = Sequence[Mapping[str, Any]]
+Point = tuple[float, float]
 
 
 def check_plot(path: Path) -> None:
@@ -188,29 +191,20 @@ def _over_the_axes(figure: Any, axes: Any, x: float, text: str) -> None:
 
 
 def label_points(
-    figure: Any,
-    axes: Any,
-    points: Sequence[tuple[float, float]],
-    texts: Sequence[str],
-    lines: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
-) -> list[Place]:
+    figure: Any, axes: Any, points: Sequence[Point], texts: Sequence[str], lines: Sequence[tuple[Point, Point]] = ()
+) -> None:
     """Write a text beside each point, with a leader line where it lies apart; `lines` are better not crossed. The axes
     must have their place and limits."""
     to_pixels, to_figure = axes.transData.transform, figure.transFigure.inverted().transform
     bounds = axes.get_window_extent()
-    frame = Box(bounds.x0 + PAD, bounds.y0 + PAD, bounds.x1 - PAD, bounds.y1 - PAD)
-    sizes = [(width + 2 * PAD, height + 2 * PAD) for width, height in (_extent(figure, text) for text in texts)]
-    spots = [tuple(map(float, to_pixels(point))) for point in points]
-    crossed = [(tuple(map(float, to_pixels(a))), tuple(map(float, to_pixels(b)))) for a, b in lines]
-    places = place_labels(spots, sizes, frame, crossed)  # type: ignore[arg-type]
+    frame = np.array([bounds.x0 + PAD, bounds.y0 + PAD, bounds.x1 - PAD, bounds.y1 - PAD])
+    sizes = np.array([_extent(figure, text) for text in texts]) + 2 * PAD
+    segments = to_pixels(np.reshape(lines, (-1, 2))).reshape(-1, 2, 2)
     line = import_module("matplotlib.lines").Line2D
-    for text, place in zip(texts, places, strict=True):
-        corner = to_figure((place.box.left + PAD, place.box.bottom + PAD))
-        figure.text(*corner, text, ha="left", va="bottom", fontsize=SIZE)
+    for text, place in zip(texts, place_labels(to_pixels(points), sizes, frame, segments), strict=True):
+        figure.text(*to_figure(place.box[:2] + PAD), text, ha="left", va="bottom", fontsize=SIZE)
         if place.leader is not None:
-            x, y = zip(*map(to_figure, place.leader), strict=True)
-            figure.add_artist(line(x, y, color=GREY, linewidth=0.8, zorder=1))
-    return places
+            figure.add_artist(line(*to_figure(place.leader).T, color=GREY, linewidth=0.8, zorder=1))
 
 
 def sheet(titles: Sequence[str], notes: Sequence[str], heights: Mapping[str, float], left: float) -> tuple[Any, Any]:

@@ -23,14 +23,18 @@ class Adaptive(Strategy):
         self.config, self.white = config.density, config.background == "white"
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Gradients as long as Gaussians are densified, the others where the settings go by them."""
+        """Gradients as long as Gaussians are densified, the others where some pruning at the end of this step or later
+        goes by them."""
         config = self.config
+        densifies = config.every > 0 and step < config.stop
+        prunes = config.min_contribution > 0 and (config.prune_every > 0 or densifies)
+        prunes_a_share = config.prune_fraction > 0 and step <= max(config.prune_at, default=-1)
         return StatisticsNeeds(
             gradients=step < config.stop,
             absolute=config.absolute_gradients,
             agreement=config.every > 0 and config.views_agree > 1,
             threshold=config.gradient_threshold,
-            contributions=wants_contributions(config, step),
+            contributions=prunes or prunes_a_share,
         )
 
     def is_due(self, step: int) -> bool:
@@ -120,15 +124,6 @@ def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
     return (config.opacity_reset_every > 0 and step % config.opacity_reset_every == 0) or (
         white and step == config.start
     )
-
-
-def wants_contributions(config: DensityConfig, step: int = 0) -> bool:
-    """True if the Gaussians' contributions have to be known in this step: some pruning at its end or later goes by
-    them."""
-    last_fraction = max(config.prune_at) if config.prune_fraction > 0 and config.prune_at else -1
-    if step <= last_fraction:
-        return True
-    return config.min_contribution > 0 and (config.prune_every > 0 or (config.every > 0 and step < config.stop))
 
 
 @dataclass(frozen=True, eq=False)
