@@ -57,7 +57,7 @@ def test_config_comes_back(tmp_path: Path) -> None:
         ('clsplat = "1"\n[train]\niterations = "many"\n', "train.iterations is 'many', expected a whole number"),
         ('clsplat = "1"\n[train]\niterations = true\n', "train.iterations is True, expected a whole number"),
         ('clsplat = "1"\n[train]\nbackground = "red"\n', "expected one of black, white, random"),
-        ('clsplat = "1"\n[train]\neval_at = [1, "x"]\n', "train.eval_at is 'x', expected a whole number"),
+        ('clsplat = "1"\n[train]\neval_at = [1, "x"]\n', "train.eval_at is [1, 'x'], expected whole numbers"),
         ('clsplat = "1"\n[train]\noptimiser = 3\n', "train.optimiser is 3, expected a table"),
         ('clsplat = "1"\n[train\n', "not readable as TOML"),
     ],

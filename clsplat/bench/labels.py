@@ -86,13 +86,14 @@ def _candidates(point: Float64, size: Float64) -> Float64:
 
 def _nearest(boxes: Float64, points: Float64) -> Float64:
     """The place in each box that is nearest to a point."""
-    return np.clip(points, boxes[..., :2], boxes[..., 2:])
+    return points.clip(boxes[..., :2], boxes[..., 2:])
 
 
 def shared(boxes: Float64, others: Float64) -> Float64:
     """The areas that boxes (m, 4) and others (n, 4) both cover, (m, n)."""
     low = np.maximum(boxes[:, None, :2], others[:, :2])
-    return (np.minimum(boxes[:, None, 2:], others[:, 2:]) - low).clip(0).prod(axis=2)
+    areas: Float64 = (np.minimum(boxes[:, None, 2:], others[:, 2:]) - low).clip(0).prod(axis=2)
+    return areas
 
 
 def crossed(boxes: Float64, segments: Float64) -> NDArray[np.bool_]:
@@ -104,7 +105,8 @@ def crossed(boxes: Float64, segments: Float64) -> NDArray[np.bool_]:
         clips = np.sort(np.stack([(low - start) / move, (high - start) / move]), axis=0)
     first, last = np.where(move == 0, 0, clips[0]).max(axis=2), np.where(move == 0, 1, clips[1]).min(axis=2)
     beside = ((move == 0) & ~((low < start) & (start < high))).any(axis=2)
-    return ~beside & (first.clip(0) < last.clip(None, 1))
+    inside: NDArray[np.bool_] = ~beside & (first.clip(0) < last.clip(None, 1))
+    return inside
 
 
 def _cross(segments: Float64, others: Float64) -> NDArray[np.bool_]:

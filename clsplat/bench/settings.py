@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -63,24 +63,16 @@ class Error:
 def settings() -> dict[str, BenchSwitches]:
     """The points of the plot: presets, and each switch away from its default alone, and the exact ones together."""
     named = {f"preset {name}": config.switches() for name, config in PRESETS.items()}
+    flags = [each.name for each in fields(BenchSwitches) if each.default is True]
     changes: dict[str, dict[str, Any]] = {
         "extent constant": {"extent": "constant"},
         "tile-test box": {"tile_test": "box"},
         "tile-test square": {"tile_test": "square"},
         "depth-sort pairs": {"depth_sort": "pairs"},
         "key-bits all": {"key_bits": "all"},
-        "no row-skip": {"row_skip": False},
-        "no column-skip": {"column_skip": False},
-        "no vector-skip": {"vector_skip": False},
-        "no early-stop": {"early_stop": False},
-        "no last-contributor": {"last_contributor": False},
-        "no record-cells": {"record_cells": False},
-        "no gradient-skip": {"gradient_skip": False},
-        "no frustum-cull": {"frustum_cull": False},
-        "no opacity-cull": {"opacity_cull": False},
+        **{f"no {flag.replace('_', '-')}": {flag: False} for flag in flags},
     }
-    together: dict[str, Any] = {key: value for change in changes.values() for key, value in change.items()}
-    changes[ALL_OFF] = together
+    changes[ALL_OFF] = {key: value for change in changes.values() for key, value in change.items()}
     changes["extent 3sigma"] = {"extent": "3sigma"}
     changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
     changes.update({f"sh-tolerance {steps}/255": {"sh_tolerance": steps / 255} for steps in (4, 16, 64)})

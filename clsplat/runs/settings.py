@@ -3,18 +3,19 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import warnings
 from dataclasses import asdict, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_origin, get_type_hints
 
-import numpy as np
 import tomli_w
 
 import clsplat
+from clsplat.config.checks import misfit
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
@@ -44,17 +45,8 @@ def config_text(config: TrainConfig, scene: Path | None) -> str:
     document: dict[str, Any] = {"clsplat": clsplat.__version__}
     if scene is not None:
         document["scene"] = str(scene)
-    document["train"] = _of_python(asdict(config))
+    document["train"] = json.loads(json.dumps(asdict(config), default=lambda number: number.item()))  # no NumPy
     return tomli_w.dumps(document)
-
-
-def _of_python(value: Any) -> Any:
-    """Settings without NumPy's numbers, which TOML does not know."""
-    if isinstance(value, dict):
-        return {key: _of_python(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_of_python(each) for each in value]
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
@@ -107,7 +99,10 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: l
         if is_dataclass(types[key]):
             values[key] = _from_table(types[key], value, path, name, passed_over)
         else:
-            values[key] = _value(types[key], value, f"{path}: {name}")
+            if expected := misfit(types[key], value):
+                raise InputError(f"{path}: {name} is {value!r}, expected {expected}")
+            kind = get_origin(types[key]) or types[key]
+            values[key] = kind(value) if kind in (float, tuple) else value
     return cls(**values)
 
 
@@ -130,20 +125,3 @@ def _meant(key: str, where: str) -> str:
 def _warn_once(text: str) -> None:
     """A warning, once however often a file is read."""
     warnings.warn(text)
-
-
-def _value(kind: Any, value: Any, what: str) -> Any:
-    """`value`, as TOML gives it, for a field of type `kind`."""
-    if get_origin(kind) is Literal:
-        if value in get_args(kind):
-            return value
-        raise InputError(f"{what} is {value!r}, expected one of {', '.join(map(str, get_args(kind)))}")
-    if get_origin(kind) is tuple:
-        if isinstance(value, list):
-            return tuple(_value(get_args(kind)[0], item, what) for item in value)
-    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300:
-        return float(value)
-    elif type(value) is kind and not (kind is int and abs(value) >= 1 << 62):
-        return value
-    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
-    raise InputError(f"{what} is {value!r}, expected {words.get(kind, 'a list of whole numbers')}")

@@ -7,8 +7,8 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -107,6 +107,16 @@ class _Session:
         self.saved = 0
         self.told_stages: set[str] = set()
         self.untold = 0
+
+    def __enter__(self) -> _Session:  # noqa: PYI034  # Self came with 3.11
+        return self
+
+    def __exit__(self, _kind: object, error: BaseException | None, _where: object) -> None:
+        """Nothing is lost of what was trained where a driver's trial ends it."""
+        if isinstance(error, DriverError | TrialInterrupted):
+            written = self.rescue()
+            if written and isinstance(error, DriverError):
+                raise DriverError(f"{error}{written}") from error
 
     def resume(self) -> None:
         """Go on from the latest checkpoint, if there is one."""
@@ -302,39 +312,8 @@ class _Session:
             self.save()
 
 
-@contextmanager
-def _rescued(session: _Session) -> Iterator[None]:
-    """Nothing is lost of what was trained where a driver's trial ends it."""
-    try:
-        yield
-    except DriverError as error:
-        if written := session.rescue():
-            raise DriverError(f"{error}{written}") from error
-        raise
-    except TrialInterrupted:
-        session.rescue()
-        raise
-
-
-def train(
-    scene: Scene,
-    config: TrainConfig,
-    *,
-    device: Device | str | None = None,
-    max_device_mem: str | int | None = None,
-    run: Run | None = None,
-    resume: bool = False,
-    on_step: Callable[[StepReport], None] | None = None,
-    on_plan: Callable[[Plan], None] | None = None,
-    between: Between | None = None,
-) -> Gaussians:
-    """Train like `clsplat.train`, for arguments that are `checked` and a run that is locked, and write no report."""
-    limit = parse_bytes(max_device_mem)
-    opened = device if isinstance(device, Device) else open_device(device, limit)
-    if isinstance(device, Device) and limit is not None:
-        opened = device.with_memory_limit(limit)
-    if run is None:
-        return _train(scene, config, opened, None, on_step=on_step, on_plan=on_plan, between=between)
+def _begin(run: Run, scene: Scene, config: TrainConfig, *, resume: bool) -> None:
+    """Record in a run what is trained. Raises InputError where it has been trained already, or on another scene."""
     if not resume and (run.checkpoints() or run.read_metrics()):
         raise InputError(
             f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
@@ -344,7 +323,6 @@ def train(
     if resume:
         scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
     scene_record.keep(run, scene, resuming=resume)
-    return _train(scene, config, opened, run, resume=resume, on_step=on_step, on_plan=on_plan, between=between)
 
 
 def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
@@ -383,18 +361,25 @@ def _tell_idle_settings(trainer: Trainer) -> None:
         )
 
 
-def _train(
+def train(
     scene: Scene,
     config: TrainConfig,
-    opened: Device,
-    run: Run | None,
     *,
+    device: Device | str | None = None,
+    max_device_mem: str | int | None = None,
+    run: Run | None = None,
     resume: bool = False,
-    on_step: Callable[[StepReport], None] | None,
-    on_plan: Callable[[Plan], None] | None,
-    between: Between | None,
+    on_step: Callable[[StepReport], None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
+    between: Between | None = None,
 ) -> Gaussians:
-    """Do the work of `train`, alone in the run's folder."""
+    """Train like `clsplat.train`, for arguments that are `checked` and a run that is locked, and write no report."""
+    limit = parse_bytes(max_device_mem)
+    opened = device if isinstance(device, Device) else open_device(device, limit)
+    if isinstance(device, Device) and limit is not None:
+        opened = device.with_memory_limit(limit)
+    if run is not None:
+        _begin(run, scene, config, resume=resume)
     if not (resume and run is not None and run.checkpoints()):
         for text in doubts.of_scene(scene, config.background):
             warnings.warn(text)
@@ -408,7 +393,7 @@ def _train(
     session.first_step = trainer.step
     _tell_idle_settings(trainer)
     session.tell_plan()
-    with _rescued(session), _Interruption() as interrupted:
+    with session, _Interruption() as interrupted:
         while True:
             while trainer.step < config.iterations and not interrupted():
                 if between is not None:

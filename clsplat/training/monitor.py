@@ -30,11 +30,11 @@ class _Last:
 
 @dataclass(frozen=True, eq=False)
 class Remedy:
-    """rows: those to keep, or None for all; moments: what to put in place of those there are, by "first" and "second"
-    and by group, or None."""
+    """rows: those to keep, or None for all; moments: new values of all rows, by "first" and "second" and by group,
+    where they change."""
 
     rows: NDArray[np.uint32] | None
-    moments: Mapping[str, Mapping[str, NDArray[np.float32]]] | None
+    moments: Mapping[str, Mapping[str, NDArray[np.float32]]]
 
 
 class Watch:
@@ -99,9 +99,9 @@ class Watch:
     def _judge(
         self, last: _Last, stage: str, elements: int, host: Mapping[str, Mapping[str, NDArray[np.float32]]]
     ) -> Remedy | None:
-        found = health.examine(**host)
-        lost = found.lost(stage)
-        concerned = np.flatnonzero(found.broken | found.refused)
+        findings = health.examine(**host)
+        lost = findings.lost(stage)
+        concerned = np.flatnonzero(findings.broken | findings.refused)
         hopeless = bool(np.mean(lost) > health.MOST_LOST)
         self.latest = Incident(
             step=last.step,
@@ -119,7 +119,7 @@ class Watch:
             return None
         moments = {k: {g: health.finite_or_zero(v) for g, v in host[k].items()} for k in ("first", "second")}
         rows = np.flatnonzero(~lost).astype(np.uint32)
-        return Remedy(rows if lost.any() else None, moments if found.refused.any() else None)
+        return Remedy(rows if lost.any() else None, moments if findings.refused.any() else {})
 
 
 def _done(stage: str, lost: int, count: int, *, hopeless: bool) -> str:

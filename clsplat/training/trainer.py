@@ -71,21 +71,17 @@ class _Mark:
     controlled: bool
 
 
+@dataclass(frozen=True, eq=False)
 class _Watched(StepProbe):
     """Follows a training step: notices what is not finite, rehearses what changes the state, adds the statistics that
     density control goes by."""
 
-    def __init__(
-        self,
-        trainer: Trainer,
-        step: GradientStep,
-        view: int,
-        camera: Camera,
-        background: NDArray[np.float32],
-        needs: StatisticsNeeds,
-    ) -> None:
-        self.trainer, self.step, self.view = trainer, step, view
-        self.camera, self.background, self.needs = camera, background, needs
+    trainer: Trainer
+    step: GradientStep
+    view: int
+    camera: Camera
+    background: NDArray[np.float32]
+    needs: StatisticsNeeds
 
     def forward(self, frame: Frame) -> None:
         """Take the counts of the step before, which this pass has read back."""
@@ -155,16 +151,15 @@ class Trainer:
         self._mark: _Mark | None = None
         self.rehearsed: set[tuple[object, ...]] = set()
         self.strategy = self._new_strategy(self.config)
-        device, initial = self.device, self.given if self.given is not None else self._initial()
+        initial = self.given
+        if initial is None:
+            initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.origin, self.near = initial.origin, self.scene.near
         self._make_plan(len(initial))
         if self.plan.streamed:
             self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
         else:
-            self._set_parameters(upload_gaussians(device, initial))
-
-    def _initial(self) -> Gaussians:
-        return from_scene(self.scene, self.config.random_points, self.rng)
+            self._set_parameters(upload_gaussians(self.device, initial))
 
     def _make_plan(self, count: int) -> None:
         """Plan the way of `count` Gaussians through the device's memory, with all of their SH coefficients in the
@@ -277,11 +272,10 @@ class Trainer:
     def _apply(self, remedy: Remedy | None) -> None:
         if remedy is None:
             return
-        for kind, groups in (remedy.moments or {}).items():
+        for kind, groups in remedy.moments.items():
             for group, values in groups.items():
                 (self.first if kind == "first" else self.second)[group].set(values)
-        if remedy.rows is not None:
-            self._rearrange(RowPlan(remedy.rows))
+        self._rearrange(RowPlan(remedy.rows))
 
     def rates(self) -> dict[str, float]:
         """Learning rate of each group at this step. The means' falls exponentially; all fall in the cooldown, and with

@@ -67,26 +67,23 @@ class RowPlan:
 
 
 class Strategy:
-    """Density control of one training. What a strategy does not define comes to nothing."""
+    """Density control of one training. A strategy defines `needs`, `is_due` and `before_step`, and of the others what
+    it has a use for."""
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
         """Statistics that this step, from 1, has to gather; of step 0: that any step has to."""
-        del step
-        return StatisticsNeeds()
+        raise NotImplementedError
 
     def is_due(self, step: int) -> bool:
         """True if `before_step` may have a plan after `step` steps: then the model is looked through first."""
-        del step
-        return False
+        raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:
         """The plan after `model.step` steps, which is carried out as the next one begins."""
-        del model
-        return None
+        raise NotImplementedError
 
-    def after_gradient(self, model: ModelState) -> RowPlan | None:
+    def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002  # most have none
         """The plan at the end of step number `model.step`, behind Adam's."""
-        del model
         return None
 
     def rearranged(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]) -> None:
