@@ -57,20 +57,20 @@ def place_labels(
         boxes = _candidates(point, sizes[index])
         ends = _nearest(boxes, point)
         distances = np.linalg.norm(ends - point, axis=1)
-        own = np.stack([np.broadcast_to(point, ends.shape), ends], axis=1)
+        links = np.stack([np.broadcast_to(point, ends.shape), ends], axis=1)
         apart = distances > LEADER
         taken = np.array([*(place.box for place in places.values()), *markers])
         leaders = np.array([p.leader for p in places.values() if p.leader is not None]).reshape(-1, 2, 2)
         others = taken[(taken != markers[index]).any(axis=1)]
         covered = shared(boxes, taken).sum(axis=1) + 100 * crossed(boxes, leaders).sum(axis=1)
-        covered += 100 * apart * crossed(others, own).sum(axis=0)
+        covered += 100 * apart * crossed(others, links).sum(axis=0)
         covered += 10 * ((boxes[:, 2:] - boxes[:, :2]).prod(axis=1) - shared(boxes, frame[None])[:, 0])
-        crossings = crossed(boxes, lines).sum(axis=1) + apart * _cross(own, leaders).sum(axis=1)
+        crossings = crossed(boxes, lines).sum(axis=1) + apart * _cross(links, leaders).sum(axis=1)
         rivals = points[(points != point).any(axis=1)]
         gaps = np.linalg.norm(_nearest(boxes[:, None], rivals) - rivals, axis=2)
         mistaken = (gaps < distances[:, None] + NEAR).sum(axis=1)
         best = np.lexsort((distances + CROSSING * crossings + MISTAKEN * mistaken, covered))[0]
-        places[index] = Place(boxes[best], own[best] if apart[best] else None)
+        places[index] = Place(boxes[best], links[best] if apart[best] else None)
     return [places[index] for index in range(len(points))]
 
 
@@ -104,8 +104,8 @@ def crossed(boxes: Float64, segments: Float64) -> NDArray[np.bool_]:
     with np.errstate(divide="ignore", invalid="ignore"):
         clips = np.sort(np.stack([(low - start) / move, (high - start) / move]), axis=0)
     first, last = np.where(move == 0, 0, clips[0]).max(axis=2), np.where(move == 0, 1, clips[1]).min(axis=2)
-    beside = ((move == 0) & ~((low < start) & (start < high))).any(axis=2)
-    inside: NDArray[np.bool_] = ~beside & (first.clip(0) < last.clip(None, 1))
+    misses = ((move == 0) & ~((low < start) & (start < high))).any(axis=2)
+    inside: NDArray[np.bool_] = ~misses & (first.clip(0) < last.clip(None, 1))
     return inside
 
 

@@ -63,7 +63,7 @@ class Error:
 def settings() -> dict[str, BenchSwitches]:
     """The points of the plot: presets, and each switch away from its default alone, and the exact ones together."""
     named = {f"preset {name}": config.switches() for name, config in PRESETS.items()}
-    flags = [each.name for each in fields(BenchSwitches) if each.default is True]
+    flags = [switch.name for switch in fields(BenchSwitches) if switch.default is True]
     changes: dict[str, dict[str, Any]] = {
         "extent constant": {"extent": "constant"},
         "tile-test box": {"tile_test": "box"},
@@ -134,10 +134,10 @@ def compare(
     size = (model.count, model.coefficients, [camera])
     for rasterizer in rasterizers.values():
         rasterizer.follow(plan_step(device, *size, rasterizer.config, fields=PLAIN_SLOTS, agreement=False))
-    found = {}
+    differences = {}
     for done, (name, rasterizer) in enumerate(rasterizers.items()):
         say("settings", done / len(rasterizers))
-        found[name] = errors(picture_of(draw(rasterizer)))
+        differences[name] = errors(picture_of(draw(rasterizer)))
         step(rasterizer)
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in rasterizers}
     for done in range(repeat):
@@ -145,7 +145,7 @@ def compare(
         for name, rasterizer in rasterizers.items():
             both = wall_ms(device, partial(draw, rasterizer)), wall_ms(device, partial(step, rasterizer))
             times[name].append(both)
-    medians = {name: tuple(map(statistics.median, zip(*each, strict=True))) for name, each in times.items()}
+    medians = {name: tuple(map(statistics.median, zip(*pairs, strict=True))) for name, pairs in times.items()}
     whole = (width, height) == (camera.width, camera.height)
     return {
         "exact": _exact_of(tried),
@@ -153,19 +153,19 @@ def compare(
         "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
         "crop": list(crop),
         "exact_against_float64": asdict(errors(exact)[0]),
-        "points": _points(tried, found, medians, whole=whole),
+        "points": _points(tried, differences, medians, whole=whole),
     }
 
 
 def _points(
     candidates: Mapping[str, BenchSwitches],
-    found: Mapping[str, tuple[Error, Error]],
+    differences: Mapping[str, tuple[Error, Error]],
     medians: Mapping[str, tuple[float, ...]],
     *,
     whole: bool,
 ) -> list[dict[str, Any]]:
     points = []
-    for name, (from_reference, from_exact) in found.items():
+    for name, (from_reference, from_exact) in differences.items():
         points.append(
             {
                 "name": name,
@@ -237,6 +237,6 @@ def settings_table(result: dict[str, Any]) -> str:
     )
     lines = [*columns(rows), "", note]
     if (faster := result["exact_switches_faster"]) is not None:
-        each = f"a frame {faster['frame']:.2f} times faster, a training step {faster['iteration']:.2f} times"
-        lines.append(f"the exact switches together: {each}")
+        gain = f"a frame {faster['frame']:.2f} times faster, a training step {faster['iteration']:.2f} times"
+        lines.append(f"the exact switches together: {gain}")
     return "\n".join(lines)

@@ -138,8 +138,8 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Measur
     for name, record in by_events[0].items():
         waits = [stages[name].wall_ms for stages in by_waiting]
         times = [stages[name].kernels for stages in by_events]
-        kernels = {kernel: statistics.median(each.get(kernel, 0.0) for each in times) for kernel in record.kernels}
-        total = statistics.median(waits if by_wall else [sum(each.values()) for each in times])
+        kernels = {kernel: statistics.median(run.get(kernel, 0.0) for run in times) for kernel in record.kernels}
+        total = statistics.median(waits if by_wall else [sum(run.values()) for run in times])
         medians[name] = replace(record, kernels=kernels, ms=total, wall_ms=statistics.median(waits))
     return _Measured(statistics.median(walls), medians, by_wall)
 
@@ -187,7 +187,7 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
     pixels = (photograph / np.float32(255)).astype(np.float32)
     view = _Picture("bench", camera, Path("bench"), "train", lens, pixels=pixels)
     scene = Scene("bench", [view], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (np.zeros(3), np.ones(3)))
-    names = [each.name for each in fields(OptimiserConfig)]
+    names = [setting.name for setting in fields(OptimiserConfig)]
     still = {name: 0.0 for name in names if "_rate" in name and name != "means_rate_steps"}
     settings = TrainConfig(
         sh_degree=subject.gaussians.sh_degree,

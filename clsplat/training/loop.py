@@ -75,13 +75,13 @@ class _Interruption:
 
     def __call__(self) -> bool:
         if not self.number:  # again, as compilers of kernels install handlers of their own
-            for each in self._previous:
-                signal.signal(each, self._ask)
+            for number in self._previous:
+                signal.signal(number, self._ask)
         return self.number != 0
 
     def __enter__(self) -> _Interruption:  # noqa: PYI034  # Self came with 3.11
         if threading.current_thread() is threading.main_thread():
-            self._previous = {each: signal.signal(each, self._ask) for each in (signal.SIGINT, *endings())}
+            self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, *endings())}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -90,8 +90,8 @@ class _Interruption:
 
     def _ask(self, number: int, _frame: FrameType | None) -> None:
         self.number = number
-        for each in self._previous:
-            signal.signal(each, signal.default_int_handler if each == signal.SIGINT else self._previous[each])
+        for other, handler in self._previous.items():
+            signal.signal(other, signal.default_int_handler if other == signal.SIGINT else handler)
 
 
 class _Session:
@@ -99,13 +99,13 @@ class _Session:
 
     def __init__(self, trainer: Trainer, run: Run | None, on_plan: Callable[[Plan], None] | None = None) -> None:
         self.trainer, self.run, self.on_plan = trainer, run, on_plan
-        self.told: Plan | None = None
+        self.announced: Plan | None = None
         self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
         self.began = time.perf_counter()
-        self.noted, self.first_step = False, 0
+        self.recorded, self.first_step = False, 0
         self.saved = 0
-        self.told_stages: set[str] = set()
+        self.warned_stages: set[str] = set()
         self.untold = 0
 
     def __enter__(self) -> _Session:  # noqa: PYI034  # Self came with 3.11
@@ -179,11 +179,11 @@ class _Session:
     def tell_trouble(self) -> None:
         """A warning for the first trouble of each stage; the rest is counted."""
         for incident in self.trainer.watch.incidents:
-            if incident.stage in self.told_stages:
+            if incident.stage in self.warned_stages:
                 self.untold += 1
             else:
                 warnings.warn(f"{incident} (more of this kind will be counted only)")
-            self.told_stages.add(incident.stage)
+            self.warned_stages.add(incident.stage)
         self.trainer.watch.incidents.clear()
 
     def tell_the_rest(self) -> None:
@@ -197,18 +197,18 @@ class _Session:
         """Raise ClsplatError, with what reproduces the trouble in the run's folder."""
         incident = self.trainer.watch.latest
         assert incident is not None, "patience is over only after trouble"
-        told = f"{incident}, and {RETURNS} returns with smaller steps did not help"
+        trouble = f"{incident}, and {RETURNS} returns with smaller steps did not help"
         if self.run is None:
-            raise ClsplatError(f"{told}: give a run, and what reproduces it is written there")
+            raise ClsplatError(f"{trouble}: give a run, and what reproduces it is written there")
         path = write_bundle(self.run.path, self.trainer, incident)
-        raise ClsplatError(f"{told}: {path} reproduces it (python -m clsplat.training.repro)")
+        raise ClsplatError(f"{trouble}: {path} reproduces it (python -m clsplat.training.repro)")
 
     def tell_plan(self) -> None:
         """Tell how the device's memory is used, at first and when more is done in pieces, or less."""
-        plan, told = self.trainer.plan, self.told
-        if self.on_plan is not None and (told is None or plan.pieces != told.pieces):
+        plan, announced = self.trainer.plan, self.announced
+        if self.on_plan is not None and (announced is None or plan.pieces != announced.pieces):
             self.on_plan(plan)
-        self.told = plan
+        self.announced = plan
 
     def report(self, result: Loss) -> StepReport | None:
         """Read the loss of the step just made; None where it is not finite."""
@@ -258,12 +258,12 @@ class _Session:
         trainer = self.trainer
         if stages is not None:
             record["stages"] = stages
-        if not self.noted:
+        if not self.recorded:
             record["session"] = telemetry.session(trainer.device, self.first_step)
-            self.noted = True
+            self.recorded = True
         last = trainer.step == trainer.config.iterations
-        if last and trainer.config.report and (found := telemetry.contributions(trainer)) is not None:
-            record["contributions"] = found
+        if last and trainer.config.report and (histogram := telemetry.contributions(trainer)) is not None:
+            record["contributions"] = histogram
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:

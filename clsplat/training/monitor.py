@@ -38,13 +38,13 @@ class Remedy:
 
 
 class Watch:
-    """found: what a pass reads back, in the last four what `adam` counts (`Rasterizer.found`); names: of the views.
+    """readback: what a pass reads back, in the last four what `adam` counts (`Rasterizer.found`); names: of the views.
 
     incidents: those not told yet; patience: the count of trouble.
     """
 
-    def __init__(self, found: DeviceArray, names: Sequence[str]) -> None:
-        self.found, self.names = found, names
+    def __init__(self, readback: DeviceArray, names: Sequence[str]) -> None:
+        self.readback, self.names = readback, names
         self.patience = Patience()
         self.incidents: list[Incident] = []
         self.latest: Incident | None = None
@@ -54,7 +54,7 @@ class Watch:
     def forget(self) -> None:
         """Forget the last step and its trouble: the model is a new one."""
         self._last = self._noticed = None
-        self.found.fill(0)
+        self.readback.fill(0)
 
     def follow(self, step: int, view: int, background: NDArray[np.float32], sums: DeviceArray) -> None:
         """A step is under way, and has its loss."""
@@ -72,7 +72,7 @@ class Watch:
 
     def look(self) -> None:
         """Read the counts now, rather than wait for the next pass."""
-        self.notice([int(value) for value in self.found.get()[-len(REFUSED) :]])
+        self.notice([int(value) for value in self.readback.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:
         """A loss was read that is not finite; where no Gaussian is, `adam` has nothing to refuse."""
@@ -84,7 +84,7 @@ class Watch:
         if self._noticed is None:
             return None
         (last, stage, elements), self._noticed = self._noticed, None
-        self.found.fill(0)
+        self.readback.fill(0)
         models = {"parameters": parameters, "first": first, "second": second}
         return self._judge(last, stage, elements, {k: {g: m[g].get() for g in GROUPS} for k, m in models.items()})
 

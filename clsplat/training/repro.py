@@ -243,8 +243,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps({"counts": counts, "stage": stage, **bundle.record}, indent=2))
         return 0 if stage else 1
     print(bundle.record["message"])
-    kept, of = bundle.record["of"]
-    print(f"{kept:,} of {of:,} Gaussians, {bundle.camera.width}x{bundle.camera.height}; not finite after")
+    kept, count = bundle.record["of"]
+    print(f"{kept:,} of {count:,} Gaussians, {bundle.camera.width}x{bundle.camera.height}; not finite after")
     for name, count in counts.items():
         print(f"  {name:13}{count:>12,}")
     print(f"first in {stage}" if stage else "all is well on this device")

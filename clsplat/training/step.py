@@ -94,8 +94,8 @@ class GradientStep:
         sh_rest = updates_sh_rest(self.config.optimiser, self.step)
         for start, stop, (parameters, first, second) in parts(work, *model, keep=True):
             projected = frame.projected.rows(start, stop)
-            of = (parameters, frame, projected, slots.rows(start, stop), gradients)
-            screen = rasterizer.row_gradients(*of, fields=self.fields, sh_rest=sh_rest)
+            backward = (parameters, frame, projected, slots.rows(start, stop), gradients)
+            screen = rasterizer.row_gradients(*backward, fields=self.fields, sh_rest=sh_rest)
             rows = StepRows(start, stop, parameters, gradients, first, second, projected, screen)
             probe.row_gradients(rows)
             self.update(rows)
