@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
 
+from clsplat.cli.main import Bench, Train, parse
 from clsplat.config.presets import PRESETS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
@@ -26,6 +27,7 @@ from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import InputError
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.sequence.settings_digest import digest_of
 from clsplat.stages.device_gaussians import upload_gaussians
 
 EXACT_OFF = {
@@ -275,3 +277,21 @@ def test_gradient_of_bands_left_out_is_zero(default_device: Device) -> None:
 def test_values_that_make_no_sense(change: dict[str, float]) -> None:
     with pytest.raises(InputError, match="expected"):
         replace(RasterizerConfig(), **change).check()
+
+
+def test_a_user_s_command_has_the_six_settings_that_approximate(capsys: pytest.CaptureFixture[str]) -> None:
+    six = ["extent", "sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min"]
+    assert [setting.name for setting in fields(RasterizerConfig)] == six
+    both = ["S", "-o", "R", "--rasterizer.sh-degree-limit", "1"]
+    assert isinstance(parse(["train", *both]), Train)
+    for flags in (["--rasterizer.no-row-skip"], ["--rasterizer.extent", "constant"]):
+        with pytest.raises(SystemExit):
+            parse(["train", *both, *flags])
+        assert flags[0] in capsys.readouterr().err
+        assert isinstance(parse(["bench", *flags]), Bench)
+
+
+def test_default_settings_have_the_digest_of_every_version() -> None:
+    """A frame's stamp says how it was made: nothing, where no setting differs from its default."""
+    assert digest_of(RasterizerConfig()) == digest_of({})
+    assert digest_of(RasterizerConfig(alpha_min=2 / 255)) == digest_of({"alpha_min": f"{2 / 255:.12g}"})
