@@ -10,6 +10,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 from clsplat.config.training import DensityConfig
+from clsplat.stages.device_gaussians import HostArray
+from clsplat.training.density import ModelState
 from clsplat.training.density.adaptive import Plan, is_due, is_reset_due, plan, reset_opacities, split_halves
 
 CONFIG = DensityConfig()
@@ -21,6 +23,12 @@ WEAK, STRONG = 1e-4, 3e-4
 def logit(opacity: ArrayLike) -> np.ndarray:
     p = np.asarray(opacity, np.float64)
     return np.log(p / (1 - p)).astype(np.float32)
+
+
+def state(step: int, extent: float, parameters: dict[str, np.ndarray], statistics: dict[str, np.ndarray]) -> ModelState:
+    """A model whose arrays are on the host."""
+    on_host = ({name: HostArray(values) for name, values in arrays.items()} for arrays in (parameters, statistics))
+    return ModelState(len(parameters["opacity_logits"]), step, extent, *on_host, np.random.default_rng(0))
 
 
 def make_plan(
@@ -38,16 +46,13 @@ def make_plan(
     n = len(largest)
     views = np.broadcast_to(np.asarray(seen, np.float32), n)
     log_scales = np.log(np.stack([0.1 * largest, largest, 0.1 * largest], axis=1))
-    return plan(
-        config,
-        step,
-        EXTENT,
-        gradient_sums=(np.asarray(gradients) * views).astype(np.float32),
-        seen=views,
-        radii=np.broadcast_to(np.asarray(radii, np.float32), n),
-        log_scales=log_scales,
-        opacity_logits=np.broadcast_to(logit(opacities), n),
-    )
+    statistics = {
+        "gradient_sums": (np.asarray(gradients) * views).astype(np.float32),
+        "seen": views,
+        "radii": np.broadcast_to(np.asarray(radii, np.float32), n),
+    }
+    parameters = {"log_scales": log_scales, "opacity_logits": np.broadcast_to(logit(opacities), n)}
+    return plan(config, state(step, EXTENT, parameters, statistics))
 
 
 def assert_plan(got: Plan, rows: list[int], fresh: list[int], split: list[int]) -> None:

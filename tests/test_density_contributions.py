@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
+from test_density import state
 
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.density.adaptive import (
     Adaptive,
-    Contributions,
     Plan,
     budget,
     is_due,
@@ -28,9 +28,11 @@ WEAK, STRONG = 1e-4, 3e-4
 """Mean gradients on either side of the threshold."""
 
 
-def contributions(totals: ArrayLike, largest: ArrayLike | None = None) -> Contributions:
+def contributions(totals: ArrayLike, largest: ArrayLike | None = None) -> dict[str, np.ndarray]:
+    """Statistics of the last whole epoch; `largest` are of the one under way."""
     values = np.asarray(totals, np.float32)
-    return Contributions(values, values if largest is None else np.asarray(largest, np.float32))
+    largest = values if largest is None else np.asarray(largest, np.float32)
+    return {"whole_totals": values, "whole_largest": np.minimum(values, largest), "current_largest": largest}
 
 
 def make_plan(
@@ -40,24 +42,17 @@ def make_plan(
     *,
     opacities: ArrayLike = 0.5,
     agreeing: ArrayLike | None = None,
-    known: Contributions | None = None,
+    known: dict[str, np.ndarray] | None = None,
 ) -> Plan:
     """All small, so that who is densified is cloned, and seen in four views."""
     sums = 4 * np.asarray(gradients, np.float32)
     n = len(sums)
     o = np.broadcast_to(np.asarray(opacities, np.float32), n)
-    return plan(
-        config,
-        step,
-        10.0,
-        gradient_sums=sums,
-        seen=np.full(n, 4, np.float32),
-        radii=np.full(n, 5, np.float32),
-        log_scales=np.full((n, 3), np.log(0.05), np.float32),
-        opacity_logits=np.log(o / (1 - o)),
-        agreeing=None if agreeing is None else np.asarray(agreeing, np.float32),
-        contributions=known,
-    )
+    statistics = {"gradient_sums": sums, "seen": np.full(n, 4, np.float32), "radii": np.full(n, 5, np.float32)}
+    if agreeing is not None:
+        statistics["agreeing"] = np.asarray(agreeing, np.float32)
+    parameters = {"log_scales": np.full((n, 3), np.log(0.05), np.float32), "opacity_logits": np.log(o / (1 - o))}
+    return plan(config, state(step, 10.0, parameters, {**statistics, **(known or {})}))
 
 
 def cloned(made: Plan) -> list[int]:
@@ -163,15 +158,13 @@ def test_a_fraction_of_those_that_are_known_goes(fraction: float, left: list[int
 def test_pruning_alone_adds_nothing_and_asks_for_less() -> None:
     config = replace(CONFIG, min_contribution=0.5, prune_every=100)
     opacities = np.array([0.5, 0.004, 0.5, 0.5])
-    made = plan_pruning(
-        config,
-        20_000,
-        opacity_logits=np.log(opacities / (1 - opacities)).astype(np.float32),
-        contributions=contributions([9, 9, 0.4, 9]),
-    )
+    logits = np.log(opacities / (1 - opacities)).astype(np.float32)
+    made = plan_pruning(config, state(20_000, 10.0, {"opacity_logits": logits}, contributions([9, 9, 0.4, 9])))
     assert (made.rows.tolist(), made.fresh.any(), made.split.any()) == ([0, 3], False, False)
     assert made.rows.dtype == np.uint32
-    made = plan_pruning(replace(config, min_contribution=0.0), 20_000, opacity_logits=np.zeros(3, np.float32))
+    made = plan_pruning(
+        replace(config, min_contribution=0.0), state(20_000, 10.0, {"opacity_logits": np.zeros(3, np.float32)}, {})
+    )
     assert made.rows.tolist() == [0, 1, 2]
 
 

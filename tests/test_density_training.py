@@ -23,7 +23,7 @@ from clsplat.reference.render import render_grad
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_gaussians import HostGaussians
-from clsplat.training.density import adaptive
+from clsplat.training.density import ModelState, adaptive
 from clsplat.training.density.adaptive import Plan
 from clsplat.training.trainer import Trainer
 
@@ -60,10 +60,11 @@ def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: p
     def noted(name: str) -> Any:
         real = getattr(adaptive, name)
 
-        def call(config: Any, step: int, *rest: Any, **values: Any) -> Plan:
-            result: Plan = real(config, step, *rest, **values)
-            made[name, step] = (len(values["opacity_logits"]), result)
-            known.append(int(np.isfinite(values["contributions"].largest).sum()))
+        def call(config: Any, model: ModelState) -> Plan:
+            result: Plan = real(config, model)
+            made[name, model.step] = (model.count, result)
+            largest = [model.statistics[f"{epoch}_largest"].get() for epoch in ("current", "whole")]
+            known.append(int(np.isfinite(np.maximum(*largest)).sum()))
             return result
 
         return call

@@ -22,7 +22,7 @@ from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_gaussians import DeviceGaussians
-from clsplat.training import trainer as trainer_module
+from clsplat.training import step as step_module
 from clsplat.training.trainer import Trainer
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -293,15 +293,15 @@ def test_spoilt_statistics_leave_a_sound_model(scene: Scene, default_device: Dev
 
 def after(monkeypatch: pytest.MonkeyPatch, name: str, spoil: Callable[[object], None]) -> None:
     """Let the stage that the trainer calls `name` do its work, once, and spoil what it gives."""
-    real = getattr(trainer_module, name)
+    real = getattr(step_module, name)
 
     def spoilt(*arguments: object, **options: object) -> object:
         result = real(*arguments, **options)
         spoil(result)
-        monkeypatch.setattr(trainer_module, name, real)
+        monkeypatch.setattr(step_module, name, real)
         return result
 
-    monkeypatch.setattr(trainer_module, name, spoilt)
+    monkeypatch.setattr(step_module, name, spoilt)
 
 
 @pytest.mark.parametrize("value", BROKEN)

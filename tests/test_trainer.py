@@ -22,7 +22,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_gaussians import DeviceGaussians, upload_gaussians
 from clsplat.stages.loss import Loss
-from clsplat.training.density import adaptive
+from clsplat.training.density import ModelState, adaptive
 from clsplat.training.density.adaptive import Plan
 from clsplat.training.loop import StepReport
 from clsplat.training.trainer import Trainer
@@ -138,10 +138,10 @@ def test_the_test_run_has_everything_in_it(
     plans: dict[int, Plan] = {}
     resets, counts, real = [], [], adaptive.plan
 
-    def plan(config: DensityConfig, step: int, extent: float, **values: Any) -> Plan:
-        counts.append(len(values["seen"]))
-        plans[step] = real(config, step, extent, **values)
-        return plans[step]
+    def plan(config: DensityConfig, model: ModelState) -> Plan:
+        counts.append(model.count)
+        plans[model.step] = real(config, model)
+        return plans[model.step]
 
     monkeypatch.setattr(adaptive, "plan", plan)
     real_reset = adaptive.reset_opacities

@@ -19,12 +19,14 @@ NEAR = 9.0
 STEP = 8.0
 """Pixels from one ring of candidates to the next."""
 RINGS, DIRECTIONS = 50, 24
+MARKER = 6.0
 LEADER = 12.0
 """A label farther from its point than this has a leader line."""
 CROSSING = 60.0
 """A crossed line costs as much as a label so many pixels farther away."""
 MISTAKEN = 40.0
 """So does a point that is not its own, as near to the label or nearly."""
+NO_LINES: Float64 = np.zeros((0, 2, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,21 +37,14 @@ class Place:
     leader: Float64 | None
 
 
-def place_labels(
-    points: Float64,
-    sizes: Float64,
-    frame: Float64,
-    lines: Float64 | None = None,
-    marker: float = 6.0,
-) -> list[Place]:
+def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64 = NO_LINES) -> list[Place]:
     """A place for each label beside its point and inside the box `frame`. points (n, 2), sizes (n, 2): of the labels.
 
     Greedy: the points with the most neighbours first, each at the cheapest of the candidates around it that covers
-    nothing. Distance costs, and so does crossing one of `lines`. A marker covers `marker` pixels around its point.
+    nothing. Distance costs, and so does crossing one of `lines`. A marker covers MARKER pixels around its point.
     Where no candidate is free the one is taken that covers the least.
     """
-    lines = np.zeros((0, 2, 2)) if lines is None else lines
-    markers = np.hstack([points - marker, points + marker])
+    markers = np.hstack([points - MARKER, points + MARKER])
     crowded = (1 / (1 + np.linalg.norm(points[:, None] - points, axis=2))).sum(axis=1)
     places: dict[int, Place] = {}
     for index in np.argsort(-crowded, kind="stable"):

@@ -11,7 +11,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
+from clsplat.gaussians import GROUPS, floats_of
 from clsplat.rendering.rasterizer import Frame
 from clsplat.rendering.renderer import Renderer, held_sh
 from clsplat.scenes.lens import Lens
@@ -34,7 +35,7 @@ from clsplat.training.trainer import Trainer
 
 FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")
 """Stages that are measured in a frame; the others in a training step."""
-GAUSSIAN_BYTES = 4 * 59 * 4
+GAUSSIAN_BYTES = 4 * floats_of(16) * 4
 """Bytes of a Gaussian of SH degree 3 in a training step: parameters, gradients and two moments."""
 
 
@@ -187,12 +188,11 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
     pixels = (photograph / np.float32(255)).astype(np.float32)
     view = _Picture("bench", camera, Path("bench"), "train", lens, pixels=pixels)
     scene = Scene("bench", [view], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (np.zeros(3), np.ones(3)))
-    names = [setting.name for setting in fields(OptimiserConfig)]
-    still = {name: 0.0 for name in names if "_rate" in name and name != "means_rate_steps"}
+    still = {group.rate: 0.0 for group in GROUPS.values()}
     settings = TrainConfig(
         sh_degree=subject.gaussians.sh_degree,
         warmup=(),
-        optimiser=OptimiserConfig(**still),  # type: ignore[arg-type]  # all of them are floats
+        optimiser=OptimiserConfig(means_rate_end=0.0, **still),  # type: ignore[arg-type]  # all of them are floats
         density=DensityConfig(every=0),
         rasterizer=config,
     )

@@ -100,7 +100,7 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: l
             values[key] = _from_table(types[key], value, path, name, passed_over)
         else:
             if expected := misfit(types[key], value):
-                raise InputError(f"{path}: {name} is {value!r}, expected {expected}")
+                raise InputError(f"{path}: {name} is {value!r:.100}, expected {expected}")
             kind = get_origin(types[key]) or types[key]
             values[key] = kind(value) if kind in (float, tuple) else value
     return cls(**values)

@@ -97,8 +97,14 @@ class _Interruption:
 class _Session:
     """One call of `train`: a trainer, the run that it writes to, and the seconds that it has trained."""
 
-    def __init__(self, trainer: Trainer, run: Run | None, on_plan: Callable[[Plan], None] | None = None) -> None:
-        self.trainer, self.run, self.on_plan = trainer, run, on_plan
+    def __init__(
+        self,
+        trainer: Trainer,
+        run: Run | None,
+        on_step: Callable[[StepReport], None] | None,
+        on_plan: Callable[[Plan], None] | None,
+    ) -> None:
+        self.trainer, self.run, self.on_step, self.on_plan = trainer, run, on_step, on_plan
         self.announced: Plan | None = None
         self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
@@ -239,17 +245,10 @@ class _Session:
             space=photos_space(view.path for view in trainer.scene.views),
         )
 
-    def record(
-        self,
-        report: StepReport,
-        on_step: Callable[[StepReport], None] | None,
-        *,
-        evaluating: bool,
-        stages: dict[str, float] | None,
-    ) -> None:
+    def record(self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None) -> None:
         """Hand the report on, and write it down with what clsplat.report asks for."""
-        if on_step is not None:
-            on_step(report)
+        if self.on_step is not None:
+            self.on_step(report)
         record = asdict(report)
         if evaluating:
             record["eval"] = self.evaluate(keep=False)
@@ -286,7 +285,7 @@ class _Session:
             return False
         return step == config.iterations or (step % config.stages_every == 0 and step % REPORT_EVERY == 0)
 
-    def step(self, on_step: Callable[[StepReport], None] | None) -> None:
+    def step(self) -> None:
         """One step, and what is due after it."""
         trainer, config = self.trainer, self.trainer.config
         start, stages = time.perf_counter(), None
@@ -307,7 +306,7 @@ class _Session:
         if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
             report = self.report(result)
             if report is not None:
-                self.record(report, on_step, evaluating=evaluating, stages=stages)
+                self.record(report, evaluating=evaluating, stages=stages)
         if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
             self.save()
 
@@ -386,7 +385,7 @@ def train(
         if is_colourless(scene):
             warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
             scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
-    session = _Session(Trainer(scene, config, opened), run, on_plan)
+    session = _Session(Trainer(scene, config, opened), run, on_step, on_plan)
     trainer = session.trainer
     if resume:
         session.resume()
@@ -398,7 +397,7 @@ def train(
             while trainer.step < config.iterations and not interrupted():
                 if between is not None:
                     between(trainer, interrupted)
-                session.step(on_step)
+                session.step()
             session.save()
             if trainer.step < config.iterations or not session.go_back():
                 break

@@ -79,13 +79,12 @@ class Watch:
         if self._last is not None and self._noticed is None:
             self._noticed = (self._last, "loss", 0)
 
-    def examine(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> Remedy | None:
-        """The remedy for what was noticed, or None if nothing was."""
+    def examine(self, models: Mapping[str, AnyGaussians]) -> Remedy | None:
+        """The remedy for what was noticed, or None if nothing was; models: parameters, first and second moments."""
         if self._noticed is None:
             return None
         (last, stage, elements), self._noticed = self._noticed, None
         self.readback.fill(0)
-        models = {"parameters": parameters, "first": first, "second": second}
         return self._judge(last, stage, elements, {k: {g: m[g].get() for g in GROUPS} for k, m in models.items()})
 
     def examine_all(self, arrays: Mapping[str, NDArray[np.float32]]) -> Remedy | None:

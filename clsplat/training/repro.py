@@ -98,8 +98,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
         _forget_marks(models)
         alone = bool(first_trouble(replay(bundle(), device)))
     if not alone:
-        whole = {"parameters": trainer.parameters, "first": trainer.first, "second": trainer.second}
-        models = {kind: {g: model[g].get() for g in GROUPS} for kind, model in whole.items()}
+        models = {kind: {g: model[g].get() for g in GROUPS} for kind, model in trainer.models().items()}
         _forget_marks(models)
     record["of"] = len(models["parameters"]["means"]), trainer.parameters.count
     record["reproduced"] = alone or bool(first_trouble(replay(bundle(), device)))
@@ -131,10 +130,8 @@ def read_bundle(path: Path) -> Bundle:
 
 def _bundle_of(arrays: dict[str, NDArray[Any]], path: Path) -> Bundle:
     record = parse_json(arrays[RECORD].tobytes())
-    size = record["camera"]
-    lens = (size["width"], size["height"], size["fx"], size["fy"], size["cx"], size["cy"])
     config, _ = parse_config(record["settings"], path)
-    camera = Camera(*lens, arrays["rotation"], arrays["translation"], near=size["near"])
+    camera = Camera(**record["camera"], rotation=arrays["rotation"], translation=arrays["translation"])
     models = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS}
     return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
 

@@ -203,7 +203,7 @@ class Trainer:
 
     def _take_down(self) -> list[HostGaussians]:
         """Parameters, first and second moments on the host, and none of them on the device."""
-        models = [to_host(model) for model in (self.parameters, self.first, self.second)]
+        models = [to_host(model) for model in self.models().values()]
         del self.parameters, self.first, self.second, self.gradients
         return models
 
@@ -236,7 +236,8 @@ class Trainer:
         step = GradientStep(
             self.device, self.rasterizer, config, self.step, self.rates(), slot_fields(needs), self.plan.channels
         )
-        model, probe = (self.parameters, self.first, self.second), _Watched(self, step, view, camera, colour, needs)
+        probe = _Watched(self, step, view, camera, colour, needs)
+        model = (self.parameters, self.first, self.second)
         result = step.run(model, self.gradients, image, camera, self.background, probe)
         self.controlled = False
         self._note()
@@ -267,14 +268,18 @@ class Trainer:
         is something to notice."""
         if look:
             self.watch.look()
-        self._apply(self.watch.examine(self.parameters, self.first, self.second))
+        self._apply(self.watch.examine(self.models()))
+
+    def models(self) -> dict[str, AnyGaussians]:
+        """Parameters, first and second moments, by the names that they have in a checkpoint."""
+        return {"parameters": self.parameters, "first": self.first, "second": self.second}
 
     def _apply(self, remedy: Remedy | None) -> None:
         if remedy is None:
             return
         for kind, groups in remedy.moments.items():
             for group, values in groups.items():
-                (self.first if kind == "first" else self.second)[group].set(values)
+                self.models()[kind][group].set(values)
         self._rearrange(RowPlan(remedy.rows))
 
     def rates(self) -> dict[str, float]:
@@ -308,10 +313,9 @@ class Trainer:
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
         coefficients = (degree + 1) ** 2
         if coefficients > self.parameters.coefficients:
-            models = [self.parameters, self.first, self.second] if self.plan.gathers else self._take_down()
-            self.parameters, self.first, self.second = (
-                self._placed(widen(self.device, model, coefficients)) for model in models
-            )
+            models = [*self.models().values()] if self.plan.gathers else self._take_down()
+            wider = (self._placed(widen(self.device, model, coefficients)) for model in models)
+            self.parameters, self.first, self.second = wider
             self.gradients = self._new_gradients()
 
     def _control_density(self) -> None:
@@ -321,8 +325,8 @@ class Trainer:
             self._rearrange(self.strategy.before_step(self._state()))
 
     def _state(self) -> ModelState:
-        parameters, statistics = self.parameters.arrays, self.statistics.named()
-        return ModelState(self.step, self.scene.extent, parameters, statistics, self.rng)
+        model, statistics = self.parameters, self.statistics.named()
+        return ModelState(model.count, self.step, self.scene.extent, model.arrays, statistics, self.rng)
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out what density control, or a repair, has planned for the rows of everything."""
@@ -349,7 +353,7 @@ class Trainer:
             try_gather(device, len(rows), self.parameters)
         self._mark = None
         self._make_plan(len(rows))
-        models = [self.parameters, self.first, self.second] if gathers and self.plan.gathers else self._take_down()
+        models = [*self.models().values()] if gathers and self.plan.gathers else self._take_down()
         statistics = self.statistics.moved(rows, fresh, densified=new_statistics)
         del self.statistics
         moment_rows = np.where(fresh, NO_ROW, rows)
@@ -386,8 +390,7 @@ class Trainer:
     def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
-        for kind, source in (("parameters", self.parameters), ("first", self.first), ("second", self.second)):
-            arrays.update({f"{kind}/{group}": source[group].get() for group in GROUPS})
+        arrays |= {f"{kind}/{group}": model[group].get() for kind, model in self.models().items() for group in GROUPS}
         return arrays
 
     def restart(self) -> None:

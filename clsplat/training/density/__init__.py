@@ -38,9 +38,10 @@ class HostCopy(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModelState:
-    """The model after `step` steps, as a strategy sees it. extent: the scene's, in world units; parameters by group;
-    statistics by the names that they have in a checkpoint."""
+    """The model of `count` Gaussians after `step` steps, as a strategy sees it. extent: the scene's, in world units;
+    parameters by group; statistics by the names that they have in a checkpoint."""
 
+    count: int
     step: int
     extent: float
     parameters: Mapping[str, HostCopy]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
-from clsplat.training.density import HostCopy, ModelState, RowPlan, StatisticsNeeds, Strategy
+from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 
 
 class Adaptive(Strategy):
@@ -44,18 +43,13 @@ class Adaptive(Strategy):
 
     def before_step(self, model: ModelState) -> RowPlan:
         """Densify or prune, then reset opacities, whichever is due."""
-        config, step, statistics = self.config, model.step, model.statistics
-        logits = model.parameters["opacity_logits"].get()
-        known: dict[str, Any] = {"opacity_logits": logits, "contributions": _contributions(statistics)}
+        config, step = self.config, model.step
         chosen: Plan | None = None
-        densifies = is_due(config, step)
-        if densifies:
-            names = ("gradient_sums", "seen", "radii", "agreeing")
-            known |= {name: statistics[name].get() for name in names if name in statistics}
-            chosen = plan(config, step, model.extent, log_scales=model.parameters["log_scales"].get(), **known)
+        if densifies := is_due(config, step):
+            chosen = plan(config, model)
         elif is_pruning_due(config, step):
-            chosen = plan_pruning(config, step, **known)
-        values = {}
+            chosen = plan_pruning(config, model)
+        logits, values = model.parameters["opacity_logits"].get(), {}
         if chosen is not None:
             if len(chosen.rows) == 0:
                 raise ClsplatError(
@@ -73,13 +67,6 @@ class Adaptive(Strategy):
             new_statistics=densifies,
             forget_contributions=resets,
         )
-
-
-def _contributions(statistics: Mapping[str, HostCopy]) -> Contributions | None:
-    if "whole_totals" not in statistics:
-        return None
-    largest = (statistics[f"{epoch}_largest"].get() for epoch in ("current", "whole"))
-    return Contributions(statistics["whole_totals"].get(), np.maximum(*largest))
 
 
 def _halves(config: DensityConfig, chosen: Plan, model: ModelState) -> dict[str, tuple[NDArray[Any], Float32]]:
@@ -126,110 +113,79 @@ def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Contributions:
-    """Contributions of each Gaussian to the pictures, in pixels; (n,), infinite where they are not known yet.
-
-    totals: over the views of the last whole epoch; largest: of any view in that epoch and the one under way.
-    """
-
-    totals: Float32
-    largest: Float32
-
-
-def plan(
-    config: DensityConfig,
-    step: int,
-    extent: float,
-    *,
-    gradient_sums: Float32,
-    seen: Float32,
-    radii: Float32,
-    log_scales: Float32,
-    opacity_logits: Float32,
-    agreeing: Float32 | None = None,
-    contributions: Contributions | None = None,
-) -> Plan:
+def plan(config: DensityConfig, model: ModelState) -> Plan:
     """Clone the small and split the large among those with a large mean gradient; prune the transparent, the oversized
-    and what hardly contributes.
-
-    gradient_sums, seen, radii, opacity_logits (n,); log_scales (n, 3); extent: the scene's, in world units; agreeing
-    (n,): views over the threshold, where the settings ask for it; contributions: likewise.
-    """
-    n = len(seen)
-    useless = _useless(config, step, contributions, n)
+    and what hardly contributes."""
+    gradient_sums, seen, radii = (model.statistics[name].get() for name in ("gradient_sums", "seen", "radii"))
+    useless = _useless(config, model)
     with np.errstate(invalid="ignore"):
         gradients = np.asarray(gradient_sums / np.maximum(seen, 1), np.float32)
     gradients[~np.isfinite(gradients)] = 0  # statistics that something has spoilt ask for nothing
-    wanted = _wanted(config, step, gradients, agreeing, useless)
-    sizes = np.exp(log_scales.max(axis=1))
-    large = sizes > config.dense_fraction * extent
+    wanted = _wanted(config, model, gradients, useless)
+    sizes = np.exp(model.parameters["log_scales"].get().max(axis=1))
+    large = sizes > config.dense_fraction * model.extent
     to_clone, to_split = np.flatnonzero(wanted & ~large), np.flatnonzero(wanted & large)
     kept = np.flatnonzero(~(wanted & large))
 
     rows = np.concatenate([kept, to_clone, to_split, to_split])
     origin = np.repeat([0, 1, 2], [len(kept), len(to_clone), 2 * len(to_split)])
     sizes_after = np.where(origin == 2, sizes[rows] / config.split_factor, sizes[rows])
-    prune = _transparent(config, opacity_logits)[rows] | useless[rows]
-    if config.opacity_reset_every > 0 and step > config.opacity_reset_every:
-        prune |= sizes_after > config.max_world_fraction * extent
+    prune = _transparent(config, model)[rows] | useless[rows]
+    if config.opacity_reset_every > 0 and model.step > config.opacity_reset_every:
+        prune |= sizes_after > config.max_world_fraction * model.extent
         if config.max_screen_radius > 0:
             prune |= (radii[rows] > config.max_screen_radius) & (origin == 0)
     rows, origin = rows[~prune], origin[~prune]
     return Plan(rows.astype(np.uint32), origin > 0, origin == 2)
 
 
-def plan_pruning(
-    config: DensityConfig, step: int, *, opacity_logits: Float32, contributions: Contributions | None = None
-) -> Plan:
-    """Prune the transparent and what hardly contributes, and nothing else; arguments as of `plan`."""
-    gone = _transparent(config, opacity_logits) | _useless(config, step, contributions, len(opacity_logits))
-    rows = np.flatnonzero(~gone).astype(np.uint32)
+def plan_pruning(config: DensityConfig, model: ModelState) -> Plan:
+    """Prune the transparent and what hardly contributes, and nothing else."""
+    rows = np.flatnonzero(~(_transparent(config, model) | _useless(config, model))).astype(np.uint32)
     none = np.zeros(len(rows), bool)
     return Plan(rows, none, none)
 
 
-def _transparent(config: DensityConfig, opacity_logits: Float32) -> NDArray[np.bool_]:
-    transparent: NDArray[np.bool_] = opacity_logits < np.log(config.min_opacity / (1 - config.min_opacity))
+def _transparent(config: DensityConfig, model: ModelState) -> NDArray[np.bool_]:
+    logits = model.parameters["opacity_logits"].get()
+    transparent: NDArray[np.bool_] = logits < np.log(config.min_opacity / (1 - config.min_opacity))
     return transparent
 
 
-def _useless(config: DensityConfig, step: int, contributions: Contributions | None, count: int) -> NDArray[np.bool_]:
-    """Gaussians that no view needs, and at the steps of `prune_at` a fraction of those whose use is known."""
-    useless = np.zeros(count, bool)
-    if contributions is None:
-        return useless
-    if config.min_contribution > 0:
-        useless |= contributions.largest < config.min_contribution
-    if step in config.prune_at:
-        known = np.flatnonzero(np.isfinite(contributions.totals))
-        least = np.argsort(contributions.totals[known], kind="stable")[: int(config.prune_fraction * len(known))]
+def _useless(config: DensityConfig, model: ModelState) -> NDArray[np.bool_]:
+    """Gaussians that no view needs, and at the steps of `prune_at` a fraction of those whose use is known.
+
+    Contributions are in pixels, and infinite where they are not known yet. Totals are over the views of the last whole
+    epoch, the largest are of any view in that epoch and the one under way.
+    """
+    if "whole_totals" not in model.statistics:
+        return np.zeros(model.count, bool)
+    totals, whole, current = (
+        model.statistics[name].get() for name in ("whole_totals", "whole_largest", "current_largest")
+    )
+    useless: NDArray[np.bool_] = (config.min_contribution > 0) & (np.maximum(current, whole) < config.min_contribution)
+    if model.step in config.prune_at:
+        known = np.flatnonzero(np.isfinite(totals))
+        least = np.argsort(totals[known], kind="stable")[: int(config.prune_fraction * len(known))]
         useless[known[least]] = True
     return useless
 
 
 def _wanted(
-    config: DensityConfig,
-    step: int,
-    gradients: Float32,
-    agreeing: Float32 | None,
-    useless: NDArray[np.bool_],
+    config: DensityConfig, model: ModelState, gradients: Float32, useless: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Gaussians to clone or split, by mean gradients (n,)."""
-    n = len(gradients)
-    room = config.max_gaussians - n
+    room = config.max_gaussians - len(gradients)
     if config.growth == "budget":
         wanted = (gradients > 0) & ~useless
-        room = budget(config, step, n) - n
+        room = budget(config, model.step, len(gradients)) - len(gradients)
     else:
         wanted = (gradients >= config.gradient_threshold) & ~useless
-    if config.views_agree > 1 and agreeing is not None:
-        wanted &= agreeing >= config.views_agree
+    if config.views_agree > 1 and "agreeing" in model.statistics:
+        wanted &= model.statistics["agreeing"].get() >= config.views_agree
     if wanted.sum() > room:
         strongest = np.argsort(-np.where(wanted, gradients, -1), kind="stable")[: max(room, 0)]
-        allowed = np.zeros(n, bool)
-        allowed[strongest] = True
-        wanted &= allowed
+        wanted = wanted & np.isin(np.arange(len(gradients)), strongest)
     return wanted
 
 
