@@ -69,15 +69,8 @@ def bench(
     for band in frame.bands:
         part = rasterizer.part(frame, band)
         listed += part.counted.pairs
-        added, looked_at = count_pairs(
-            rasterizer.device,
-            rasterizer.work,
-            part.lists,
-            frame.projected.splats,
-            frame.background,
-            subject.camera,
-            band,
-        )
+        drawn = (part.lists, frame.projected.splats, frame.background, subject.camera, band)
+        added, looked_at = count_pairs(rasterizer.device, rasterizer.work, *drawn)
         contributing, evaluated = contributing + added, evaluated + looked_at
     in_frame = _measure(device, draw, repeat)
     say("training step", None)
@@ -156,15 +149,7 @@ def wall_ms(device: Device, work: Callable[[], object]) -> float:
 
 def _row(record: StageRecord, limits: Limits) -> dict[str, Any]:
     rate = 1e3 * record.bytes / record.ms if record.ms > 0 else 0.0
-    return {
-        "ms": record.ms,
-        "wall_ms": record.wall_ms,
-        "launches": record.launches,
-        "bytes": record.bytes,
-        "bytes_per_second": rate,
-        "share_of_copy": rate / limits.copy_bytes_per_second,
-        "kernels": record.kernels,
-    }
+    return {**asdict(record), "bytes_per_second": rate, "share_of_copy": rate / limits.copy_bytes_per_second}
 
 
 @dataclass(frozen=True, eq=False)
