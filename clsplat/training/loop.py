@@ -66,8 +66,8 @@ class StepReport:
 
 
 class _Interruption:
-    """Inside, the first Ctrl-C, or another signal to end, is noted, and the loop stops between two steps; after it a
-    Ctrl-C is Python's own, and the others do what they did before."""
+    """Inside, the first Ctrl-C or other signal to end is noted, and the loop stops between two steps. After it a Ctrl-C
+    is Python's own, and the other signals do what they did before."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -118,7 +118,7 @@ class _Session:
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _where: object) -> None:
-        """Nothing is lost of what was trained where a driver's trial ends it."""
+        """Write a checkpoint if a driver's trial ends the training, so that nothing is lost."""
         if isinstance(error, DriverError | TrialInterrupted):
             written = self.rescue()
             if written and isinstance(error, DriverError):
@@ -143,8 +143,8 @@ class _Session:
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
-        """After a trial that failed or was interrupted: a checkpoint of the state that the step began with, if that is
-        whole. What was written, for the end of a sentence, or nothing."""
+        """Write a checkpoint of the state that the step began with, if that is whole, after a trial that failed or was
+        interrupted. The end of a sentence that says so, or nothing."""
         if self.run is None or not self.trainer.step_back():
             return ""
         try:
@@ -158,7 +158,7 @@ class _Session:
 
     def go_back(self) -> bool:
         """Tell what trouble there was; after too much of it go back to the last checkpoint, with smaller steps, and
-        after too much of that raise ClsplatError. Whether it went back."""
+        after too much of that raise ClsplatError. True if it went back."""
         trainer, patience = self.trainer, self.trainer.watch.patience
         self.tell_trouble()
         if not patience.over:
@@ -266,7 +266,7 @@ class _Session:
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """A warning where the pictures are none. Nothing where the memory is too little for a look."""
+        """A warning if the renders show nothing; no look at them if the memory is too small for one."""
         trainer, renderer = self.trainer, self.renderer
         background = background_colour(trainer.config.background)
 

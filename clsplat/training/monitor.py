@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches over a training: notices that `adam` has refused steps, finds out why, and says what is to be done."""
+"""Watch over a training: notices that `adam` has refused steps, finds the stage at fault, and returns a remedy."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ class Trainer:
         self._start()
 
     def _start(self) -> None:
-        """Begin with the first step."""
+        """Set up the model and the state of step 0."""
         self.rng = np.random.default_rng(self.config.seed)
         self.step = 0
         self.queue: list[int] = []
@@ -162,8 +162,7 @@ class Trainer:
             self._set_parameters(upload_gaussians(self.device, initial))
 
     def _make_plan(self, count: int) -> None:
-        """Plan the way of `count` Gaussians through the device's memory, with all of their SH coefficients in the
-        end."""
+        """Plan the device's memory for `count` Gaussians with all the SH coefficients that they will have."""
         needs = self.strategy.needs()
         self.plan = plan_step(
             self.device,
@@ -254,8 +253,8 @@ class Trainer:
         self._mark = None
 
     def step_back(self) -> bool:
-        """After an error within a step: make the state that of its beginning, or of after its density control. Returns
-        whether that can be."""
+        """After an error within a step, make the state that of its beginning, or of after its density control. False
+        if that cannot be."""
         mark = self._mark
         if mark is None:
             return False
@@ -264,8 +263,8 @@ class Trainer:
         return True
 
     def mend(self, *, look: bool = False) -> None:
-        """See to the Gaussians in which something was not finite, if that has been noticed; look: read whether there
-        is something to notice."""
+        """Mend the Gaussians in which something was not finite, if that has been noticed; look: read the counts
+        first."""
         if look:
             self.watch.look()
         self._apply(self.watch.examine(self.models()))
