@@ -16,7 +16,7 @@ from clsplat.cli.options import DeviceOptions, Flag, Verb, with_given
 from clsplat.cli.session import Services
 from clsplat.config.memory import parse_bytes
 from clsplat.config.presets import PRESETS, Preset
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches
 from clsplat.errors import InputError
 
 
@@ -46,11 +46,12 @@ class Bench(Verb):
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
     json: Flag = False
     """Print the result as JSON."""
-    rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
+    rasterizer: BenchSwitches = field(default_factory=BenchSwitches)
 
     def completed(self, given: Collection[str]) -> Bench:
         """The rasterizer's settings are those of the preset."""
-        return replace(self, rasterizer=with_given(PRESETS[self.preset], self.rasterizer, given, "rasterizer."))
+        switches = PRESETS[self.preset].switches()
+        return replace(self, rasterizer=with_given(switches, self.rasterizer, given, "rasterizer."))
 
 
 def run(verb: Bench, services: Services) -> int:
