@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from clsplat.cli.render_request import Job, frames_there
 from clsplat.config.pictures import FPS
 from clsplat.errors import amount, examples
-from clsplat.frame.draw import COLOUR, renderer_channels
+from clsplat.frame.draw import COLOUR, on_tiles, renderer_channels
 from clsplat.frame.supersample import finer
-from clsplat.frame.window import crop, on_tiles
+from clsplat.frame.window import crop
 from clsplat.sequence import workers
 from clsplat.sequence.task import picture_camera
 from clsplat.shots.frame_numbers import ranges

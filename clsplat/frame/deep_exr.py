@@ -23,8 +23,8 @@ from clsplat.config.pictures import DEEP_STRIP_FLOATS, DeepConfig, Encoding
 from clsplat.device.context import Device
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
+from clsplat.frame.draw import on_tiles
 from clsplat.frame.strips import strips
-from clsplat.frame.window import on_tiles
 from clsplat.gaussians import Gaussians
 from clsplat.images.channels import DEEP, HALF_MAX, deep_spec
 from clsplat.images.colour import Colours

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.frame.window import on_tiles, reframed
+from clsplat.device.layout import TILE
+from clsplat.frame.window import crop, reframed
 from clsplat.images.channels import LAYERS
 
 if TYPE_CHECKING:
@@ -67,3 +68,12 @@ def drawn_by(
 def renderer_channels(names: Collection[str]) -> tuple[str, ...]:
     """Names, in `Renderer.render_channels`, of those layers that it makes only when asked."""
     return tuple(own for name, own in _FEATURES.items() if name in names)
+
+
+def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
+    """A camera whose picture begins with a whole tile of its frame, and where the wanted one is in that."""
+    if camera.window is None:
+        return camera, slice(None), slice(None)
+    left, top = camera.window.x % TILE, camera.window.y % TILE
+    larger = crop(camera, -left, -top, camera.width + left, camera.height + top)
+    return larger, slice(top, None), slice(left, None)

@@ -60,19 +60,13 @@ def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
     )
 
 
-def shutter_middle(config: SamplingConfig) -> float:
-    """The time half way between open and close, in frames from the frame."""
-    begin, end = config.shutter
-    return 0.5 * (begin + end)
-
-
 def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tuple[Camera, list[Camera]]:
     """(the camera in the middle of shutter and lens, one for each sample), of whole frames.
 
     at: the camera at a time in frames from the frame, such as `Shot.at` gives; one sample is the middle itself.
     """
     begin, end = config.shutter
-    middle = at(shutter_middle(config))
+    middle = at(config.middle)
     if not config.on or config.samples == 1:
         return middle, [middle]
     times = begin + (end - begin) * sample_times(config.samples)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from clsplat.camera import Camera
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig
 from clsplat.files import digest, is_file
-from clsplat.frame.shutter_and_lens import shutter_middle
 from clsplat.frame.window import framed
 from clsplat.images.channels import VIDEO
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
@@ -96,13 +95,12 @@ def picture_camera(task: Task, options: RenderOptions) -> Camera:
 
     Raises InputError for a region that is not in the frame.
     """
-    middle = task.at(shutter_middle(options.pictures.sampling))
-    return framed(middle, options.pictures.framing)
+    return framed(task.at(options.pictures.sampling.middle), options.pictures.framing)
 
 
 def camera_after(task: Task, options: RenderOptions) -> Camera | None:
     """The camera of the whole frame that motion goes to: a frame later than the middle of the shutter."""
-    middle = shutter_middle(options.pictures.sampling)
+    middle = options.pictures.sampling.middle
     return task.after if middle == 0 or task.after is None else task.at(middle + 1)
 
 

@@ -19,7 +19,8 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep
-from clsplat.frame.window import crop, on_tiles
+from clsplat.frame.draw import on_tiles
+from clsplat.frame.window import crop
 from clsplat.reference import deep as deep_twin
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
