@@ -18,13 +18,13 @@ from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Layers, drawn_by
 from clsplat.frame.supersample import filter_taps, supersampled
 from clsplat.frame.window import crop, framed, reframed
-from clsplat.images.channels import LAYERS
+from clsplat.images.channels import CHANNELS
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
 
 WIDTH, HEIGHT = 150, 100
-EVERYTHING = tuple(LAYERS)
+EVERYTHING = tuple(CHANNELS)
 PERSPECTIVE = scenes.random_cloud(3000, 8, WIDTH, HEIGHT)
 
 

@@ -88,12 +88,12 @@ PICTURES = """
 import sys
 from pathlib import Path
 import numpy as np
-from clsplat.config.pictures import Encoding; from clsplat.images.channels import is_whole, write_layers
+from clsplat.config.pictures import Encoding; from clsplat.images.channels import is_whole, write_channels
 folder, name = Path(sys.argv[1]), sys.argv[2]
 rng = np.random.default_rng(0)
 for size in range(*map(int, sys.argv[3:])):
     try:
-        write_layers(folder / name, {"rgb": rng.random((size, size, 3)).astype(np.float32)})
+        write_channels(folder / name, {"rgb": rng.random((size, size, 3)).astype(np.float32)})
         print("whole" if is_whole(folder / name, size, size, ["rgb"], Encoding()) else "cut")
         (folder / name).unlink()
     except OSError as error:

@@ -77,7 +77,7 @@ def test_samples_in_linear_light() -> None:
     times = (0.1, 0.3, 0.5)
     light = [srgb_to_linear(renderer.render(CLOUD, sliding(time)).image).astype(np.float64) for time in times]
     assert_close(got["rgb"], np.mean(light, axis=0), relative=1e-6, absolute=1e-6)
-    assert_same_bits(got["depth"], renderer.render_channels(CLOUD, sliding(0.3))[1].depth)
+    assert_same_bits(got["depth"], renderer.render_channels(CLOUD, sliding(0.3))[1]["depth"])
     assert_close(pictures.camera(sliding).position, sliding(0.3).position, absolute=1e-12)
 
 

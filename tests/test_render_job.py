@@ -23,7 +23,7 @@ from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import temporary_name
 from clsplat.frame.draw import Layers
-from clsplat.images.channels import LAYERS
+from clsplat.images.channels import CHANNELS
 from clsplat.sequence import existing, workers
 from clsplat.sequence.existing import is_complete
 from clsplat.sequence.frame_renderer import FrameShader, Shaded
@@ -33,7 +33,7 @@ from clsplat.sequence.workers import run_tasks, write_frame
 from clsplat.shots.motion import camera_after, stretches
 from clsplat.shots.shot import Frame, Shot, numbered
 
-EVERYTHING = tuple(LAYERS)
+EVERYTHING = tuple(CHANNELS)
 OPTIONS = RenderOptions(("rgb", "alpha", "depth"), attributes={"clsplat:model": "abc", "Software": "clsplat"})
 
 
@@ -56,7 +56,7 @@ def tasks_in(folder: Path, count: int = 6, channels: tuple[str, ...] = OPTIONS.c
 def layers_of(task: Task, channels: tuple[str, ...] = OPTIONS.channels) -> Layers:
     rng = np.random.default_rng(task.number)
     size = (task.camera.height, task.camera.width)
-    return {name: rng.uniform(0, 1, (*size, len(LAYERS[name].names))).astype(np.float32) for name in channels}
+    return {name: rng.uniform(0, 1, (*size, len(CHANNELS[name].names))).astype(np.float32) for name in channels}
 
 
 def shader(task: Task) -> Shaded:
@@ -148,13 +148,13 @@ class FakeRenderer:
     def render_channels(self, gaussians: object, camera: Camera, wanted: Any, **how: Any) -> Any:
         self.asked.append((wanted, how))
         size = (camera.height, camera.width)
-        plain = {
+        planes = {
             name: np.full(size, value) for value, name in enumerate(("depth", "median", "first", "count", "index"))
         }
         fields = {"normal": np.full((*size, 3), 7.0), "position": np.full((*size, 3), 8.0)}
         fields["motion"] = np.broadcast_to(np.float32([2, 3]), (*size, 2))
-        found = type("Channels", (), {**plain, "fields": {name: fields[name] for name in wanted}})
-        return self.render(gaussians, camera, None), found
+        planes |= {name: fields[name] for name in wanted if name in fields}
+        return self.render(gaussians, camera, None), planes
 
 
 def shade(renderer: Any, task: Task, options: RenderOptions) -> Layers:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
+from clsplat.config.channels import DEEP
 from clsplat.config.pictures import DEEP_STRIP_FLOATS, DeepConfig, Encoding
 from clsplat.device.context import Device
 from clsplat.device.layout import TILE
@@ -26,7 +27,7 @@ from clsplat.errors import InputError
 from clsplat.frame.draw import on_tiles
 from clsplat.frame.strips import strips
 from clsplat.gaussians import Gaussians
-from clsplat.images.channels import DEEP, HALF_MAX, deep_spec
+from clsplat.images.channels import HALF_MAX, deep_spec
 from clsplat.images.colour import Colours
 from clsplat.images.exr_header import Header
 from clsplat.images.writing import atomic_output
@@ -100,7 +101,7 @@ def write_deep(
 
     Channels R G B A Z ZBack; a pixel has a sample for each slice that it has something in, with the depths of the first
     and the last Gaussian that it takes there. Colours are half or float as the encoding says, depths are float. Raises
-    InputError and ClsplatError as `images.channels.write_layers`.
+    InputError and ClsplatError as `images.channels.write_channels`.
     """
     path, config = Path(path), config or DeepConfig()
     encoding, header, colours = encoding or Encoding(), header or Header(), colours or Colours()

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.config.channels import CHANNELS, kernel_names, light_and_rest
 from clsplat.device.layout import TILE
 from clsplat.frame.window import crop, reframed
-from clsplat.images.channels import LAYERS
+from clsplat.stages.channels import Features
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
@@ -23,9 +24,6 @@ Layers = dict[str, NDArray[Any]]
 Draw = Callable[[Camera, Collection[str]], Layers]
 """(camera, names of layers) -> those layers, (height, width) or (height, width, channels); rgb over the background,
 so over black it is associated with alpha."""
-COLOUR = ("rgb", "alpha")
-"""Layers that light is added up in; the other layers have no mean."""
-_FEATURES = {"normals": "normal", "position": "position", "motion": "motion"}
 
 
 def drawn_by(
@@ -36,38 +34,39 @@ def drawn_by(
 ) -> Draw:
     """A Draw by the kernels; after: the camera of a whole frame that motion goes to.
 
-    Motion is turned over: in files v is up, and docs/channels.md has y down. Layers need not be contiguous: the
-    encoder, which may be another thread, puts them in order.
+    Layers need not be contiguous: the encoder, which may be another thread, puts them in order.
     """
 
     def draw(camera: Camera, names: Collection[str]) -> Layers:
         camera, rows, columns = on_tiles(camera)
-        if set(names) <= set(COLOUR):
+        _, rest = light_and_rest(names)
+        planes: Layers = {}
+        if not rest:
             picture = renderer.render(gaussians, camera, background, contiguous=False)
-            layers: Layers = {"rgb": picture.image, "alpha": picture.alpha}
         else:
-            wanted = renderer_channels(names)
-            picture, found = renderer.render_channels(
+            picture, planes = renderer.render_channels(
                 gaussians,
                 camera,
-                wanted,
+                kernel_names(rest, "features"),
                 after=after and reframed(after, camera),
                 background=background,
                 contiguous=False,
             )
-            layers = {"rgb": picture.image, "alpha": picture.alpha, "depth": found.depth, "median": found.median}
-            layers |= {"first": found.first, "count": found.count, "id": found.index}
-            layers |= {name: found.fields[_FEATURES[name]] for name in names if name in _FEATURES}
-            if "motion" in layers:
-                layers["motion"] = layers["motion"] * np.array([1, -1], np.float32)
-        return {name: layers[name][rows, columns] for name in LAYERS if name in names}
+        layers: Layers = {"rgb": picture.image, "alpha": picture.alpha}
+        layers |= {name: _in_file(planes[CHANNELS[name].kernel], CHANNELS[name].signs) for name in rest}
+        return {name: layers[name][rows, columns] for name in names}
 
     return draw
 
 
-def renderer_channels(names: Collection[str]) -> tuple[str, ...]:
-    """Names, in `Renderer.render_channels`, of those layers that it makes only when asked."""
-    return tuple(own for name, own in _FEATURES.items() if name in names)
+def _in_file(plane: NDArray[Any], signs: tuple[int, ...]) -> NDArray[Any]:
+    return plane * np.array(signs, np.float32) if signs else plane
+
+
+def feature_floats(names: Collection[str]) -> int:
+    """Floats of each Gaussian's that these channels are blended from, 0 where they are colour alone."""
+    _, rest = light_and_rest(names)
+    return Features.of(kernel_names(rest, "features")).floats if rest else 0
 
 
 def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:

@@ -21,7 +21,7 @@ from clsplat.frame.shutter_and_lens import sample_cameras, sampled
 from clsplat.frame.strips import in_strips, strip_rows, write_in_strips
 from clsplat.frame.supersample import supersampled
 from clsplat.frame.window import framed
-from clsplat.images.channels import write_layers
+from clsplat.images.channels import write_channels
 from clsplat.images.colour import SRGB, Colours
 from clsplat.images.exr_header import Header
 
@@ -125,7 +125,7 @@ class Pictures:
         if rows < camera.height:
             write_in_strips(path, draw, camera, names, rows, encoding, header)
         else:
-            write_layers(path, draw(camera, names), encoding, header)
+            write_channels(path, draw(camera, names), encoding, header)
 
 
 def converted(draw: Draw, colours: Colours, source: str, target: str) -> Draw:

@@ -13,11 +13,11 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
+from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import SamplingConfig
 from clsplat.errors import InputError
-from clsplat.frame.draw import COLOUR, Draw, Layers
+from clsplat.frame.draw import Draw, Layers
 from clsplat.frame.window import reframed
-from clsplat.images.channels import LAYERS
 
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
@@ -87,8 +87,7 @@ def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera]) -> Draw:
     """
 
     def blurred(camera: Camera, names: Collection[str]) -> Layers:
-        light = [name for name in COLOUR if name in names]
-        rest = [name for name in names if name not in COLOUR]
+        light, rest = light_and_rest(names)
         layers = draw(reframed(middle, camera), rest) if rest else {}
         if light and len(cameras) == 1:
             layers |= draw(reframed(cameras[0], camera), light)
@@ -101,6 +100,6 @@ def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera]) -> Draw:
                     else:
                         sums[name] = plane.astype(np.float64)
             layers |= {name: (total / len(cameras)).astype(np.float32) for name, total in sums.items()}
-        return {name: layers[name] for name in LAYERS if name in names}
+        return layers
 
     return blurred

@@ -14,17 +14,15 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import STRIP_PIXELS, Encoding, FramingConfig
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
-from clsplat.frame.draw import Draw, Layers
+from clsplat.frame.draw import Draw, Layers, feature_floats
 from clsplat.frame.window import crop
-from clsplat.images.channels import LAYERS, check_format, encoded
+from clsplat.images.channels import check_format, encoded
 from clsplat.images.exr_header import Header
 from clsplat.images.writing import atomic_output
 from clsplat.rendering.memory_needs import frame_pixels
 
 if TYPE_CHECKING:
     from clsplat.device.context import Device
-
-_FEATURE_FLOATS = {"normals": 3, "position": 3, "motion": 2}
 
 
 def strip_rows(
@@ -34,9 +32,8 @@ def strip_rows(
 
     names: of the layers that are wanted; config: supersampling makes strips larger than they are written.
     """
-    features = 0 if set(names) <= {"rgb", "alpha"} else 1 + sum(_FEATURE_FLOATS.get(name, 0) for name in names)
     samples = config.supersample if config else 1
-    most = min(frame_pixels(device, features), STRIP_PIXELS)
+    most = min(frame_pixels(device, feature_floats(names)), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
     rows = most // across - 2 * TILE  # what a window that begins within a tile, and a filter's margins, add
     if rows >= camera.height:
@@ -76,7 +73,7 @@ def write_in_strips(
     encoding: Encoding | None = None,
     header: Header | None = None,
 ) -> None:
-    """Draw and write a picture strip by strip, atomically; the same bytes as `write_layers` writes of all of it, but
+    """Draw and write a picture strip by strip, atomically; the same bytes as `write_channels` writes of all of it, but
     for layouts of a file that depend on how it is handed over.
 
     Raises InputError for what the format cannot hold and for several parts, which a file has one after the other;
@@ -94,9 +91,7 @@ def write_in_strips(
     pictures = strips(camera, rows)
 
     def made(strip: Camera) -> tuple[NDArray[Any], Any]:
-        layers = draw(strip, names)
-        ordered = {name: layers[name] for name in LAYERS if name in names}
-        ((pixels, spec),) = encoded(extension, ordered, encoding, header)
+        ((pixels, spec),) = encoded(extension, draw(strip, names), encoding, header)
         return pixels, spec
 
     pixels, spec = made(next(pictures))

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
+from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import Filter, FramingConfig
 from clsplat.errors import InputError
-from clsplat.frame.draw import COLOUR, Draw, Layers
+from clsplat.frame.draw import Draw, Layers
 from clsplat.frame.window import crop
-from clsplat.images.channels import LAYERS
 
 _RADII: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
 
@@ -73,12 +73,11 @@ def supersampled(draw: Draw, config: FramingConfig) -> Draw:
         return total
 
     def fine(camera: Camera, names: Collection[str]) -> Layers:
-        light = [name for name in COLOUR if name in names]
-        rest = [name for name in names if name not in COLOUR]
+        light, rest = light_and_rest(names)
         layers = draw(camera, rest) if rest else {}
         if light:
             for name, plane in draw(finer(camera, config), light).items():
                 layers[name] = shrunk(shrunk(plane, 0, camera.height), 1, camera.width)
-        return {name: layers[name] for name in LAYERS if name in names}
+        return layers
 
     return fine

@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of rendered frames: layers of channels in EXR, one part or several, or a plain picture.
 
-EXR names follow the OpenEXR documentation ("Technical introduction", layers): R G B A Z, N.x N.y N.z, P.x P.y P.z,
-forward.u forward.v. Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
+Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
 vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standard attributes (ImfStandardAttributes.h).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from clsplat.config.channels import CHANNELS, DEEP
 from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
 from clsplat.files import native_name
@@ -25,30 +24,6 @@ from clsplat.images.exr_header import Header
 from clsplat.images.reading import image_size
 from clsplat.images.writing import steps_of, write_spec
 
-
-@dataclass(frozen=True)
-class Layer:
-    """names: of the channels in a file. kind: colour is half or float as asked for; exact stays float, as a half has 11
-    bits of a depth; whole is uint32 in a part of its own, else float. part: its name in a file of several parts."""
-
-    names: tuple[str, ...]
-    kind: Literal["colour", "exact", "whole"]
-    part: str
-
-
-LAYERS: dict[str, Layer] = {
-    "rgb": Layer(("R", "G", "B"), "colour", "rgba"),
-    "alpha": Layer(("A",), "colour", "rgba"),
-    "depth": Layer(("Z",), "exact", "depth"),
-    "median": Layer(("median.Z",), "exact", "median"),
-    "first": Layer(("first.Z",), "exact", "first"),
-    "normals": Layer(("N.x", "N.y", "N.z"), "colour", "N"),
-    "position": Layer(("P.x", "P.y", "P.z"), "exact", "P"),
-    "motion": Layer(("forward.u", "forward.v"), "exact", "forward"),
-    "count": Layer(("count",), "whole", "count"),
-    "id": Layer(("id",), "whole", "id"),
-}
-"""Every channel that `--channels` takes, in the order of a file."""
 
 HALF_MAX = np.float32(65504)
 _PNG_LEVEL, _PNG_FILTER = 1, 0x40
@@ -62,18 +37,16 @@ _BLOCK, _ROWS = 1 << 12, 64
 
 EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
 VIDEO = ".mp4"
-DEEP = ("R", "G", "B", "A", "Z", "ZBack")
-"""Channels of a deep picture."""
 
 
 def parse_channels(text: str) -> tuple[str, ...]:
-    """The names in `text`, comma-separated, in the order of LAYERS. Raises InputError."""
+    """The names in `text`, comma-separated, in the order of CHANNELS. Raises InputError."""
     asked = [word.strip() for word in text.split(",") if word.strip()]
-    unknown = [word for word in asked if word not in LAYERS]
+    unknown = [word for word in asked if word not in CHANNELS]
     if unknown or not asked:
         found = f"has {examples(map(repr, unknown))}" if unknown else "is empty"
-        raise InputError(f"--channels {text}: {found}, expected some of {', '.join(LAYERS)}")
-    return tuple(name for name in LAYERS if name in asked)
+        raise InputError(f"--channels {text}: {found}, expected some of {', '.join(CHANNELS)}")
+    return tuple(name for name in CHANNELS if name in asked)
 
 
 def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
@@ -91,7 +64,7 @@ def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> 
         raise InputError(f"{path}: {article} {extension[1:].upper()} {lacking}; write .exr, or other --channels")
 
 
-def write_layers(
+def write_channels(
     path: Path, layers: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
 ) -> None:
     """Write a frame, atomically.
@@ -103,15 +76,15 @@ def write_layers(
     check_format(str(path), layers)
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: no such folder to write {path.name} to")
-    ordered = {name: layers[name] for name in LAYERS if name in layers}
-    pairs = encoded(path.suffix.lower(), ordered, encoding, header)
+    pairs = encoded(path.suffix.lower(), layers, encoding, header)
     write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], path.suffix.lower()[1:])
 
 
 def encoded(
     extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
 ) -> list[tuple[NDArray[Any], Any]]:
-    """(pixels, OpenImageIO's specification) of each part of a file. layers: in the order of LAYERS."""
+    """(pixels, OpenImageIO's specification) of each part of a file."""
+    layers = {name: layers[name] for name in CHANNELS if name in layers}
     if extension != ".exr":
         return [_picture(extension, layers, encoding, header)]
     groups = _parts(tuple(layers)) if encoding.parts == "several" else [tuple(layers)]
@@ -128,13 +101,13 @@ def is_whole(
     *,
     deep: bool = False,
 ) -> bool:
-    """True if the file holds these channels as `write_layers` writes them, and is whole.
+    """True if the file holds these channels as `write_channels` writes them, and is whole.
 
     It has to have that size and no other values of these attributes, and to decode to its last row; with a block of
     zeros in it every row is decoded. A file that was cut short fails. deep: expect a deep picture, whose channels are
     DEEP.
     """
-    channels = [name for name in LAYERS if name in set(channels)]
+    channels = [name for name in CHANNELS if name in set(channels)]
     exr = path.suffix.lower() == ".exr"
     groups = _parts(channels) if exr and encoding.parts == "several" else [tuple(channels)]
     if not path.is_file():
@@ -153,8 +126,10 @@ def is_whole(
             if not source.seek_subimage(part, 0):
                 return False
             spec = source.spec()
-            names = DEEP if deep else tuple(channel for name in group for channel in LAYERS[name].names)
-            if (spec.width, spec.height, tuple(spec.channelnames)) != (width, height, names) or spec.deep != deep:
+            names = DEEP if deep else tuple(channel for name in group for channel in CHANNELS[name].names)
+            if (spec.width, spec.height, spec.deep) != (width, height, deep):
+                return False
+            if sorted(spec.channelnames) != sorted(names):  # OpenImageIO has its own order of an EXR's
                 return False
             if any(spec.getattribute(key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False
@@ -215,14 +190,14 @@ def attribute(path: Path, name: str) -> Any:
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
     grouped: dict[str, list[str]] = {}
     for name in names:
-        grouped.setdefault(LAYERS[name].part, []).append(name)
+        grouped.setdefault(CHANNELS[name].part, []).append(name)
     return [tuple(group) for group in grouped.values()]
 
 
 def _exr_part(
     names: Sequence[str], layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
 ) -> tuple[NDArray[Any], Any]:
-    kinds = [LAYERS[name].kind for name in names for _ in LAYERS[name].names]
+    kinds = [CHANNELS[name].kind for name in names for _ in CHANNELS[name].names]
     planes = [_planes(layers[name]) for name in names]
     if set(kinds) == {"whole"}:
         pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes the largest
@@ -242,19 +217,19 @@ def _exr_part(
         spec = _spec(pixels, formats[0] if len(set(formats)) == 1 else oiio.FLOAT, header)
         if len(set(formats)) > 1:
             spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
-    spec.channelnames = tuple(channel for name in names for channel in LAYERS[name].names)
+    spec.channelnames = tuple(channel for name in names for channel in CHANNELS[name].names)
     if "alpha" in names:
         spec.alpha_channel = spec.channelnames.index("A")
     deflated = encoding.compression.startswith("zip")
     spec.attribute("compression", f"{encoding.compression}:{_EXR_LEVEL}" if deflated else encoding.compression)
     if named:
-        spec.attribute("oiio:subimagename", LAYERS[names[0]].part)
+        spec.attribute("oiio:subimagename", CHANNELS[names[0]].part)
     _add_matrices(spec, header)
     return np.ascontiguousarray(pixels), spec
 
 
 def _check_floats(name: str, plane: NDArray[Any]) -> None:
-    if LAYERS[name].kind == "whole" and plane.max(initial=0) > _LARGEST_FLOAT_INDEX:
+    if CHANNELS[name].kind == "whole" and plane.max(initial=0) > _LARGEST_FLOAT_INDEX:
         raise InputError(
             f"--channels {name}: the largest is {plane.max():,}, more than a float holds exactly; use --parts several, "
             "where it is a whole number"

@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from clsplat.camera import Camera
+from clsplat.config.channels import light_and_rest
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device, open_device, select
 from clsplat.errors import DriverError, InputError
 from clsplat.frame.deep_exr import write_deep
-from clsplat.frame.draw import COLOUR, Layers
+from clsplat.frame.draw import Layers
 from clsplat.frame.pipeline import Pictures
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, RAYS
@@ -121,8 +122,8 @@ def open_shader(
     profile: note what the device is busy with.
     """
     opened: Any = _profiled(device, memory_limit) if profile else open_device(device, memory_limit)
-    beside = DEEP if options.deep is not None else CHANNELS if set(options.channels) - set(COLOUR) else ()
-    opened = require(opened, (*FORWARD, *beside))
+    kernels = DEEP if options.deep is not None else CHANNELS if light_and_rest(options.channels)[1] else ()
+    opened = require(opened, (*FORWARD, *kernels))
     shader = FrameShader(Renderer(opened, config=rasterizer), gaussians, options)
     return _Recorded(shader, opened) if profile else shader
 

@@ -76,7 +76,7 @@ class Task:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options that all frames of a job share. channels: of `images.channels.LAYERS`; attributes: of the file's header;
+    """Options that all frames of a job share. channels: of `config.channels.CHANNELS`; attributes: of the file's header;
     pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a deep
     picture, or None; drawn: digest of the rasterizer's settings."""
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.config.channels import CHANNELS, DEEP
 from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig
 from clsplat.device.child import abandon
 from clsplat.files import is_file
@@ -50,7 +51,7 @@ def write_frame(task: Task, shaded: Shaded, options: RenderOptions) -> Record:
     """Encode the frame and write it, atomically, unless that is done. Raises ClsplatError."""
     start = time.monotonic()
     if shaded.layers is not None:
-        layers.write_layers(task.path, shaded.finish(shaded.layers), options.encoding, header(task, options))
+        layers.write_channels(task.path, shaded.finish(shaded.layers), options.encoding, header(task, options))
     return _record(task, shaded, options, start)
 
 
@@ -81,8 +82,8 @@ def frame_bytes(task: Task, options: RenderOptions) -> int:
     if not task.is_video:
         pixels = min(pixels, STRIP_PIXELS // finer)
     if options.deep is not None:
-        return COPIES * 4 * min(len(layers.DEEP) * options.deep.bins * pixels, DEEP_STRIP_FLOATS)
-    floats = sum(len(layers.LAYERS[name].names) for name in options.channels)
+        return COPIES * 4 * min(len(DEEP) * options.deep.bins * pixels, DEEP_STRIP_FLOATS)
+    floats = sum(len(CHANNELS[name].names) for name in options.channels)
     light = 4 if options.pictures.sampling.on or finer > 1 else 0
     return 4 * pixels * (COPIES * floats + light * (finer if finer > 1 else 2))
 
