@@ -24,7 +24,6 @@ from clsplat.images.exr_header import Header
 from clsplat.images.reading import image_size
 from clsplat.images.writing import steps_of, write_spec
 
-
 HALF_MAX = np.float32(65504)
 _PNG_LEVEL, _PNG_FILTER = 1, 0x40
 """Each pixel from the mean of the two beside it, rather than the best of five filters for each row. A fifth of the time

@@ -38,8 +38,8 @@ class RenderResult:
 
 ChannelResult = dict[str, NDArray[Any]]
 """Channels beside colour by their names in the kernels. depth, median, first (H, W) float32, along the camera's axis;
-count, index (H, W) int32, index -1 for nothing; of normal and position (H, W, 3), in the world, and motion (H, W, 2), in
-pixels, those that were asked for."""
+count, index (H, W) int32, index -1 for nothing. normal and position (H, W, 3), in the world, and motion (H, W, 2), in
+pixels, are there if they were asked for."""
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:

@@ -76,9 +76,9 @@ class Task:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options that all frames of a job share. channels: of `config.channels.CHANNELS`; attributes: of the file's header;
-    pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a deep
-    picture, or None; drawn: digest of the rasterizer's settings."""
+    """Options that all frames of a job share. channels: of the table, `config.channels`; attributes: of the file's
+    header; pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a
+    deep picture, or None; drawn: digest of the rasterizer's settings."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
