@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from compare import assert_close, assert_same_bits
 from clsplat.camera import Camera
 from clsplat.config.pictures import ColourConfig, Encoding, FramingConfig, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
-from clsplat.frame.pipeline import Pictures
+from clsplat.frame.draw import Planes
+from clsplat.frame.pipeline import FramePipeline
 from clsplat.images.colour import LINEAR, linear_to_srgb, srgb_to_linear
 from clsplat.rendering.renderer import Renderer
 
@@ -30,6 +32,11 @@ def still(_: float) -> Camera:
     return CAMERA
 
 
+def drawn(pipeline: FramePipeline, at: Callable[[float], Camera], names: tuple[str, ...]) -> Planes:
+    planes, finish = pipeline.unfinished(at, names)
+    return finish(planes)
+
+
 def straight(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return rgb / np.where(alpha > 0, alpha, 1)[:, :, None]
 
@@ -37,7 +44,7 @@ def straight(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 def test_nothing_asked_for_is_the_plain_frame() -> None:
     renderer = Renderer()
     plain = renderer.render(CLOUD, CAMERA)
-    layers = Pictures(renderer, CLOUD).layers(still, ("rgb", "alpha"))
+    layers = drawn(FramePipeline(renderer, CLOUD), still, ("rgb", "alpha"))
     assert_same_bits(layers["rgb"], plain.image)
     assert_same_bits(layers["alpha"], plain.alpha)
 
@@ -46,7 +53,7 @@ def test_nothing_asked_for_is_the_plain_frame() -> None:
 def test_light_is_added_up_in_linear_values(recorded: str, space: str) -> None:
     renderer = Renderer()
     config = PictureConfig(framing=FramingConfig(supersample=2))
-    layers = Pictures(renderer, CLOUD, config, recorded=recorded).layers(still, ("rgb", "alpha"))
+    layers = drawn(FramePipeline(renderer, CLOUD, config, recorded=recorded), still, ("rgb", "alpha"))
     large = renderer.render(CLOUD, CAMERA.resized(200, 140))
     colour = straight(large.image, large.alpha)
     light = (srgb_to_linear(colour) if space == "sRGB" else colour) * large.alpha[:, :, None]
@@ -63,7 +70,7 @@ def test_light_is_added_up_in_linear_values(recorded: str, space: str) -> None:
 def test_an_opaque_picture_is_converted_as_it_is() -> None:
     config = PictureConfig(colour=ColourConfig(colorspace=LINEAR))
     renderer = Renderer()
-    got = Pictures(renderer, CLOUD, config, background=(0.2, 0.4, 0.6)).layers(still, ("rgb",))["rgb"]
+    got = drawn(FramePipeline(renderer, CLOUD, config, background=(0.2, 0.4, 0.6)), still, ("rgb",))["rgb"]
     assert_same_bits(got, srgb_to_linear(renderer.render(CLOUD, CAMERA, (0.2, 0.4, 0.6)).image))
 
 
@@ -72,13 +79,13 @@ def test_samples_in_linear_light() -> None:
         colour=ColourConfig(colorspace=LINEAR), sampling=SamplingConfig(samples=3, shutter_open=0.0, shutter_close=0.6)
     )
     renderer = Renderer()
-    pictures = Pictures(renderer, CLOUD, config)
-    got = pictures.layers(sliding, ("rgb", "depth"))
+    pipeline = FramePipeline(renderer, CLOUD, config)
+    got = drawn(pipeline, sliding, ("rgb", "depth"))
     times = (0.1, 0.3, 0.5)
     light = [srgb_to_linear(renderer.render(CLOUD, sliding(time)).image).astype(np.float64) for time in times]
     assert_close(got["rgb"], np.mean(light, axis=0), relative=1e-6, absolute=1e-6)
     assert_same_bits(got["depth"], renderer.render_channels(CLOUD, sliding(0.3))[1]["depth"])
-    assert_close(pictures.camera(sliding).position, sliding(0.3).position, absolute=1e-12)
+    assert_close(pipeline.camera(sliding).position, sliding(0.3).position, absolute=1e-12)
 
 
 def test_all_of_it_to_a_file_in_strips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,16 +95,16 @@ def test_all_of_it_to_a_file_in_strips(tmp_path: Path, monkeypatch: pytest.Monke
         SamplingConfig(samples=2, shutter_angle=90.0, aperture=0.05, focus=4.0),
     )
     names = ("rgb", "alpha", "depth", "motion")
-    pictures = Pictures(Renderer(), CLOUD, config)
+    pipeline = FramePipeline(Renderer(), CLOUD, config)
     after = sliding(1.0)
-    pictures.write(tmp_path / "whole.exr", sliding, names, Encoding(depth="float"), after=after)
+    pipeline.write(tmp_path / "whole.exr", sliding, names, Encoding(depth="float"), after=after)
     monkeypatch.setattr("clsplat.frame.pipeline.strip_rows", lambda *_: 16)
-    pictures.write(tmp_path / "strips.exr", sliding, names, Encoding(depth="float"), after=after)
+    pipeline.write(tmp_path / "strips.exr", sliding, names, Encoding(depth="float"), after=after)
     assert (tmp_path / "strips.exr").read_bytes() == (tmp_path / "whole.exr").read_bytes()
     spec = oiio.ImageBuf(str(tmp_path / "whole.exr")).spec()
     assert (spec.x, spec.y, spec.width, spec.height) == (-10, -7, 120, 84)
     assert (spec.full_x, spec.full_y, spec.full_width, spec.full_height) == (0, 0, 100, 70)
-    pictures.write(tmp_path / "a.png", sliding, ("rgb", "alpha"))
+    pipeline.write(tmp_path / "a.png", sliding, ("rgb", "alpha"))
     assert oiio.ImageBuf(str(tmp_path / "a.png")).spec().full_width == 120
 
 
@@ -113,4 +120,4 @@ def test_what_deep_pictures_have_not() -> None:
     with pytest.raises(InputError, match="deep EXR: a shutter or a lens has no deep samples"):
         PictureConfig(sampling=SamplingConfig(shutter_angle=9.0)).check_deep()
     with pytest.raises(InputError, match="--supersample 0"):
-        Pictures(Renderer(), CLOUD, PictureConfig(framing=FramingConfig(supersample=0)))
+        FramePipeline(Renderer(), CLOUD, PictureConfig(framing=FramingConfig(supersample=0)))

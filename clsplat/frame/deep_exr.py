@@ -30,7 +30,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.images.channels import HALF_MAX, deep_spec
 from clsplat.images.colour import Colours
 from clsplat.images.exr_header import Header
-from clsplat.images.writing import atomic_output
+from clsplat.images.writing import write_rows
 from clsplat.rendering.memory_needs import frame_pixels
 from clsplat.rendering.renderer import Renderer
 from clsplat.stages.deep import DEEP_FLOATS
@@ -72,14 +72,6 @@ def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bounds
     return renderer.render_deep(gaussians, larger, bounds)[:, rows, columns]
 
 
-def flattened(slices: Float32) -> Float32:
-    """(bins, H, W, 6) to (H, W, 4): the slices over each other, front to back."""
-    flat = np.zeros((*slices.shape[1:3], 4), np.float64)
-    for each in slices.astype(np.float64):
-        flat += (1 - flat[:, :, 3:]) * each[:, :, :4]
-    return flat.astype(np.float32)
-
-
 def deep_rows(device: Device, camera: Camera, bins: int) -> int:
     """Rows of the strips, in whole tiles, that a deep picture of `bins` slices is rendered in."""
     floats = DEEP_FLOATS * bins
@@ -103,7 +95,7 @@ def write_deep(
     and the last Gaussian that it takes there. Colours are half or float as the encoding says, depths are float. Raises
     InputError and ClsplatError as `images.channels.write_channels`.
     """
-    path, config = Path(path), config or DeepConfig()
+    config = config or DeepConfig()
     encoding, header, colours = encoding or Encoding(), header or Header(), colours or Colours()
     if path.suffix.lower() != ".exr":
         raise InputError(f"{path}: deep samples want an .exr file")
@@ -116,16 +108,16 @@ def write_deep(
     spec.alpha_channel, spec.z_channel = 3, 4
     spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
     rows = deep_rows(renderer.device, camera, len(bounds) + 1)
-    with atomic_output(path, [spec], "exr") as output:
-        row = spec.y
+
+    def pieces() -> Iterator[tuple[Any, int]]:
         for strip in strips(camera, rows):
             slices = render_deep(renderer, gaussians, strip, bounds)
-            for each in slices:
-                rgb, alpha = np.ascontiguousarray(each[:, :, :3]), np.ascontiguousarray(each[:, :, 3])
-                each[:, :, :3] = colours.convert(rgb, alpha, colours.model, colours.output)
-            for data, count in _deep_rows(slices, kinds, half=encoding.depth == "half"):
-                output.take(output.file.write_deep_scanlines(row, row + count, 0, data))
-                row += count
+            for image in slices:
+                rgb, alpha = np.ascontiguousarray(image[:, :, :3]), np.ascontiguousarray(image[:, :, 3])
+                image[:, :, :3] = colours.convert(rgb, alpha, colours.model, colours.output)
+            yield from _deep_rows(slices, kinds, half=encoding.depth == "half")
+
+    write_rows(path, spec, "exr", pieces())
 
 
 def _deep_rows(slices: Float32, kinds: list[Any], *, half: bool) -> Iterator[tuple[Any, int]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A `Draw` makes the named layers of a camera's picture; here, the one by the kernels."""
+"""A `Draw` makes the named channels of a camera's picture; here, the one by the kernels."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from clsplat.rendering.renderer import Renderer
 
 
-Layers = dict[str, NDArray[Any]]
-Draw = Callable[[Camera, Collection[str]], Layers]
-"""(camera, names of layers) -> those layers, (height, width) or (height, width, channels); rgb over the background,
-so over black it is associated with alpha."""
+Planes = dict[str, NDArray[Any]]
+"""Channels by name, (height, width) or (height, width, floats); rgb over the background, so over black it is associated
+with alpha."""
+Draw = Callable[[Camera, Collection[str]], Planes]
+"""From a camera and the names of channels to their planes."""
 
 
 def drawn_by(
@@ -34,17 +35,17 @@ def drawn_by(
 ) -> Draw:
     """A Draw by the kernels; after: the camera of a whole frame that motion goes to.
 
-    Layers need not be contiguous: the encoder, which may be another thread, puts them in order.
+    Planes need not be contiguous: the encoder, which may be another thread, puts them in order.
     """
 
-    def draw(camera: Camera, names: Collection[str]) -> Layers:
+    def draw(camera: Camera, names: Collection[str]) -> Planes:
         camera, rows, columns = on_tiles(camera)
         _, rest = light_and_rest(names)
-        planes: Layers = {}
+        made: Planes = {}
         if not rest:
             picture = renderer.render(gaussians, camera, background, contiguous=False)
         else:
-            picture, planes = renderer.render_channels(
+            picture, made = renderer.render_channels(
                 gaussians,
                 camera,
                 kernel_names(rest, "features"),
@@ -52,15 +53,24 @@ def drawn_by(
                 background=background,
                 contiguous=False,
             )
-        layers: Layers = {"rgb": picture.image, "alpha": picture.alpha}
-        layers |= {name: _in_file(planes[CHANNELS[name].kernel], CHANNELS[name].signs) for name in rest}
-        return {name: layers[name][rows, columns] for name in names}
+        planes: Planes = {"rgb": picture.image, "alpha": picture.alpha}
+        for name in rest:
+            plane, signs = made[CHANNELS[name].kernel], CHANNELS[name].signs
+            planes[name] = plane * np.array(signs, np.float32) if signs else plane
+        return {name: planes[name][rows, columns] for name in names}
 
     return draw
 
 
-def _in_file(plane: NDArray[Any], signs: tuple[int, ...]) -> NDArray[Any]:
-    return plane * np.array(signs, np.float32) if signs else plane
+def in_two(light: Draw, rest: Draw) -> Draw:
+    """A Draw that takes the channels that light is added up in from one, and the others from another."""
+
+    def draw(camera: Camera, names: Collection[str]) -> Planes:
+        of_light, others = light_and_rest(names)
+        planes = rest(camera, others) if others else {}
+        return planes | light(camera, of_light) if of_light else planes
+
+    return draw
 
 
 def feature_floats(names: Collection[str]) -> int:

@@ -13,10 +13,9 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
-from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import SamplingConfig
 from clsplat.errors import InputError
-from clsplat.frame.draw import Draw, Layers
+from clsplat.frame.draw import Draw, Planes, in_two
 from clsplat.frame.window import reframed
 
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
@@ -80,26 +79,20 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
 
 
 def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera]) -> Draw:
-    """rgb and alpha as the mean over the cameras, of whole frames; other layers, of which there is no mean, from the
+    """rgb and alpha as the mean over the cameras, of whole frames; other channels, of which there is no mean, from the
     middle one. The camera that is drawn says the size and the window alone.
 
     `draw` has to give rgb in linear light. Sums are of float64, in the cameras' order.
     """
 
-    def blurred(camera: Camera, names: Collection[str]) -> Layers:
-        light, rest = light_and_rest(names)
-        layers = draw(reframed(middle, camera), rest) if rest else {}
-        if light and len(cameras) == 1:
-            layers |= draw(reframed(cameras[0], camera), light)
-        elif light:
-            sums: dict[str, Float64] = {}
-            for each in cameras:
-                for name, plane in draw(reframed(each, camera), light).items():
-                    if name in sums:
-                        sums[name] += plane
-                    else:
-                        sums[name] = plane.astype(np.float64)
-            layers |= {name: (total / len(cameras)).astype(np.float32) for name, total in sums.items()}
-        return layers
+    def blurred(camera: Camera, names: Collection[str]) -> Planes:
+        sums: dict[str, Float64] = {}
+        for sample in cameras:
+            for name, plane in draw(reframed(sample, camera), names).items():
+                if name in sums:
+                    sums[name] += plane
+                else:
+                    sums[name] = plane.astype(np.float64)
+        return {name: (total / len(cameras)).astype(np.float32) for name, total in sums.items()}
 
-    return blurred
+    return in_two(blurred, lambda camera, names: draw(reframed(middle, camera), names))

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import Filter, FramingConfig
 from clsplat.errors import InputError
-from clsplat.frame.draw import Draw, Layers
+from clsplat.frame.draw import Draw, Planes, in_two
 from clsplat.frame.window import crop
 
 _RADII: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
@@ -52,7 +51,7 @@ def finer(camera: Camera, config: FramingConfig) -> Camera:
 
 
 def supersampled(draw: Draw, config: FramingConfig) -> Draw:
-    """rgb and alpha from a frame `supersample` times larger, filtered; other layers as without.
+    """rgb and alpha from a frame `supersample` times larger, filtered; other channels as without.
 
     `draw` has to give rgb in linear light: what falls on a pixel adds up in that alone. The sums are in the same order
     wherever the picture is in its frame.
@@ -67,17 +66,13 @@ def supersampled(draw: Draw, config: FramingConfig) -> Draw:
         total: Float32 | None = None
         for at, weight in enumerate(taps):
             parts[axis] = slice(at, at + samples * (size - 1) + 1, samples)
-            each = weight * plane[tuple(parts)]
-            total = each if total is None else total + each
+            part = weight * plane[tuple(parts)]
+            total = part if total is None else total + part
         assert total is not None
         return total
 
-    def fine(camera: Camera, names: Collection[str]) -> Layers:
-        light, rest = light_and_rest(names)
-        layers = draw(camera, rest) if rest else {}
-        if light:
-            for name, plane in draw(finer(camera, config), light).items():
-                layers[name] = shrunk(shrunk(plane, 0, camera.height), 1, camera.width)
-        return layers
+    def filtered(camera: Camera, names: Collection[str]) -> Planes:
+        planes = draw(finer(camera, config), names)
+        return {name: shrunk(shrunk(plane, 0, camera.height), 1, camera.width) for name, plane in planes.items()}
 
-    return fine
+    return in_two(filtered, draw)

@@ -63,6 +63,13 @@ def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> 
         raise InputError(f"{path}: {article} {extension[1:].upper()} {lacking}; write .exr, or other --channels")
 
 
+def check_target(path: Path, channels: Iterable[str]) -> None:
+    """Raise InputError as `check_format`, and for a folder that does not exist."""
+    check_format(str(path), channels)
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such folder to write {path.name} to")
+
+
 def write_channels(
     path: Path, layers: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
 ) -> None:
@@ -71,10 +78,8 @@ def write_channels(
     layers: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
     numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `writing.write_image`.
     """
-    path, encoding, header = Path(path), encoding or Encoding(), header or Header()
-    check_format(str(path), layers)
-    if not path.parent.is_dir():
-        raise InputError(f"{path.parent}: no such folder to write {path.name} to")
+    encoding, header = encoding or Encoding(), header or Header()
+    check_target(path, layers)
     pairs = encoded(path.suffix.lower(), layers, encoding, header)
     write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], path.suffix.lower()[1:])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,6 +93,17 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
             if index > 0:
                 output.take(output.file.open(output.name, specs[index], "AppendSubimage"))
             output.take(output.file.write_image(pixels))
+
+
+def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int]]) -> None:
+    """Write a file of one part from the top as its rows come, atomically. pieces: pixels, or OpenImageIO's deep data,
+    and how many rows they are. Raises ClsplatError if writing fails."""
+    with atomic_output(path, [spec], kind) as output:
+        write = output.file.write_deep_scanlines if spec.deep else output.file.write_scanlines
+        row = spec.y
+        for pixels, count in pieces:
+            output.take(write(row, row + count, 0, pixels))
+            row += count
 
 
 def _is_whole(path: Path, kind: str, parts: int) -> bool:

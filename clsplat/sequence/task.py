@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame to be rendered, and what all frames of a job have in common."""
+"""The frames of a shot as tasks: where they go, and the options that all of a job share."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig
+from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
+from clsplat.errors import InputError
 from clsplat.files import digest, is_file
 from clsplat.frame.window import framed
 from clsplat.images.channels import VIDEO
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.images.exr_header import Header, camera_matrices
 from clsplat.sequence.settings_digest import SETTINGS, digest_of, encoding_of
-
-if TYPE_CHECKING:
-    from clsplat.shots.motion import Stretch
+from clsplat.shots import Shot
+from clsplat.shots.frame_numbers import output_paths
+from clsplat.shots.motion import Stretch, stretches
+from clsplat.shots.motion import camera_after as following
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,39 @@ class Task:
     def is_video(self) -> bool:
         """True if the file holds other frames too."""
         return self.path.suffix.lower() == VIDEO
+
+
+def make_tasks(
+    chosen: Shot,
+    whole: Shot,
+    pattern: str,
+    resize: Callable[[Camera], Camera],
+    channels: Sequence[str],
+    sampling: SamplingConfig | None = None,
+) -> list[Task]:
+    """The frames of `chosen`, which are of the shot `whole`. Raises InputError for files that would be one, unless it
+    is a video, and for cameras that these channels, or the lens, are not defined for."""
+    sampling = sampling or SamplingConfig()
+    motion = "motion" in channels
+    chosen.check(channels)
+    if motion:
+        whole.check(channels)
+    indices = {frame.number: index for index, frame in enumerate(whole.frames)}
+    if Path(pattern).suffix.lower() == VIDEO:
+        paths = [Path(pattern)] * len(chosen.frames)
+    else:
+        paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
+    stretch = stretches(whole, resize, *sampling.shutter, motion=motion) if sampling.moves else lambda number: None
+    tasks = []
+    for frame, path in zip(chosen.frames, paths, strict=True):
+        camera = resize(frame.camera)
+        if sampling.has_lens and camera.projection != "perspective":
+            raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
+        after = None
+        if motion:
+            after = resize(following(whole, indices[frame.number])).resized(camera.width, camera.height)
+        tasks.append(Task(frame.number, frame.name, camera, path, after, stretch(frame.number)))
+    return tasks
 
 
 @dataclass(frozen=True)
