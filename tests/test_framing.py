@@ -194,4 +194,4 @@ def test_what_the_camera_cannot(default_device: Device) -> None:
     with pytest.raises(InputError, match="--filter blackman-harris: needs pixels beyond a panorama's edges"):
         supersampled(drawer(default_device, panorama), config)(panorama, ("rgb",))
     assert parse_overscan(" 5% ") == (0, 0.05)
-    assert framed(camera, FramingConfig()) is camera and not FramingConfig().on
+    assert framed(camera, FramingConfig()) is camera

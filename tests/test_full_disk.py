@@ -120,10 +120,12 @@ VIDEO = """
 import sys
 from pathlib import Path
 import numpy as np
-from clsplat.images.video import write_video
+from clsplat.images.video import VideoWriter, frame_planes
 rng = np.random.default_rng(0)
 try:
-    write_video(Path(sys.argv[1]), [(rng.random((200, 200, 3)) * 255).astype(np.uint8) for _ in range(10)])
+    with VideoWriter(Path(sys.argv[1])) as video:
+        for _ in range(10):
+            video.add(frame_planes((rng.random((200, 200, 3)) * 255).astype(np.uint8)))
 except OSError as error:
     print(error.exit_status, error)
 print(len(list(Path(sys.argv[1]).parent.iterdir())))

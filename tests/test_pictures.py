@@ -18,7 +18,9 @@ from clsplat.config.pictures import ColourConfig, Encoding, FramingConfig, Pictu
 from clsplat.errors import InputError
 from clsplat.frame.draw import Planes
 from clsplat.frame.pipeline import FramePipeline
+from clsplat.images.channels import write_channels
 from clsplat.images.colour import LINEAR, linear_to_srgb, srgb_to_linear
+from clsplat.images.exr_header import Header
 from clsplat.rendering.renderer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(1500, 8, 100, 70)
@@ -97,7 +99,9 @@ def test_all_of_it_to_a_file_in_strips(tmp_path: Path, monkeypatch: pytest.Monke
     names = ("rgb", "alpha", "depth", "motion")
     pipeline = FramePipeline(Renderer(), CLOUD, config)
     after = sliding(1.0)
-    pipeline.write(tmp_path / "whole.exr", sliding, names, Encoding(depth="float"), after=after)
+    planes, finish = pipeline.unfinished(sliding, names, after)
+    header = Header(window=pipeline.camera(sliding).window)
+    write_channels(tmp_path / "whole.exr", finish(planes), Encoding(depth="float"), header)
     monkeypatch.setattr("clsplat.frame.pipeline.strip_rows", lambda *_: 16)
     pipeline.write(tmp_path / "strips.exr", sliding, names, Encoding(depth="float"), after=after)
     assert (tmp_path / "strips.exr").read_bytes() == (tmp_path / "whole.exr").read_bytes()

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 
 from clsplat.config.pictures import VideoConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.images.video import VideoWriter, check_video, write_video, yuv420
+from clsplat.images.video import VideoWriter, check_video, frame_planes, yuv420
 
 require("av")
 import av  # noqa: E402
@@ -25,6 +27,14 @@ def frames(count: int, width: int, height: int) -> list[NDArray[np.float32]]:
     y, x = np.mgrid[0:height, 0:width]
     base = np.stack([x / width, y / height, 0.5 + 0 * x], axis=2)
     return [(0.6 * base + 0.35 * index / count).astype(np.float32) for index in range(count)]
+
+
+def write_video(path: Path, images: Iterable[NDArray[Any]], config: VideoConfig | None = None) -> int:
+    """Write all images; returns how many."""
+    with VideoWriter(path, config) as video:
+        for image in images:
+            video.add(frame_planes(image))
+        return video.frames
 
 
 def read(path: Path) -> tuple[list[NDArray[np.float64]], object]:
@@ -111,7 +121,7 @@ def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
     path.write_bytes(b"before")
     made = frames(2, 32, 32)
     with pytest.raises(KeyboardInterrupt), VideoWriter(path) as video:
-        video.add(made[0])
+        video.add(frame_planes(made[0]))
         raise KeyboardInterrupt
     with pytest.raises(InputError, match="a video of no frames"):
         write_video(path, [])

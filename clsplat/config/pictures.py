@@ -61,11 +61,6 @@ class FramingConfig:
         if not 1 <= self.supersample <= _MOST_SUPERSAMPLES:
             raise InputError(f"--supersample {self.supersample}: expected 1 to {_MOST_SUPERSAMPLES}")
 
-    @property
-    def on(self) -> bool:
-        """True if anything differs from the plain frame."""
-        return bool(self.region) or self.supersample > 1 or parse_overscan(self.overscan) != (0, 0.0)
-
 
 def parse_overscan(text: str) -> tuple[int, float]:
     """(pixels, 0) or (0, share) of "32" or "5%". Raises InputError."""

@@ -21,7 +21,6 @@ from clsplat.frame.shutter_and_lens import sample_cameras, sampled
 from clsplat.frame.strips import in_strips, strip_rows, write_in_strips
 from clsplat.frame.supersample import supersampled
 from clsplat.frame.window import framed
-from clsplat.images.channels import write_channels
 from clsplat.images.colour import SRGB, Colours
 from clsplat.images.exr_header import Header
 
@@ -109,17 +108,16 @@ class FramePipeline:
         header: Header | None = None,
         after: Camera | None = None,
     ) -> None:
-        """Draw and write, in strips where the picture is too large for the memory; the header gets the window."""
+        """Draw and write the picture in the strips that the memory has room for; an EXR's header gets the window."""
         camera, header = self.camera(at), header or Header()
         if path.suffix.lower() == ".exr":
             header = replace(header, window=camera.window)
-        rows, (draw, finish) = self.rows(camera, names), self._draw(at, after)
-        if rows < camera.height:
-            write_in_strips(
-                path, lambda strip, asked: finish(draw(strip, asked)), camera, names, rows, encoding, header
-            )
-        else:
-            write_channels(path, finish(draw(camera, names)), encoding, header)
+        draw, finish = self._draw(at, after)
+
+        def finished(strip: Camera, asked: Collection[str]) -> Planes:
+            return finish(draw(strip, asked))
+
+        write_in_strips(path, finished, camera, names, self.rows(camera, names), encoding, header)
 
 
 def converted(planes: Planes, colours: Colours, source: str, target: str) -> Planes:

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from clsplat.config.channels import CHANNELS, DEEP
 from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
-from clsplat.files import native_name
 from clsplat.images.alpha import unassociate
 from clsplat.images.exr_header import Header
-from clsplat.images.reading import image_size
+from clsplat.images.reading import decodes, image_size, opened
 from clsplat.images.writing import steps_of, write_spec
 
 HALF_MAX = np.float32(65504)
@@ -31,8 +30,8 @@ of level 6, which can be more than a CPU device takes for the frame, for a file 
 _EXR_LEVEL = 1
 """Level of zip and zips: two thirds of the time of the usual 4, for 2 to 7 % more bytes."""
 _LARGEST_FLOAT_INDEX = 2**24
-_BLOCK, _ROWS = 1 << 12, 64
-"""Bytes of a disk's block; rows that are decoded at a time to see whether they are whole."""
+_BLOCK = 1 << 12
+"""Bytes of a disk's block."""
 
 EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
 VIDEO = ".mp4"
@@ -120,12 +119,10 @@ def is_whole(
         image_size(path)  # finds a PNG that is cut short, of which libpng would print
     except InputError:
         return False
-    source = oiio.ImageInput.open(native_name(path))
-    if source is None:
-        oiio.geterror()
-        return False
     holed = _has_hole(path)
-    try:
+    with opened(path) as source:
+        if source is None:
+            return False
         for part, group in enumerate(groups):
             if not source.seek_subimage(part, 0):
                 return False
@@ -137,18 +134,9 @@ def is_whole(
                 return False
             if any(spec.getattribute(key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False
-            bottom = spec.y + spec.height
-            row = (
-                source.read_native_deep_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels)
-                if deep
-                else source.read_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels, oiio.FLOAT)
-            )
-            if row is None or source.geterror() or (holed and not _decodes(source, part)):
+            if not decodes(source, part, spec.height - 1) or (holed and not decodes(source, part, 0)):
                 return False
         return not source.seek_subimage(len(groups), 0)
-    finally:
-        source.geterror()
-        source.close()
 
 
 def _has_hole(path: Path) -> bool:
@@ -158,37 +146,16 @@ def _has_hole(path: Path) -> bool:
         return any(empty in block for block in iter(lambda: file.read(_BLOCK << 8), b""))
 
 
-def _decodes(source: Any, part: int) -> bool:
-    """True if every row of the part decodes."""
-    spec = source.spec()
-    for first in range(spec.y, spec.y + spec.height, _ROWS):
-        of = (part, 0, first, min(first + _ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
-        rows = source.read_native_deep_scanlines(*of) if spec.deep else source.read_scanlines(*of, oiio.FLOAT)
-        if rows is None or source.geterror():
-            return False
-    return True
-
-
 def is_foreign(path: Path) -> bool:
     """True if a file is a picture that clsplat has not made."""
-    source = oiio.ImageInput.open(native_name(path))
-    if source is None:
-        oiio.geterror()
-        return False
-    maker = source.spec().getattribute("Software")
-    source.close()
-    return "clsplat" not in str(maker)
+    with opened(path) as source:
+        return source is not None and "clsplat" not in str(source.spec().getattribute("Software"))
 
 
 def attribute(path: Path, name: str) -> Any:
     """The value of an attribute of a file's first part, None where it has none or is no picture."""
-    source = oiio.ImageInput.open(native_name(path))
-    if source is None:
-        oiio.geterror()
-        return None
-    value = source.spec().getattribute(name)
-    source.close()
-    return value
+    with opened(path) as source:
+        return None if source is None else source.spec().getattribute(name)
 
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading, writing and scaling pictures, through OpenImageIO.
+"""Reading and scaling pictures, through OpenImageIO.
 
 In memory a picture is float32 (H, W, C), C = 3 (RGB) or 4 (RGBA), with *straight* (unassociated) alpha whatever the
 file has, in the file's own colour space: nothing is linearised. In files alpha is what OpenImageIO writes:
@@ -11,7 +11,8 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,7 @@ from scipy import sparse
 
 from clsplat.arrays import Float32
 from clsplat.errors import InputError, examples, reason_of
-from clsplat.files import (
-    is_file,
-    native_name,
-    open_input,
-)
+from clsplat.files import is_file, native_name, open_input
 from clsplat.images.alpha import associate, unassociate
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
@@ -36,6 +33,7 @@ MAX_PIXELS = 1 << 28
 FREE_FLOATS, FLOATS_A_BYTE = 48 << 20, 4096
 """Channel values that a picture may have whatever its file's length is, and for each byte of it. Both are more than any
 real picture has, compressed, as deflate makes at most 1032 bytes of one."""
+_ROWS = 64
 MAX_FILE_BYTES, FREE_FILE_BYTES = 1 << 30, 1 << 26
 SIGNATURES = (
     *(PNG_SIGNATURE, b"\xff\xd8\xff", b"\x76\x2f\x31\x01", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"#?"),
@@ -96,7 +94,7 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     """All pictures (by extension) under `folder`, if `deep` with its sub-folders, sorted; hidden files and folders are
     left out, and links that lead nowhere. Links to folders are followed, to each folder once. Raises InputError for a
     folder that cannot be read."""
-    found: list[Path] = []
+    paths: list[Path] = []
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
         real = os.path.realpath(root)  # not the inode: some file systems of Windows number every folder 0
@@ -105,12 +103,12 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
             continue
         seen.add(real)
         folders[:] = sorted(name for name in folders if deep and not name.startswith("."))
-        found += [
+        paths += [
             path
             for path in (Path(root, name) for name in files)
             if not path.name.startswith(".") and path.suffix.lower() in EXTENSIONS and is_file(path)
         ]
-    return sorted(found)
+    return sorted(paths)
 
 
 def cannot_be_searched(error: OSError) -> None:
@@ -222,6 +220,29 @@ def open_image(path: Path, hints: Any = None) -> Any:
             f"{spec.full_width} x {spec.full_height}, in {size} bytes; is it damaged?"
         )
     return source
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """OpenImageIO's input of a file, None where that is none. Its messages are not looked at."""
+    source = oiio.ImageInput.open(native_name(path))
+    try:
+        yield source
+    finally:
+        (source or oiio).geterror()
+        if source is not None:
+            source.close()
+
+
+def decodes(source: Any, part: int, first: int) -> bool:
+    """True if the rows of an input's part decode, from the picture's row `first` on. They are read a few at a time."""
+    spec = source.spec()
+    for top in range(spec.y + first, spec.y + spec.height, _ROWS):
+        place = (part, 0, top, min(top + _ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
+        rows = source.read_native_deep_scanlines(*place) if spec.deep else source.read_scanlines(*place, oiio.FLOAT)
+        if rows is None or source.geterror():
+            return False
+    return True
 
 
 def error_of(source: Any) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterable
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
@@ -122,15 +121,11 @@ class VideoWriter:
     def __enter__(self) -> VideoWriter:  # noqa: PYI034  # Self came with 3.11
         return self
 
-    def add(self, image: NDArray[Any]) -> None:
-        """Append a frame, as `frame_planes` takes it; all of one size.
+    def add(self, planes: NDArray[np.uint8]) -> None:
+        """Append a frame as `frame_planes` gives it; all of one size.
 
         Raises ClsplatError if writing fails, ValueError for a frame of another size.
         """
-        self.add_planes(frame_planes(image))
-
-    def add_planes(self, planes: NDArray[np.uint8]) -> None:
-        """Add a frame from what `frame_planes` gives."""
         size = planes.shape[0] * 2 // 3, planes.shape[1]
         if self.frames and size != self._size:
             raise ValueError(f"frame {size}: expected {self._size}, the size of the first")
@@ -199,11 +194,3 @@ class VideoWriter:
         with open(self._temporary, "r+b") as file:  # Windows flushes only what may be written to
             os.fsync(file.fileno())
         replace(self._temporary, self._target)
-
-
-def write_video(path: Path, frames: Iterable[NDArray[Any]], config: VideoConfig | None = None) -> int:
-    """Write all frames, see `VideoWriter`; returns how many."""
-    with VideoWriter(Path(path), config) as video:
-        for frame in frames:
-            video.add(frame)
-        return video.frames

@@ -174,7 +174,7 @@ def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter
             waiting[record.frame] = record, planes
         record, planes = waiting.pop(task.number)
         start = time.monotonic()
-        video.add_planes(planes)
+        video.add(planes)
         yield replace(record, seconds=record.seconds + time.monotonic() - start)
 
 
