@@ -186,8 +186,12 @@ def test_one_camera_of_several(stage: Path) -> None:
         ("(0.5, 500)", "(0, 500)", "/rig/shot at 1001: clippingRange 0 to 500, expected 0 < near < far"),
         ("1001: 35,", "1001: 0,", "/rig/shot at 1001: focalLength is 0, expected more than 0"),
         ("1001: 35,", "1001: nan,", "/rig/shot at 1001: focalLength is nan, expected a number"),
-        ("endTimeCode = 1005", "endTimeCode = 1000.5", "/rig/shot: no whole time code from 1001 to 1000.5"),
-        ("endTimeCode = 1005", "endTimeCode = 1e12", "/rig/shot: time codes 1001 to 1e+12, expected at most 100,000"),
+        ("endTimeCode = 1005", "endTimeCode = 1000.5", "/rig/shot: has no whole time code from 1001 to 1000.5"),
+        (
+            "endTimeCode = 1005",
+            "endTimeCode = 1e12",
+            "/rig/shot: has the time codes 1001 to 1e+12, expected at most 100,000",
+        ),
     ],
 )
 def test_stages_that_cannot_be(stage: Path, old: str, new: str, message: str) -> None:
