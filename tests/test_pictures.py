@@ -18,6 +18,8 @@ from clsplat.config.pictures import ColourConfig, Encoding, FramingConfig, Pictu
 from clsplat.errors import InputError
 from clsplat.frame.draw import Planes
 from clsplat.frame.pipeline import FramePipeline
+from clsplat.frame.strips import write_in_strips
+from clsplat.frame.window import framed
 from clsplat.images.channels import write_channels
 from clsplat.images.colour import LINEAR, linear_to_srgb, srgb_to_linear
 from clsplat.images.exr_header import Header
@@ -34,9 +36,13 @@ def still(_: float) -> Camera:
     return CAMERA
 
 
+def picture_camera(pipeline: FramePipeline, at: Callable[[float], Camera]) -> Camera:
+    return framed(at(pipeline.config.sampling.middle), pipeline.config.framing)
+
+
 def drawn(pipeline: FramePipeline, at: Callable[[float], Camera], names: tuple[str, ...]) -> Planes:
-    planes, finish = pipeline.unfinished(at, names)
-    return finish(planes)
+    draw, finish = pipeline.draw(at)
+    return finish(draw(picture_camera(pipeline, at), names))
 
 
 def straight(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -87,10 +93,10 @@ def test_samples_in_linear_light() -> None:
     light = [srgb_to_linear(renderer.render(CLOUD, sliding(time)).image).astype(np.float64) for time in times]
     assert_close(got["rgb"], np.mean(light, axis=0), relative=1e-6, absolute=1e-6)
     assert_same_bits(got["depth"], renderer.render_channels(CLOUD, sliding(0.3))[1]["depth"])
-    assert_close(pipeline.camera(sliding).position, sliding(0.3).position, absolute=1e-12)
+    assert_close(picture_camera(pipeline, sliding).position, sliding(0.3).position, absolute=1e-12)
 
 
-def test_all_of_it_to_a_file_in_strips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_of_it_to_a_file_in_strips(tmp_path: Path) -> None:
     config = PictureConfig(
         ColourConfig(colorspace="ACEScg"),
         FramingConfig(overscan="10%", supersample=2, filter="blackman-harris"),
@@ -99,16 +105,15 @@ def test_all_of_it_to_a_file_in_strips(tmp_path: Path, monkeypatch: pytest.Monke
     names = ("rgb", "alpha", "depth", "motion")
     pipeline = FramePipeline(Renderer(), CLOUD, config)
     after = sliding(1.0)
-    planes, finish = pipeline.unfinished(sliding, names, after)
-    header = Header(window=pipeline.camera(sliding).window)
-    write_channels(tmp_path / "whole.exr", finish(planes), Encoding(depth="float"), header)
-    monkeypatch.setattr("clsplat.frame.pipeline.strip_rows", lambda *_: 16)
-    pipeline.write(tmp_path / "strips.exr", sliding, names, Encoding(depth="float"), after=after)
+    (draw, finish), camera = pipeline.draw(sliding, after), picture_camera(pipeline, sliding)
+    file = Encoding(depth="float"), Header(window=camera.window)
+    write_channels(tmp_path / "whole.exr", finish(draw(camera, names)), *file)
+    write_in_strips(tmp_path / "strips.exr", lambda strip, _: finish(draw(strip, names)), camera, names, 16, *file)
     assert (tmp_path / "strips.exr").read_bytes() == (tmp_path / "whole.exr").read_bytes()
     spec = oiio.ImageBuf(str(tmp_path / "whole.exr")).spec()
     assert (spec.x, spec.y, spec.width, spec.height) == (-10, -7, 120, 84)
     assert (spec.full_x, spec.full_y, spec.full_width, spec.full_height) == (0, 0, 100, 70)
-    pipeline.write(tmp_path / "a.png", sliding, ("rgb", "alpha"))
+    write_channels(tmp_path / "a.png", drawn(pipeline, sliding, ("rgb", "alpha")))
     assert oiio.ImageBuf(str(tmp_path / "a.png")).spec().full_width == 120
 
 

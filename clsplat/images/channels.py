@@ -258,8 +258,6 @@ def _add_header(spec: Any, header: Header) -> None:
         spec.x, spec.y = header.window.x, header.window.y
         spec.full_x = spec.full_y = 0
         spec.full_width, spec.full_height = header.window.width, header.window.height
-    if header.pixel_aspect != 1.0:
-        spec.attribute("PixelAspectRatio", float(header.pixel_aspect))
     if header.chromaticities:
         spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(header.chromaticities))
     spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes

@@ -20,7 +20,6 @@ class Header:
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
     matrices: Mapping[str, Float64] = field(default_factory=dict)
     window: Window | None = None
-    pixel_aspect: float = 1.0
     chromaticities: Sequence[float] = ()
     is_srgb: bool = True
 

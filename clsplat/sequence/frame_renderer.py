@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from clsplat.camera import Camera
@@ -16,7 +16,7 @@ from clsplat.errors import DriverError
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes
 from clsplat.frame.pipeline import FramePipeline
-from clsplat.frame.strips import check_parts
+from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, RAYS
 from clsplat.selftest.trust import require
@@ -34,15 +34,13 @@ TRANSFERS = ("read", "write", "fill")
 @dataclass(frozen=True)
 class RenderedFrame:
     """A frame before it is encoded. planes: None for one that was written strip by strip; seconds: time that it took;
-    finish: the rest of the work on the planes, which the encoding thread does; blank: True if nothing of the model is
-    in it, None where that was not looked at; kernel_ms, transfer_ms: the device's, None if not asked for."""
+    finish: the rest of the work on the planes, which the encoding thread does; measured: further values of its
+    `Record`."""
 
     planes: Planes | None
     seconds: float
     finish: Callable[[Planes], Planes] = lambda planes: planes
-    blank: bool | None = None
-    kernel_ms: float | None = None
-    transfer_ms: float | None = None
+    measured: Mapping[str, Any] = field(default_factory=dict)
 
 
 RenderFrame = Callable[[Task], RenderedFrame]
@@ -63,9 +61,9 @@ class FrameRenderer:
 
     def check(self, tasks: Sequence[Task]) -> None:
         """Raise InputError for a frame that the file's kind cannot hold as it has to be rendered here."""
-        for task in tasks:
-            if self.options.encoding.parts == "several" and self._in_strips(task):
-                check_parts(picture_camera(task, self.options), self.options.encoding)
+        for camera in (picture_camera(task, self.options) for task in tasks if not task.is_video):
+            if self._rows(camera) < camera.height:
+                check_parts(camera, self.options.encoding)
 
     def __call__(self, task: Task) -> RenderedFrame:
         """The frame. Raises ClsplatError where it cannot be rendered, or, if it is written here, not be written."""
@@ -76,23 +74,29 @@ class FrameRenderer:
             frame = self._frame(task)
         times = [(name, taken) for record in stages.values() for name, taken in record.kernels.items()]
         kernels = sum(taken for name, taken in times if name not in TRANSFERS)
-        return replace(frame, kernel_ms=kernels, transfer_ms=sum(taken for _, taken in times) - kernels)
+        device_ms = {"kernel_ms": kernels, "transfer_ms": sum(taken for _, taken in times) - kernels}
+        return replace(frame, measured={**frame.measured, **device_ms})
 
     def _frame(self, task: Task) -> RenderedFrame:
         self._trust(task.camera)
         start, options, pipeline = time.monotonic(), self.options, self._pipeline
-        after = camera_after(task, options)
-        if options.deep is None and not self._in_strips(task):
-            planes, finish = pipeline.unfinished(task.at, options.channels, after)
-            blank = pipeline.is_blank(planes)
-            return RenderedFrame(planes, time.monotonic() - start, finish, blank)
-        encoding, head = options.encoding, header(task, options)
-        if options.deep is None:
-            pipeline.write(task.path, task.at, options.channels, encoding, head, after)
-        else:
-            model, camera = (self._renderer, self._gaussians), picture_camera(task, options)
-            write_deep(task.path, *model, camera, options.deep, encoding, head, pipeline.colours)
-        return RenderedFrame(None, time.monotonic() - start)
+        camera, names, encoding = picture_camera(task, options), options.channels, options.encoding
+        if options.deep is not None:
+            model = (self._renderer, self._gaussians)
+            write_deep(task.path, *model, camera, options.deep, encoding, header(task, options), pipeline.colours)
+            return RenderedFrame(None, time.monotonic() - start)
+        draw, finish = pipeline.draw(task.at, camera_after(task, options))
+        rows = self._rows(camera)
+        if rows < camera.height and not task.is_video:
+
+            def finished(strip: Camera, names: Collection[str]) -> Planes:
+                return finish(draw(strip, names))
+
+            write_in_strips(task.path, finished, camera, names, rows, encoding, header(task, options))
+            return RenderedFrame(None, time.monotonic() - start)
+        planes = in_strips(draw, rows)(camera, names)
+        blank = pipeline.is_blank(planes)
+        return RenderedFrame(planes, time.monotonic() - start, finish, {"blank": blank})
 
     def _trust(self, camera: Camera) -> None:
         """Self-test what panoramas and fisheyes need before the first of them."""
@@ -106,9 +110,9 @@ class FrameRenderer:
             )
         self._rays_tested = True
 
-    def _in_strips(self, task: Task) -> bool:
-        camera = picture_camera(task, self.options)
-        return not task.is_video and self._pipeline.rows(camera, self.options.channels) < camera.height
+    def _rows(self, camera: Camera) -> int:
+        """Rows of the strips that the camera's picture is rendered in, its height where that is none."""
+        return strip_rows(self._renderer.device, camera, self.options.channels, self.options.pictures.framing)
 
 
 def open_frame_renderer(

@@ -49,8 +49,7 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
     elif frame.planes is not None:
         channels.write_channels(task.path, frame.finish(frame.planes), options.encoding, header(task, options))
     seconds = frame.seconds + time.monotonic() - start
-    measured = {"kernel_ms": frame.kernel_ms, "transfer_ms": frame.transfer_ms}
-    return record_of(task, options, seconds=seconds, blank=frame.blank, **measured), yuv
+    return record_of(task, options, seconds=seconds, **frame.measured), yuv
 
 
 def record_of(task: Task, options: RenderOptions, **values: Any) -> Record:
