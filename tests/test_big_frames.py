@@ -17,9 +17,8 @@ from clsplat.config.pictures import Encoding, FramingConfig, SamplingConfig
 from clsplat.device.context import open_device
 from clsplat.errors import InputError
 from clsplat.frame.draw import drawn_by
-from clsplat.frame.shutter_and_lens import sample_cameras, sampled
+from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.frame.strips import in_strips, strip_rows, strips, write_in_strips
-from clsplat.frame.supersample import supersampled
 from clsplat.frame.window import crop, framed
 from clsplat.images.channels import CHANNELS, write_channels
 from clsplat.images.exr_header import Header

@@ -16,7 +16,7 @@ from clsplat.config.pictures import FramingConfig, parse_overscan
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, drawn_by
-from clsplat.frame.supersample import filter_taps, supersampled
+from clsplat.frame.samples import filter_taps, supersampled
 from clsplat.frame.window import crop, framed, reframed
 from clsplat.images.channels import CHANNELS
 from clsplat.reference import every_pixel

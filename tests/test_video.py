@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from clsplat.config.pictures import VideoConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.images.video import VideoWriter, check_video, frame_planes, yuv420
+from clsplat.images.video import VideoWriter, check_video, frame_planes
 
 require("av")
 import av  # noqa: E402
@@ -56,7 +56,7 @@ def test_frames_in_order(width: int, height: int, tmp_path: Path) -> None:
     assert stream.codec_context.colorspace == 1  # the matrix that the values were made with
     for picture, wanted in zip(pictures, made, strict=True):
         # what crf 12 leaves of a smooth ramp: a few levels of 219; frames are 8 of them apart
-        error = picture.astype(int) - yuv420(wanted)
+        error = picture.astype(int) - frame_planes(wanted)
         assert np.abs(error).max() <= 6
         assert abs(error.mean()) < 0.5
     assert list(tmp_path.iterdir()) == [path]
@@ -80,7 +80,7 @@ def test_chroma_is_where_it_belongs() -> None:
     # A ramp of blue to the right: at the left site, a quarter of it each side, of its own column's value.
     rgb = np.zeros((4, 8, 3), np.float32)
     rgb[:, :, 2] = np.arange(8) / 10
-    planes = yuv420(rgb)
+    planes = frame_planes(rgb)
     assert planes.shape == (6, 8)
     luma, blue, red = planes[:4], planes[4].reshape(2, 4), planes[5].reshape(2, 4)
     np.testing.assert_array_equal(luma[0], np.rint(16 + 219 * 0.0722 * np.arange(8) / 10))
@@ -88,7 +88,7 @@ def test_chroma_is_where_it_belongs() -> None:
     at = np.array([0.25, 2, 4, 6]) / 10
     np.testing.assert_array_equal(blue[1], np.rint(128 + 224 * at * (1 - 0.0722) / (2 * (1 - 0.0722))))
     np.testing.assert_array_equal(red[0], np.rint(128 - 224 * at * 0.0722 / (2 * (1 - 0.2126))))
-    white = yuv420(np.ones((2, 2, 3), np.float32))
+    white = frame_planes(np.ones((2, 2, 3), np.float32))
     assert (white[:2] == 235).all() and (white[2:] == 128).all()
 
 

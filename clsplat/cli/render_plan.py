@@ -12,7 +12,7 @@ from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import FPS
 from clsplat.errors import amount, examples
 from clsplat.frame.draw import feature_floats, on_tiles
-from clsplat.frame.supersample import finer
+from clsplat.frame.samples import finer
 from clsplat.frame.window import crop
 from clsplat.sequence import workers
 from clsplat.sequence.task import picture_camera

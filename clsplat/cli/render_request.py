@@ -17,7 +17,7 @@ from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureC
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError, examples
 from clsplat.files import check_new, digest
-from clsplat.frame.supersample import finer
+from clsplat.frame.samples import finer
 from clsplat.gaussians import Gaussians
 from clsplat.images.channels import VIDEO, check_format, parse_channels
 from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space

@@ -100,13 +100,7 @@ def write_deep(
     if path.suffix.lower() != ".exr":
         raise InputError(f"{path}: deep samples want an .exr file")
     bounds = bin_bounds(gaussians, camera, config)
-    kinds = [oiio.TypeDesc("half" if encoding.depth == "half" else "float")] * 4 + [oiio.TypeDesc("float")] * 2
-    spec = deep_spec(camera.width, camera.height, header)
-    spec.nchannels = len(DEEP)
-    spec.channelnames = DEEP
-    spec.channelformats = tuple(kinds)
-    spec.alpha_channel, spec.z_channel = 3, 4
-    spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
+    spec = deep_spec(camera.width, camera.height, encoding, header)
     rows = deep_rows(renderer.device, camera, len(bounds) + 1)
 
     def pieces() -> Iterator[tuple[Any, int]]:
@@ -115,7 +109,7 @@ def write_deep(
             for image in slices:
                 rgb, alpha = np.ascontiguousarray(image[:, :, :3]), np.ascontiguousarray(image[:, :, 3])
                 image[:, :, :3] = colours.convert(rgb, alpha, colours.model, colours.output)
-            yield from _deep_rows(slices, kinds, half=encoding.depth == "half")
+            yield from _deep_rows(slices, list(spec.channelformats), half=encoding.depth == "half")
 
     write_rows(path, spec, "exr", pieces())
 

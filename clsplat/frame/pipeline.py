@@ -15,8 +15,7 @@ import numpy as np
 from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig
 from clsplat.frame.draw import Draw, Planes, drawn_by
-from clsplat.frame.shutter_and_lens import sample_cameras, sampled
-from clsplat.frame.supersample import supersampled
+from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.images.colour import SRGB, Colours
 
 if TYPE_CHECKING:
@@ -50,8 +49,8 @@ class FramePipeline:
     def draw(
         self, at: Callable[[float], Camera], after: Camera | None = None
     ) -> tuple[Draw, Callable[[Planes], Planes]]:
-        """The Draw of a camera that says size and window, of the picture or a strip of it; and the conversion that makes
-        its planes the file's, which needs no device.
+        """The Draw of a camera that says size and window, of the picture or a strip of it; and the conversion that
+        makes its planes the file's, which needs no device.
 
         at: the camera of the whole frame, in its final size, at a time in frames from the frame: 0 if nothing moves;
         after: that of the next frame, for motion.

@@ -239,10 +239,14 @@ def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
     return spec
 
 
-def deep_spec(width: int, height: int, header: Header) -> Any:
-    """The spec of a deep EXR, without its channels and their formats."""
-    spec = oiio.ImageSpec(width, height, 1, oiio.FLOAT)
+def deep_spec(width: int, height: int, encoding: Encoding, header: Header) -> Any:
+    """OpenImageIO's specification of a deep EXR: colours are half or float as the encoding says, depths are float."""
+    spec = oiio.ImageSpec(width, height, len(DEEP), oiio.FLOAT)
     spec.deep = True
+    spec.channelnames = DEEP
+    spec.channelformats = (oiio.TypeDesc(encoding.depth),) * 4 + (oiio.TypeDesc("float"),) * 2
+    spec.alpha_channel, spec.z_channel = 3, 4
+    spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
     _add_header(spec, header)
     _add_matrices(spec, header)
     return spec

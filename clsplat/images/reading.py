@@ -128,7 +128,7 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
 
     Raises InputError for a file that is missing, no picture, or a PNG that is cut short.
     """
-    source = _open(path)
+    source = open_image(path, straight=True)
     spec = source.spec()
     source.close()
     width, height = spec.full_width, spec.full_height
@@ -150,7 +150,7 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
     Raises InputError, naming the file and the decoder's reason, for a file that is missing, no picture, damaged, cut
     short, of another kind of channels, or with values that are not finite.
     """
-    source = _open(path)
+    source = open_image(path, straight=True)
     spec = source.spec()
     if source.format_name() == "png":
         _check_png_is_whole(path)
@@ -190,23 +190,20 @@ def downscale(image: Float32, width: int, height: int) -> Float32:
     return unassociate(result) if has_alpha else result
 
 
-def _open(path: Path) -> Any:
+def open_image(path: Path, *, straight: bool = False) -> Any:
+    """OpenImageIO's input of a file, whose header makes sense. straight: alpha, where the format has it so. Raises
+    InputError."""
     if not is_file(path):
         raise InputError(f"{path}: no such image file")
     hints = oiio.ImageSpec()
-    hints.attribute("oiio:UnassociatedAlpha", 1)
-    return open_image(path, hints)
-
-
-def open_image(path: Path, hints: Any = None) -> Any:
-    """OpenImageIO's input of a file, whose header makes sense. Raises InputError."""
+    if straight:
+        hints.attribute("oiio:UnassociatedAlpha", 1)
     size = path.stat().st_size
     with open_input(path, "a picture") as file:
         known = file.read(8).startswith(SIGNATURES)
     if size > MAX_FILE_BYTES or (size > FREE_FILE_BYTES and not known):
         raise InputError(f"{path}: has {size} bytes and does not begin as a picture, expected at most {MAX_FILE_BYTES}")
-    name = native_name(path)
-    source = oiio.ImageInput.open(name, hints) if hints is not None else oiio.ImageInput.open(name)
+    source = oiio.ImageInput.open(native_name(path), hints)
     if source is None:
         raise InputError(f"{path}: does not decode: {one_line(error_of(oiio))}; expected an image")
     spec = source.spec()

@@ -61,6 +61,8 @@ class FrameRenderer:
 
     def check(self, tasks: Sequence[Task]) -> None:
         """Raise InputError for a frame that the file's kind cannot hold as it has to be rendered here."""
+        if self.options.encoding.parts == "one":
+            return
         for camera in (picture_camera(task, self.options) for task in tasks if not task.is_video):
             if self._rows(camera) < camera.height:
                 check_parts(camera, self.options.encoding)

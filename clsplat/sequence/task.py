@@ -88,9 +88,7 @@ def make_tasks(
     is a video, and for cameras that these channels, or the lens, are not defined for."""
     sampling = sampling or SamplingConfig()
     motion = "motion" in channels
-    chosen.check(channels)
-    if motion:
-        whole.check(channels)
+    whole.check(channels)
     indices = {frame.number: index for index, frame in enumerate(whole.frames)}
     if Path(pattern).suffix.lower() == VIDEO:
         paths = [Path(pattern)] * len(chosen.frames)
