@@ -121,18 +121,18 @@ def _deep_rows(slices: Float32, kinds: list[Any], *, half: bool) -> Iterator[tup
         slices[:, :, :, :4] = np.clip(slices[:, :, :, :4], -HALF_MAX, HALF_MAX)
     for top in range(0, height, step := max((1 << 18) // width, 1)):
         rows = slices[:, top : top + step].reshape(bins, -1, DEEP_FLOATS).transpose(1, 0, 2)
-        there = rows[:, :, 3] > 0
+        taken = rows[:, :, 3] > 0
         data = oiio.DeepData()
         data.init(len(rows), len(DEEP), kinds, list(DEEP))
-        _each(data.set_samples, range(len(rows)), there.sum(axis=1).tolist())
-        pixels = np.nonzero(there)[0].tolist()
-        samples = (np.cumsum(there, axis=1) - 1)[there].tolist()
-        values = rows[there]
+        _call_with(data.set_samples, range(len(rows)), taken.sum(axis=1).tolist())
+        pixels = np.nonzero(taken)[0].tolist()
+        samples = (np.cumsum(taken, axis=1) - 1)[taken].tolist()
+        values = rows[taken]
         for channel in range(len(DEEP)):
-            _each(data.set_deep_value, pixels, repeat(channel), samples, values[:, channel].tolist())
+            _call_with(data.set_deep_value, pixels, repeat(channel), samples, values[:, channel].tolist())
         yield data, len(rows) // width
 
 
-def _each(function: Any, *arguments: Any) -> None:
+def _call_with(function: Any, *arguments: Any) -> None:
     """Call it with each row of arguments: OpenImageIO takes deep values one by one, and a loop takes twice as long."""
     deque(map(function, *arguments), maxlen=0)

@@ -42,8 +42,8 @@ def parse_channels(text: str) -> tuple[str, ...]:
     asked = [word.strip() for word in text.split(",") if word.strip()]
     unknown = [word for word in asked if word not in CHANNELS]
     if unknown or not asked:
-        found = f"has {examples(map(repr, unknown))}" if unknown else "is empty"
-        raise InputError(f"--channels {text}: {found}, expected some of {', '.join(CHANNELS)}")
+        problem = f"has {examples(map(repr, unknown))}" if unknown else "is empty"
+        raise InputError(f"--channels {text}: {problem}, expected some of {', '.join(CHANNELS)}")
     return tuple(name for name in CHANNELS if name in asked)
 
 

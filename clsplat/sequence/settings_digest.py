@@ -23,19 +23,19 @@ def plain(value: Any) -> Any:
     """A value in the form of JSON. A dataclass becomes its differences from the defaults, so that a setting that is
     added later changes nothing. Floats have 12 digits, as processors differ in the last ones."""
     if is_dataclass(value) and not isinstance(value, type):
-        found = {}
-        for each in fields(value):
-            own = getattr(value, each.name)
-            usual = each.default_factory() if each.default_factory is not MISSING else each.default
-            if isinstance(own, np.ndarray) or usual is MISSING or own != usual:
-                found[each.name] = plain(own)
-        return found
+        changes = {}
+        for setting in fields(value):
+            given = getattr(value, setting.name)
+            usual = setting.default_factory() if setting.default_factory is not MISSING else setting.default
+            if isinstance(given, np.ndarray) or usual is MISSING or given != usual:
+                changes[setting.name] = plain(given)
+        return changes
     if isinstance(value, float | np.floating):
         return f"{value + 0.0:.12g}"  # + 0.0: no -0
     if isinstance(value, np.ndarray):
-        return [plain(float(each)) for each in value.ravel()]
+        return [plain(float(item)) for item in value.ravel()]
     if isinstance(value, tuple | list):
-        return [plain(each) for each in value]
+        return [plain(item) for item in value]
     return value
 
 

@@ -98,7 +98,9 @@ def run_tasks(
     writers, held = frames_ahead(tasks, options, len(renderers))
     frames = _FrameQueue(tasks, options, held, is_video=video is not None)
     pool = ThreadPoolExecutor(writers, "clsplat-write")
-    threads = [threading.Thread(target=frames.render, args=(each, pool), name="clsplat-render") for each in renderers]
+    threads = [
+        threading.Thread(target=frames.render, args=(render, pool), name="clsplat-render") for render in renderers
+    ]
     try:
         for thread in threads:
             thread.start()

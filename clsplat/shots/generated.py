@@ -150,8 +150,8 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 def _in_medians(lengths: Float64, rounding: float) -> Float64:
     """lengths (n,) over the median of those that are more than rounding."""
-    there = lengths[lengths > rounding]
-    return lengths / np.median(there) if len(there) else np.zeros_like(lengths)
+    clear = lengths[lengths > rounding]
+    return lengths / np.median(clear) if len(clear) else np.zeros_like(lengths)
 
 
 def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:

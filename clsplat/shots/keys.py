@@ -83,8 +83,8 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
     exact = {key.frame: key.camera for key in keys if key.roll == 0}
     cameras = []
     for index, (rotation, position) in enumerate(zip(cam_from_world, path, strict=True)):
-        if (own := exact.get(float(at[index]))) is not None:
-            cameras.append(own)
+        if (camera := exact.get(float(at[index]))) is not None:
+            cameras.append(camera)
             continue
         fx, fy = np.exp(values[index, 1:3])
         cameras.append(

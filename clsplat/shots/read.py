@@ -83,7 +83,7 @@ def _is_usd(path: Path) -> bool:
 
 
 def _read_folder(path: Path, size: tuple[int | None, int | None]) -> Shot:
-    listed = sorted(each.name for each in path.glob("transforms*.json"))
+    listed = sorted(file.name for file in path.glob("transforms*.json"))
     if listed:
         # a model below colmap/ beside a transforms.json is nerfstudio's, in a world that is not the file's
         model = find_model(path)

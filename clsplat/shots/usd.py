@@ -58,7 +58,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
             f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more"
         ) from None
     with readable(path):
-        camera = _find(path, [UsdGeom.Camera(each) for each in stage.Traverse() if each.IsA(UsdGeom.Camera)], prim)
+        camera = _find(path, [UsdGeom.Camera(item) for item in stage.Traverse() if item.IsA(UsdGeom.Camera)], prim)
         where = f"{path}: {camera.GetPath()}"
         codes = _time_codes(where, stage, camera)
         horizontal, vertical = _aperture(where, camera, codes[0])
@@ -68,7 +68,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
         frames = numbered(cameras, codes[0], None if len(codes) == 1 or per_second <= 0 else per_second)
     # without the end of the line, where USD has the stage's address in memory
     unapplied = _unapplied(stage, camera, codes)
-    lines = [each.commentary.split(" (instantiating")[0] for each in diagnostics.TakeUncoalescedDiagnostics()]
+    lines = [message.commentary.split(" (instantiating")[0] for message in diagnostics.TakeUncoalescedDiagnostics()]
     warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in lines[:3])
     return Shot(frames, warnings, per_second if 0 < per_second < math.inf else None, unapplied)
 
@@ -132,7 +132,7 @@ def _time_codes(where: str, stage: Any, camera: Any) -> list[int]:
     """The whole time codes of the stage's range, or from the first to the last at which the camera, or something that
     moves it, has values."""
     timed = (*camera.GetPrim().GetAttributes(), *_moved(camera))
-    samples = sorted({time for each in timed for time in each.GetTimeSamples()})
+    samples = sorted({time for source in timed for time in source.GetTimeSamples()})
     if stage.HasAuthoredTimeCodeRange():
         begin, end = float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())
     elif samples:
