@@ -304,12 +304,12 @@ def test_files_and_folders_that_are_missing(tmp_path: Path) -> None:
 
 def test_only_some_frames(tmp_path: Path) -> None:
     path = write(tmp_path / "camera_path.json", camera_path(10))
-    assert [frame.number for frame in choose_shot(path, frames="7,2-9:3").frames] == [2, 5, 7, 8]
-    shot = choose_shot(path, frames="9-12")
+    assert [frame.number for frame in choose_shot(path).only("7,2-9:3").frames] == [2, 5, 7, 8]
+    shot = choose_shot(path).only("9-12")
     assert [frame.number for frame in shot.frames] == [9, 10]
     assert shot.warnings == ("--frames 9-12: 2 of these frames do not exist; there are the frames 1-10",)
     with pytest.raises(InputError, match=r"--frames 11-20: holds none of the frames to render, .* the frames 1-10"):
-        choose_shot(path, frames="11-20")
+        choose_shot(path).only("11-20")
 
 
 def test_paths_made_of_cameras(tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ def test_what_is_authored_and_not_applied_is_one_warning(stage: Path) -> None:
 )
 def test_the_rate_of_the_stage(stage: Path, authored: str, rate: float) -> None:
     stage.write_text(STAGE.replace("timeCodesPerSecond = 24", authored))
-    shot = choose_shot(stage, size=(90, 60), frames="1001-1003")
+    shot = choose_shot(stage, size=(90, 60)).only("1001-1003")
     assert shot.fps == rate
     assert shot.frames[2].time == pytest.approx(2 / rate)
     assert choose_shot(stage, size=(90, 60), path="spiral").fps is None, "a path of its own has no rate"

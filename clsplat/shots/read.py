@@ -51,14 +51,13 @@ def choose_shot(
     *,
     path: str | None = None,
     count: int | None = None,
-    frames: str | None = None,
     size: tuple[int | None, int | None] = (None, None),
     usd_camera: str | None = None,
 ) -> Shot:
-    """The shot that --cameras, --path, --count and --frames ask for together.
+    """The shot that --cameras, --path and --count ask for together.
 
     path: turntable, spiral or through: `count` frames of that path, made from the cameras; else the cameras themselves.
-    frames: of these, the ones listed. Raises InputError.
+    Raises InputError.
     """
     if count is not None and path is None:
         raise InputError(f"--count {count}: expected --path with it, the files of cameras have their own frames")
@@ -70,7 +69,6 @@ def choose_shot(
             raise InputError(f"{cameras}: its cameras are {kind}, --path needs perspective or orthographic ones")
         made = numbered(PATHS[path](shot.cameras, COUNT if count is None else count))
         shot = Shot(made, shot.warnings, unapplied=shot.unapplied)
-    shot = shot if frames is None else shot.only(frames)
     far = min(frame.camera.far for frame in shot.frames)
     unapplied = (*((f"far plane ({far:g})",) if far < math.inf else ()), *shot.unapplied)
     if unapplied:
