@@ -23,8 +23,7 @@ from clsplat.images.channels import VIDEO, check_format, parse_channels
 from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
 from clsplat.runs.run import model_file
 from clsplat.sequence import existing
-from clsplat.sequence.settings_digest import digest_of
-from clsplat.sequence.task import RenderOptions, Task, make_tasks, picture_camera
+from clsplat.sequence.task import RenderOptions, Task, digest_of, make_tasks, picture_camera
 from clsplat.shots import Shot, choose_shot
 
 _PICTURES = (".png", ".tif", ".tiff")

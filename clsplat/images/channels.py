@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of rendered frames: layers of channels in EXR, one part or several, or a plain picture.
+"""Files of rendered frames: channels in EXR, one part or several, or a plain picture.
 
 Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
 vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standard attributes (ImfStandardAttributes.h).
@@ -70,28 +70,28 @@ def check_target(path: Path, channels: Iterable[str]) -> None:
 
 
 def write_channels(
-    path: Path, layers: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
+    path: Path, channels: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
 ) -> None:
     """Write a frame, atomically.
 
-    layers: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
+    channels: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
     numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `writing.write_image`.
     """
     encoding, header = encoding or Encoding(), header or Header()
-    check_target(path, layers)
-    pairs = encoded(path.suffix.lower(), layers, encoding, header)
+    check_target(path, channels)
+    pairs = encoded(path.suffix.lower(), channels, encoding, header)
     write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], path.suffix.lower()[1:])
 
 
 def encoded(
-    extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
 ) -> list[tuple[NDArray[Any], Any]]:
     """(pixels, OpenImageIO's specification) of each part of a file."""
-    layers = {name: layers[name] for name in CHANNELS if name in layers}
+    channels = {name: channels[name] for name in CHANNELS if name in channels}
     if extension != ".exr":
-        return [_picture(extension, layers, encoding, header)]
-    groups = _parts(tuple(layers)) if encoding.parts == "several" else [tuple(layers)]
-    return [_exr_part(group, layers, encoding, header, named=len(groups) > 1) for group in groups]
+        return [_picture(extension, channels, encoding, header)]
+    groups = _parts(tuple(channels)) if encoding.parts == "several" else [tuple(channels)]
+    return [_exr_part(group, channels, encoding, header, named=len(groups) > 1) for group in groups]
 
 
 def is_whole(
@@ -166,10 +166,10 @@ def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
 
 
 def _exr_part(
-    names: Sequence[str], layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
+    names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
 ) -> tuple[NDArray[Any], Any]:
     kinds = [CHANNELS[name].kind for name in names for _ in CHANNELS[name].names]
-    planes = [_planes(layers[name]) for name in names]
+    planes = [_planes(channels[name]) for name in names]
     if set(kinds) == {"whole"}:
         pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes the largest
         spec = _spec(pixels, oiio.UINT32, header)
@@ -208,10 +208,10 @@ def _check_floats(name: str, plane: NDArray[Any]) -> None:
 
 
 def _picture(
-    extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
 ) -> tuple[NDArray[Any], Any]:
-    planes = [_planes(plane) for plane in layers.values()]
-    if extension == ".png" and "alpha" in layers:
+    planes = [_planes(plane) for plane in channels.values()]
+    if extension == ".png" and "alpha" in channels:
         planes = [unassociate(np.concatenate(planes, axis=2))]
     bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
     whole = steps_of(planes, bits)

@@ -27,8 +27,8 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
     """Write a picture, atomically: 8-bit PNG or float EXR, by the extension.
 
     image (H, W) or (H, W, C), C = 1, 3 or 4, with straight alpha; floats, in a PNG clipped to [0, 1] and rounded, or
-    uint8. Raises InputError for another extension or a folder that does not exist, ClsplatError
-    if writing fails (disk full); the previous file is whole then, and no temporary file is left.
+    uint8. Raises InputError for another extension or a folder that does not exist, ClsplatError if writing fails (disk
+    full). The previous file is whole then, and no temporary file is left.
     """
     path = Path(path)
     extension = path.suffix.lower()

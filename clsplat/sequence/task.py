@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
@@ -17,11 +21,15 @@ from clsplat.frame.window import framed
 from clsplat.images.channels import VIDEO
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.images.exr_header import Header, camera_matrices
-from clsplat.sequence.settings_digest import SETTINGS, digest_of, encoding_of
 from clsplat.shots import Shot
 from clsplat.shots.frame_numbers import output_paths
 from clsplat.shots.motion import Stretch, stretches
 from clsplat.shots.motion import camera_after as following
+
+SETTINGS = "clsplat:settings"
+"""The attribute of EXR and PNG files that holds it."""
+_ENCODED = {".exr": ("depth", "parts", "compression"), ".png": ("bits",)}
+"""Settings of the encoding that a file of that extension depends on."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,36 @@ def camera_after(task: Task, options: RenderOptions) -> Camera | None:
     """The camera of the whole frame that motion goes to: a frame later than the middle of the shutter."""
     middle = options.pictures.sampling.middle
     return task.after if middle == 0 or task.after is None else task.at(middle + 1)
+
+
+def plain(value: Any) -> Any:
+    """A value in the form of JSON. A dataclass becomes its differences from the defaults, so that a setting that is
+    added later changes nothing. Floats have 12 digits, as processors differ in the last ones."""
+    if is_dataclass(value) and not isinstance(value, type):
+        changes = {}
+        for setting in fields(value):
+            given = getattr(value, setting.name)
+            usual = setting.default_factory() if setting.default_factory is not MISSING else setting.default
+            if isinstance(given, np.ndarray) or usual is MISSING or given != usual:
+                changes[setting.name] = plain(given)
+        return changes
+    if isinstance(value, float | np.floating):
+        return f"{value + 0.0:.12g}"  # + 0.0: no -0
+    if isinstance(value, np.ndarray):
+        return [plain(float(item)) for item in value.ravel()]
+    if isinstance(value, tuple | list):
+        return [plain(item) for item in value]
+    return value
+
+
+def encoding_of(encoding: Encoding, extension: str) -> dict[str, Any]:
+    """The settings that a file of that extension depends on."""
+    return {name: getattr(encoding, name) for name in _ENCODED.get(extension, ())}
+
+
+def digest_of(*parts: Any) -> str:
+    """128 bits of SHA-256, in hexadecimal, of values that `plain` takes."""
+    return hashlib.sha256(json.dumps(plain(parts), sort_keys=True).encode()).hexdigest()[:32]
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
