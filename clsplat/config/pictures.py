@@ -17,24 +17,10 @@ STRIP_PIXELS = 1 << 24
 """Pixels that are on the host at once, before filtering: about a gigabyte with every layer."""
 DEEP_STRIP_FLOATS = 1 << 26
 """Floats for the slices of a deep picture's strip: 256 MiB."""
+_MOST_SUPERSAMPLES = 64
+_MOST_SAMPLES = 4096
+_MOST_BINS = 256
 _PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
-
-_FRAMING_RULES: tuple[Rule, ...] = ((("supersample",), lambda value: 1 <= value <= 64, "1 to 64"),)
-_SAMPLING_RULES: tuple[Rule, ...] = (
-    (("samples",), lambda value: 1 <= value <= 4096, "1 to 4096"),
-    (("shutter_angle",), lambda value: 0 <= value <= 3600, "0 to 3600 degrees"),
-    (("f_stop", "sensor_width", "metres"), lambda value: value is None or 0 < value < inf, "a number above 0"),
-    (("aperture",), lambda value: 0 <= value < inf, "a radius of at least 0"),
-)
-_DEEP_RULES: tuple[Rule, ...] = (
-    (("bins",), lambda value: 1 <= value <= 256, "1 to 256"),
-    (("near", "far"), lambda value: 0 <= value < inf, "a depth, or 0 for that of what is in view"),
-)
-_VIDEO_RULES: tuple[Rule, ...] = (
-    (("fps",), lambda value: value is None or 0.01 <= value <= 1000, "0.01 to 1000 frames a second"),
-    (("crf",), lambda value: 0 <= value <= 51, "0 to 51"),
-    (("preset",), lambda value: str(value) in _PRESETS, f"one of {', '.join(_PRESETS)}"),
-)
 
 
 @dataclass(frozen=True)
@@ -73,7 +59,8 @@ class FramingConfig:
             parse_region(self.region)
         if self.region and parse_overscan(self.overscan) != (0, 0.0):
             raise InputError("--overscan and --region exclude each other: a region lies within the frame")
-        check_rules(self, "--", _FRAMING_RULES)
+        if not 1 <= self.supersample <= _MOST_SUPERSAMPLES:
+            raise InputError(f"--supersample {self.supersample}: expected 1 to {_MOST_SUPERSAMPLES}")
 
 
 def parse_overscan(text: str) -> tuple[int, float]:
@@ -126,7 +113,13 @@ class SamplingConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        check_rules(self, "--", _SAMPLING_RULES)
+        rules: tuple[Rule, ...] = (
+            (("samples",), lambda value: 1 <= value <= _MOST_SAMPLES, f"1 to {_MOST_SAMPLES}"),
+            (("shutter_angle",), lambda value: 0 <= value <= 3600, "0 to 3600 degrees"),
+            (("f_stop", "sensor_width", "metres"), lambda value: value is None or 0 < value < inf, "a number above 0"),
+            (("aperture",), lambda value: 0 <= value < inf, "a radius of at least 0"),
+        )
+        check_rules(self, "--", rules)
         if self.shutter_open is not None or self.shutter_close is not None:
             if self.shutter_angle:
                 raise InputError("--shutter-angle and --shutter-open exclude each other")
@@ -204,7 +197,11 @@ class DeepConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        check_rules(self, "--deep.", _DEEP_RULES)
+        rules: tuple[Rule, ...] = (
+            (("bins",), lambda value: 1 <= value <= _MOST_BINS, f"1 to {_MOST_BINS}"),
+            (("near", "far"), lambda value: 0 <= value < inf, "a depth, or 0 for that of what is in view"),
+        )
+        check_rules(self, "--deep.", rules)
         if self.near and self.far and not self.near < self.far:
             raise InputError(f"--deep.far {self.far}: expected more than --deep.near {self.near}")
 
@@ -227,7 +224,12 @@ class VideoConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        check_rules(self, "--video.", _VIDEO_RULES)
+        if self.fps is not None and not 0.01 <= self.fps <= 1000:
+            raise InputError(f"--video.fps {self.fps}: expected 0.01 to 1000 frames a second")
+        if not 0 <= self.crf <= 51:
+            raise InputError(f"--video.crf {self.crf}: expected 0 to 51")
+        if self.preset not in _PRESETS:
+            raise InputError(f"--video.preset {self.preset}: expected one of {', '.join(_PRESETS)}")
 
 
 Parts = Literal["one", "several"]
