@@ -81,8 +81,8 @@ def write_in_strips(
     encoding: Encoding | None = None,
     header: Header | None = None,
 ) -> None:
-    """Draw and write a picture strip by strip, atomically; the same bytes as `write_channels` writes of all of it, but
-    for layouts of a file that depend on how it is handed over.
+    """Draw and write a picture strip by strip, atomically. The bytes are those that `write_channels` writes of all of
+    it, except in formats whose layout depends on how the rows come.
 
     Raises InputError for what the format cannot hold and for several parts, which a file has one after the other;
     ClsplatError if writing fails.

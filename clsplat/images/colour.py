@@ -134,8 +134,8 @@ class Colours:
         return bool(np.allclose(rest, 0, atol=2e-3) and np.allclose([*one, *colours[3]], colours[3, 0], atol=2e-3))
 
     def check_file(self, path: str, extension: str, video: str) -> None:
-        """Raise InputError where a file of that extension would be shown in other colours than it holds: whole numbers
-        of light in linear values, and a video, whose extension is `video`, that is not in Rec.709."""
+        """Raise InputError where a file of that extension would be shown in other colours than it holds. Whole numbers
+        are not for linear light, and a video, whose extension is `video`, has to be in Rec.709."""
         advice = "write .exr, or give --colorspace sRGB"
         if extension != ".exr" and self.is_linear(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, which is linear, expected sRGB; {advice}")

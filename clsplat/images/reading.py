@@ -57,9 +57,9 @@ _COLOUR = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE)
 def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) -> set[Path]:
     """Those of `paths` that go with one of the pictures and are none: masks, depths, normals and the like.
 
-    They are told by name: a picture's own with such a word behind it (r_0_depth_0001.png) or before it (mask_r_0.png),
-    in place of "color" (frame-1.color.jpg, frame-1.depth.png), or with .png behind its extension (COLMAP's masks); and
-    whatever is in a sub-folder of `folder` that is called by such a word.
+    Their names tell. Such a word stands behind a picture's name (r_0_depth_0001.png), before it (mask_r_0.png) or in
+    place of "color" (frame-1.color.jpg, frame-1.depth.png). COLMAP's masks have .png behind the picture's extension.
+    Whatever is in a sub-folder of `folder` that is called by such a word counts too.
     """
     pictures = list(pictures)
 

@@ -171,7 +171,7 @@ def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWri
 
 
 def dask_setup(_: Any) -> None:
-    """Called by Dask in a local worker: Ctrl-C, which a terminal sends to it as well, is for the job to deal with."""
+    """Leave Ctrl-C, which a terminal sends to a local worker as well, to the job. Dask calls this in the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -185,7 +185,7 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         raise InputError(
             f"{flag}: needs the package distributed, install it with: pip install 'clsplat[farm]'"
         ) from None
-    # Dask tells of every worker that it loses, in many lines; what matters is raised.
+    # Dask logs every worker that it loses in many lines. What matters is raised.
     for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler is not None:

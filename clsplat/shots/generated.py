@@ -95,8 +95,9 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
     In spherical coordinates about `focus_point`: at the cameras' median distance, the elevation from their 10th to
     their 90th percentile and back. Where they leave a wide gap, the azimuth swings over the arc that they cover, once a
-    turn, a quarter of a turn behind the elevation: an ellipse before the scene, over which the distance goes from its
-    10th to its 90th percentile and back. Intrinsics of the first camera. Raises ValueError for no cameras or frames.
+    turn, a quarter of a turn behind the elevation. That is an ellipse before the scene; on it the distance goes from
+    its 10th to its 90th percentile and back. Intrinsics are the first camera's. Raises ValueError for no cameras or
+    frames.
     """
     _check("spiral", cameras, frames)
     ring = _ring(cameras)
@@ -129,10 +130,10 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A path from the first camera to the last in their order, smoothed, at an even speed, with the first one's
     intrinsics.
 
-    Positions and rotations are those of a parabola fitted to a camera and three neighbours on each side (fewer towards
-    the ends, which stay where they are), which keeps an arc where it is; a spline goes through these. Speed counts
-    distances and angles, each in steps of the median camera, so a camera that only turns takes its time as well. Raises
-    ValueError for no cameras or no frames.
+    Positions and rotations are those of a parabola fitted to a camera and three neighbours on each side, which keeps an
+    arc where it is. Towards the ends there are fewer neighbours, so that the ends stay. A spline goes through these.
+    Speed counts distances and angles, each in steps of the median camera, so a camera that only turns takes its time as
+    well. Raises ValueError for no cameras or no frames.
     """
     _check("through", cameras, frames)
     smooth = _smoothed(cameras)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """nerfstudio's camera_path.json, as its viewer and its Blender add-on write it: one camera a frame.
 
-Its formulas are those of nerfstudio's `get_path_from_json`: square pixels, the principal point in the middle, `fov`
-the vertical angle of view in degrees, from which a fisheye takes its focal length as a perspective camera does.
+Its formulas are those of nerfstudio's `get_path_from_json`. Pixels are square, the principal point is in the middle,
+and `fov` is the vertical angle of view in degrees. A fisheye takes its focal length from it as a perspective
+camera does.
 """
 
 from __future__ import annotations
