@@ -13,7 +13,7 @@ import OpenImageIO as oiio
 import pytest
 
 from clsplat.camera import Camera
-from clsplat.config.channels import CHANNELS, Channel, kernel_names, light_and_rest
+from clsplat.config.channels import CHANNELS, Channel, feature_names, light_and_rest
 from clsplat.config.pictures import Encoding
 from clsplat.device.source import kernel_root
 from clsplat.frame.draw import drawn_by, feature_floats
@@ -99,7 +99,7 @@ def test_one_more_row_goes_all_the_way_to_the_file(tmp_path: Path, monkeypatch: 
     monkeypatch.setitem(CHANNELS, "rough", ROUGHNESS)
     monkeypatch.setitem(WIDTHS, "roughness", 2)
     names = parse_channels("rgb,rough")
-    assert kernel_names(names, "features") == ("roughness",)
+    assert feature_names(names) == ("roughness",)
     assert feature_floats(names) == 3
     assert Features.of(("roughness",)).defines == {"FEATURES": 3, "FEATURE_DEPTH": 0, "FEATURE_ROUGHNESS": 1}
 

@@ -62,10 +62,10 @@ def floats_of(source: Source) -> dict[str, int]:
     return {channel.kernel: len(channel.names) for channel in CHANNELS.values() if channel.source == source}
 
 
-def kernel_names(names: Iterable[str], source: Source) -> tuple[str, ...]:
-    """The kernels' names of those of the channels that are of the source."""
+def feature_names(names: Iterable[str]) -> tuple[str, ...]:
+    """The kernels' names of those of the channels that are features."""
     asked = set(names)
-    return tuple(row.kernel for name, row in CHANNELS.items() if name in asked and row.source == source)
+    return tuple(row.kernel for name, row in CHANNELS.items() if name in asked and row.source == "features")
 
 
 def light_and_rest(names: Iterable[str]) -> tuple[list[str], list[str]]:

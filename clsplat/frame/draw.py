@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config.channels import CHANNELS, kernel_names, light_and_rest
+from clsplat.config.channels import CHANNELS, feature_names, light_and_rest
 from clsplat.device.layout import TILE
 from clsplat.frame.window import crop, reframed
 from clsplat.stages.channels import Features
@@ -48,7 +48,7 @@ def drawn_by(
             picture, made = renderer.render_channels(
                 gaussians,
                 camera,
-                kernel_names(rest, "features"),
+                feature_names(rest),
                 after=after and reframed(after, camera),
                 background=background,
                 contiguous=False,
@@ -76,7 +76,7 @@ def in_two(light: Draw, rest: Draw) -> Draw:
 def feature_floats(names: Collection[str]) -> int:
     """Floats of each Gaussian's that these channels are blended from, 0 where they are colour alone."""
     _, rest = light_and_rest(names)
-    return Features.of(kernel_names(rest, "features")).floats if rest else 0
+    return Features.of(feature_names(rest)).floats if rest else 0
 
 
 def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
