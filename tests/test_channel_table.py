@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -115,3 +116,8 @@ def test_one_more_row_goes_all_the_way_to_the_file(tmp_path: Path, monkeypatch: 
     source = oiio.ImageInput.open(str(tmp_path / "a.exr"))
     assert source.spec().channelnames == ("R", "G", "B", "rough.x", "rough.y")
     assert (np.asarray(source.read_image(oiio.FLOAT))[:, :, 3:] == [-3, 3]).all()
+
+
+def test_channels_of_one_part_stand_together() -> None:
+    parts = [channel.part for channel in CHANNELS.values()]
+    assert [part for part, _ in groupby(parts)] == list(dict.fromkeys(parts))

@@ -8,6 +8,7 @@ vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standa
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -159,17 +160,15 @@ def attribute(path: Path, name: str) -> Any:
 
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
-    grouped: dict[str, list[str]] = {}
-    for name in names:
-        grouped.setdefault(CHANNELS[name].part, []).append(name)
-    return [tuple(group) for group in grouped.values()]
+    """The channels of each part. Those of one part stand together in the table."""
+    return [tuple(group) for _, group in groupby(names, lambda name: CHANNELS[name].part)]
 
 
 def _exr_part(
     names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
 ) -> tuple[NDArray[Any], Any]:
     kinds = [CHANNELS[name].kind for name in names for _ in CHANNELS[name].names]
-    planes = [_planes(channels[name]) for name in names]
+    planes = [np.atleast_3d(channels[name]) for name in names]
     if set(kinds) == {"whole"}:
         pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes the largest
         spec = _spec(pixels, oiio.UINT32, header)
@@ -210,7 +209,7 @@ def _check_floats(name: str, plane: NDArray[Any]) -> None:
 def _picture(
     extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
 ) -> tuple[NDArray[Any], Any]:
-    planes = [_planes(plane) for plane in channels.values()]
+    planes = [np.atleast_3d(plane) for plane in channels.values()]
     if extension == ".png" and "alpha" in channels:
         planes = [unassociate(np.concatenate(planes, axis=2))]
     bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
@@ -226,10 +225,6 @@ def _picture(
     if extension in (".jpg", ".jpeg"):
         spec.attribute("Compression", f"jpeg:{encoding.quality}")
     return whole, spec
-
-
-def _planes(plane: NDArray[Any]) -> NDArray[Any]:
-    return plane[:, :, None] if plane.ndim == 2 else plane
 
 
 def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:

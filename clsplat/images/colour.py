@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +110,6 @@ class Colours:
         space that it lacks, with the names that are near."""
         config = config or ColourConfig()
         self._source = config.ocio_config or os.environ.get("OCIO", "") or BUILT_IN
-        self._loaded: Any = None
         self._matrices: dict[tuple[str, str], Float32 | None] = {}
         flag = "--model-colorspace" if config.model_colorspace else "the model's colour space"
         self.model = self._known(config.model_colorspace or recorded, flag)
@@ -142,14 +142,12 @@ class Colours:
         if extension == video and not self.has_rec709(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, expected sRGB's primaries; {advice}")
 
-    @property
+    @cached_property
     def _config(self) -> Any:
-        if self._loaded is None:
-            loaded = oiio.ColorConfig(self._source)
-            if reason := loaded.geterror():
-                raise InputError(f"{self._source}: no OpenColorIO configuration: {' '.join(reason.split())}")
-            self._loaded = loaded
-        return self._loaded
+        config = oiio.ColorConfig(self._source)
+        if reason := config.geterror():
+            raise InputError(f"{self._source}: no OpenColorIO configuration: {' '.join(reason.split())}")
+        return config
 
     def _known(self, name: str, flag: str) -> str:
         for space, names in _NAMES.items():

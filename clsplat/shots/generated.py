@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -176,8 +176,4 @@ def parabola_weights(reach: int) -> Float64:
     return np.asarray(scale * (3 * reach * reach + 3 * reach - 1 - 5 * offsets**2))
 
 
-PATHS: dict[str, Callable[[Sequence[Camera], int], list[Camera]]] = {
-    "turntable": turntable,
-    "spiral": spiral,
-    "through": through,
-}
+PATHS = {"turntable": turntable, "spiral": spiral, "through": through}

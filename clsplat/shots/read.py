@@ -35,11 +35,12 @@ def read_shot(path: Path, *, size: tuple[int | None, int | None] = (None, None),
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such folder or file, expected {EXPECTED}")
-    if usd_camera is not None and not _is_usd(path):
+    is_usd = path.suffix.lower() in USD
+    if usd_camera is not None and not is_usd:
         raise InputError(f"--usd-camera {usd_camera}: {path} is no USD stage, expected it with one only")
     if path.is_dir():
         return _read_folder(path, size)
-    if _is_usd(path):
+    if is_usd:
         return read_usd(path, size, usd_camera)
     if path.suffix.lower() == ".json":
         return _read_json(path, size)
@@ -74,10 +75,6 @@ def choose_shot(
     if unapplied:
         shot = replace(shot, warnings=(*shot.warnings, f"{cameras}: not applied: {', '.join(unapplied)}"))
     return shot
-
-
-def _is_usd(path: Path) -> bool:
-    return path.suffix.lower() in USD
 
 
 def _read_folder(path: Path, size: tuple[int | None, int | None]) -> Shot:

@@ -105,11 +105,7 @@ def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:
     paths = [str(camera.GetPath()) for camera in cameras]
     if not cameras:
         raise InputError(f"{path}: has no camera in it, expected at least one")
-    matching = [
-        camera for camera, name in zip(cameras, paths, strict=True) if prim in (name, camera.GetPrim().GetName())
-    ]
-    if prim is None:
-        matching = cameras
+    matching = [camera for camera in cameras if prim in (None, str(camera.GetPath()), camera.GetPrim().GetName())]
     if len(matching) != 1:
         problem = "has no such camera" if not matching else f"has {len(matching)} cameras"
         asked = "" if prim is None else f"--usd-camera {prim}: "
