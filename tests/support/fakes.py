@@ -56,7 +56,7 @@ class Pipeline:
     cameras: dict[str, Camera] = field(default_factory=lambda: {"a.jpg": camera(), "sub/b.c.jpg": camera(20, 40)})
     training: Callable[..., None] = lambda *_: None
 
-    def write_layers(self, path: Path, made: dict[str, np.ndarray], *_: object) -> None:
+    def write_channels(self, path: Path, made: dict[str, np.ndarray], *_: object) -> None:
         """In place of the real one."""
         planes = [plane if plane.ndim == 3 else plane[:, :, None] for plane in made.values()]
         self.written[str(path)] = np.concatenate(planes, axis=2)
@@ -162,7 +162,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         pipe.written[str(path)] = image
 
     monkeypatch.setattr(read, "read_cameras", lambda _: pipe.cameras)
-    monkeypatch.setattr(layers, "write_layers", pipe.write_layers)
+    monkeypatch.setattr(layers, "write_channels", pipe.write_channels)
     fakes: dict[str, dict[str, Any]] = {
         "scenes.scene": {"load_scene": load_scene},
         "api": {"train": train},
