@@ -155,18 +155,18 @@ def run(verb: Render, services: Services) -> int:
         from clsplat.cli.render_plan import dry_run
 
         return dry_run(job)
-    shaders = []
+    renderers = []
     if not job.on_farm:
         how: dict[str, Any] = {"memory_limit": job.memory_limit, "profile": verb.profile}
         model = (job.gaussians, job.options, job.verb.rasterizer)
-        shaders = [services.open_shader(*model, device=selector, **how) for selector in job.devices]
-        for shader in shaders:
-            shader.check(job.tasks)
+        renderers = [services.open_frame_renderer(*model, device=selector, **how) for selector in job.devices]
+        for renderer in renderers:
+            renderer.check(job.tasks)
     with terminable():  # again, as pycolmap and compilers of kernels install handlers of their own
-        return _write_frames(job, shaders)
+        return _write_frames(job, renderers)
 
 
-def _write_frames(job: Job, shaders: Sequence[Any]) -> int:
+def _write_frames(job: Job, renderers: Sequence[Any]) -> int:
     from clsplat.cli.render_request import check_foreign, frames_there
     from clsplat.sequence import existing, workers
 
@@ -195,7 +195,7 @@ def _write_frames(job: Job, shaders: Sequence[Any]) -> int:
             if job.on_farm:
                 _on_farm(job, left, done, video)
             else:
-                workers.run_tasks(left, shaders, options, done, video)
+                workers.run_tasks(left, renderers, options, done, video)
     except KeyboardInterrupt as error:
         count = f"{len(records)} of {len(tasks)} frames"
         advice = "nothing is left of the video" if job.is_video else "go on with --skip-existing"
@@ -208,21 +208,21 @@ def _write_frames(job: Job, shaders: Sequence[Any]) -> int:
             "model's world?"
         )
     if verb.profile:
-        _print_profile(records.values(), time.monotonic() - start, len(shaders))
+        _print_profile(records.values(), time.monotonic() - start, len(renderers))
     if verb.json:
         print(json.dumps([records[task.number].document() for task in tasks], indent=2))
     return 0
 
 
 def _on_farm(job: Job, tasks: Sequence[Task], done: Callable[[Record], None], video: VideoWriter | None) -> None:
-    from clsplat.sequence.farm import Scene, render_on_farm
+    from clsplat.sequence.farm import WorkerJob, render_on_farm
 
     verb = job.verb
     if verb.profile:
         warn("--profile is not used: it is for devices of this process")
     model = str(job.model.absolute())
-    scene = Scene(model, job.digest, job.options, job.verb.rasterizer, job.devices[0], job.memory_limit)
-    render_on_farm(tasks, scene, done, scheduler=verb.scheduler, workers=verb.workers, video=video)
+    worker_job = WorkerJob(model, job.digest, job.options, job.verb.rasterizer, job.devices[0], job.memory_limit)
+    render_on_farm(tasks, worker_job, done, scheduler=verb.scheduler, workers=verb.workers, video=video)
 
 
 def _print_profile(records: Iterable[Record], wall: float, devices: int) -> None:

@@ -9,21 +9,21 @@ from dataclasses import dataclass
 from typing import Any
 
 from clsplat.cli.render_request import Job, frames_there
+from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import FPS
 from clsplat.device.context import open_device
 from clsplat.errors import amount, examples
 from clsplat.frame.deep_exr import deep_rows
-from clsplat.frame.draw import COLOUR, renderer_channels
+from clsplat.frame.draw import feature_floats, on_tiles
+from clsplat.frame.samples import finer
 from clsplat.frame.strips import strip_rows
-from clsplat.frame.supersample import finer
-from clsplat.frame.window import crop, on_tiles
+from clsplat.frame.window import crop
 from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import held_sh
 from clsplat.sequence import workers
 from clsplat.sequence.task import picture_camera
 from clsplat.shots.frame_numbers import ranges
-from clsplat.stages.channels import Features
 from clsplat.stages.deep import DEEP_FLOATS
 
 
@@ -117,7 +117,7 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
     device, options = open_device(selector, job.memory_limit), job.options
     floats = held_sh(job.gaussians, job.verb.rasterizer).floats
     framing, names = options.pictures.framing, set(options.channels)
-    features = Features.of(renderer_channels(options.channels)).floats if names - set(COLOUR) else 0
+    features = feature_floats(names)
     plans = []
     cameras = [picture_camera(task, options) for task in job.tasks]
     for camera in {(camera.width, camera.height): camera for camera in cameras}.values():
@@ -127,7 +127,7 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
             rows, planes = strip_rows(device, camera, options.channels, framing), 0
         strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
         drawn = [(strip, features)]
-        if framing.supersample > 1 and names & set(COLOUR):
+        if framing.supersample > 1 and light_and_rest(names)[0]:
             drawn.append((finer(strip, framing), 0))
         for part, floats_beside in drawn:
             sizes = (on_tiles(part)[0], job.verb.rasterizer, floats_beside, planes)

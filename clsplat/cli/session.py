@@ -41,7 +41,7 @@ class Services:
     reconstruct: Callable[..., Path] = imported("clsplat.scenes.sfm.reconstruct")
     train: Callable[..., Gaussians] = imported("clsplat.api.train")
     renderer: Callable[..., Renderer] = imported("clsplat.rendering.renderer.Renderer")
-    open_shader: Callable[..., Any] = imported("clsplat.sequence.frame_renderer.open_shader")
+    open_frame_renderer: Callable[..., Any] = imported("clsplat.sequence.frame_renderer.open_frame_renderer")
     run_demo: Callable[..., dict[str, Any]] = imported("clsplat.demo.run.run_demo")
 
 

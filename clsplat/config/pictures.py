@@ -143,6 +143,12 @@ class SamplingConfig:
         return -self.shutter_angle / 720, self.shutter_angle / 720
 
     @property
+    def middle(self) -> float:
+        """The time half way between opening and closing, in frames from the frame."""
+        begin, end = self.shutter
+        return 0.5 * (begin + end)
+
+    @property
     def moves(self) -> bool:
         """True if the shutter stays open for a time, so that the camera is looked at more than once."""
         return self.shutter[1] > self.shutter[0]

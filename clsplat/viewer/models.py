@@ -138,9 +138,9 @@ def render_picture(
     if isinstance(model, Gaussians) and not len(model):
         raise InputError("nothing of the model is left: the crop box holds no Gaussian")
     if look.mode in ("depth", "count"):
-        frame, found = renderer.render_channels(model, camera, background=background, contiguous=False)
+        frame, channels = renderer.render_channels(model, camera, background=background, contiguous=False)
         if look.mode == "depth":
-            return depth_picture(found.depth, frame.alpha)
-        return count_picture(found.count)
+            return depth_picture(channels["depth"], frame.alpha)
+        return count_picture(channels["count"])
     frame = renderer.render(model, camera, background, contiguous=False)
     return (alpha_picture(frame.alpha) if look.mode == "alpha" else colour_picture(frame.image)), ""

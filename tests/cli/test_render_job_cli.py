@@ -78,19 +78,25 @@ def test_every_channel_is_that_of_the_renderer(shot: list[str], tmp_path: Path, 
     gaussians = Gaussians.load(shot[0])
     camera, after = frames[1].camera, frames[2].camera
     image, own = Renderer().render_channels(gaussians, camera, ("normal", "position", "motion"), after=after)
-    wanted = {"A": image.alpha, "Z": own.depth, "median.Z": own.median, "first.Z": own.first, "count": own.count}
-    wanted |= {"id": own.index, "forward.u": own.fields["motion"][:, :, 0], "forward.v": -own.fields["motion"][:, :, 1]}
+    wanted = {
+        "A": image.alpha,
+        "Z": own["depth"],
+        "median.Z": own["median"],
+        "first.Z": own["first"],
+        "count": own["count"],
+    }
+    wanted |= {"id": own["index"], "forward.u": own["motion"][:, :, 0], "forward.v": -own["motion"][:, :, 1]}
     for index in range(3):
         wanted["RGB"[index]] = image.image[:, :, index]
-        wanted[f"N.{'xyz'[index]}"] = own.fields["normal"][:, :, index]
-        wanted[f"P.{'xyz'[index]}"] = own.fields["position"][:, :, index]
+        wanted[f"N.{'xyz'[index]}"] = own["normal"][:, :, index]
+        wanted[f"P.{'xyz'[index]}"] = own["position"][:, :, index]
     assert set(spec.channelnames) == set(wanted)
     for name, values in wanted.items():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
     assert spec.getattribute("clsplat:frame") == 2
     assert len(spec.getattribute("clsplat:model")) == 64
     last, after = frames[-1].camera, camera_after(whole, COUNT - 1)
-    motion = Renderer().render_channels(gaussians, last, ("motion",), after=after)[1].fields["motion"]
+    motion = Renderer().render_channels(gaussians, last, ("motion",), after=after)[1]["motion"]
     found, _ = read(tmp_path / "a.0006.exr")
     np.testing.assert_array_equal(found["forward.u"], motion[:, :, 0])
     assert np.abs(found["forward.u"]).max() > 1

@@ -17,16 +17,15 @@ from clsplat.config.pictures import Encoding, FramingConfig, SamplingConfig
 from clsplat.device.context import open_device
 from clsplat.errors import InputError
 from clsplat.frame.draw import drawn_by
-from clsplat.frame.shutter_and_lens import sample_cameras, sampled
+from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.frame.strips import in_strips, strip_rows, strips, write_in_strips
-from clsplat.frame.supersample import supersampled
 from clsplat.frame.window import crop, framed
-from clsplat.images.channels import LAYERS, write_layers
+from clsplat.images.channels import CHANNELS, write_channels
 from clsplat.images.exr_header import Header
 from clsplat.rendering.renderer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(3000, 8, 150, 200)
-EVERYTHING = tuple(LAYERS)
+EVERYTHING = tuple(CHANNELS)
 
 
 def test_strips_cover_the_picture_and_end_with_tiles() -> None:
@@ -71,7 +70,7 @@ def test_files_are_those_of_the_whole(ending: str, tmp_path: Path) -> None:
     camera = crop(CAMERA, 5, 21, 100, 150)
     header = Header({"clsplat:frame": 7}, window=Window(5, 21, 150, 200) if ending == "exr" else None)
     draw = drawn_by(Renderer(), CLOUD)
-    write_layers(tmp_path / f"whole.{ending}", draw(camera, names), Encoding(), header)
+    write_channels(tmp_path / f"whole.{ending}", draw(camera, names), Encoding(), header)
     write_in_strips(tmp_path / f"strips.{ending}", draw, camera, names, 32, Encoding(), header)
     whole, in_parts = (oiio.ImageBuf(str(tmp_path / f"{name}.{ending}")) for name in ("whole", "strips"))
     assert_same_bits(in_parts.get_pixels(oiio.FLOAT), whole.get_pixels(oiio.FLOAT))

@@ -19,7 +19,7 @@ from clsplat.camera import Camera, Window
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
-from clsplat.frame.deep_exr import bin_bounds, depths_in_view, flattened, render_deep, write_deep
+from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep, write_deep
 from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import LINEAR, Colours
@@ -34,6 +34,14 @@ SCENES = {
     "equal_depth": scenes.NAMED["equal_depth"],
     "cloud": lambda: scenes.random_cloud(600, 8, 70, 50),
 }
+
+
+def flattened(slices: np.ndarray) -> np.ndarray:
+    """(bins, H, W, 6) to (H, W, 4): the slices over each other, front to back."""
+    flat = np.zeros((*slices.shape[1:3], 4), np.float64)
+    for image in slices.astype(np.float64):
+        flat += (1 - flat[:, :, 3:]) * image[:, :, :4]
+    return flat.astype(np.float32)
 
 
 def read(path: Path) -> tuple[Any, list[NDArray[np.float64]]]:

@@ -15,16 +15,16 @@ from clsplat.camera import Camera, Projection, Window
 from clsplat.config.pictures import FramingConfig, parse_overscan
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.frame.draw import Draw, Layers, drawn_by
-from clsplat.frame.supersample import filter_taps, supersampled
+from clsplat.frame.draw import Draw, Planes, drawn_by
+from clsplat.frame.samples import filter_taps, supersampled
 from clsplat.frame.window import crop, framed, reframed
-from clsplat.images.channels import LAYERS
+from clsplat.images.channels import CHANNELS
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
 
 WIDTH, HEIGHT = 150, 100
-EVERYTHING = tuple(LAYERS)
+EVERYTHING = tuple(CHANNELS)
 PERSPECTIVE = scenes.random_cloud(3000, 8, WIDTH, HEIGHT)
 
 
@@ -46,7 +46,7 @@ def drawer(device: Device, camera: Camera) -> Draw:
     return drawn_by(Renderer(device), PERSPECTIVE[0], after=after)
 
 
-def assert_same(part: Layers, whole: Layers, rows: slice, columns: slice) -> None:
+def assert_same(part: Planes, whole: Planes, rows: slice, columns: slice) -> None:
     assert part.keys() == whole.keys()
     for name, values in part.items():
         assert_same_bits(values, np.ascontiguousarray(whole[name][rows, columns]))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +16,13 @@ from compare import assert_close, assert_same_bits
 from clsplat.camera import Camera
 from clsplat.config.pictures import ColourConfig, Encoding, FramingConfig, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
-from clsplat.frame.pipeline import Pictures
+from clsplat.frame.draw import Planes
+from clsplat.frame.pipeline import FramePipeline
+from clsplat.frame.strips import write_in_strips
+from clsplat.frame.window import framed
+from clsplat.images.channels import write_channels
 from clsplat.images.colour import LINEAR, linear_to_srgb, srgb_to_linear
+from clsplat.images.exr_header import Header
 from clsplat.rendering.renderer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(1500, 8, 100, 70)
@@ -30,6 +36,15 @@ def still(_: float) -> Camera:
     return CAMERA
 
 
+def picture_camera(pipeline: FramePipeline, at: Callable[[float], Camera]) -> Camera:
+    return framed(at(pipeline.config.sampling.middle), pipeline.config.framing)
+
+
+def drawn(pipeline: FramePipeline, at: Callable[[float], Camera], names: tuple[str, ...]) -> Planes:
+    draw, finish = pipeline.draw(at)
+    return finish(draw(picture_camera(pipeline, at), names))
+
+
 def straight(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return rgb / np.where(alpha > 0, alpha, 1)[:, :, None]
 
@@ -37,7 +52,7 @@ def straight(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 def test_nothing_asked_for_is_the_plain_frame() -> None:
     renderer = Renderer()
     plain = renderer.render(CLOUD, CAMERA)
-    layers = Pictures(renderer, CLOUD).layers(still, ("rgb", "alpha"))
+    layers = drawn(FramePipeline(renderer, CLOUD), still, ("rgb", "alpha"))
     assert_same_bits(layers["rgb"], plain.image)
     assert_same_bits(layers["alpha"], plain.alpha)
 
@@ -46,7 +61,7 @@ def test_nothing_asked_for_is_the_plain_frame() -> None:
 def test_light_is_added_up_in_linear_values(recorded: str, space: str) -> None:
     renderer = Renderer()
     config = PictureConfig(framing=FramingConfig(supersample=2))
-    layers = Pictures(renderer, CLOUD, config, recorded=recorded).layers(still, ("rgb", "alpha"))
+    layers = drawn(FramePipeline(renderer, CLOUD, config, recorded=recorded), still, ("rgb", "alpha"))
     large = renderer.render(CLOUD, CAMERA.resized(200, 140))
     colour = straight(large.image, large.alpha)
     light = (srgb_to_linear(colour) if space == "sRGB" else colour) * large.alpha[:, :, None]
@@ -63,7 +78,7 @@ def test_light_is_added_up_in_linear_values(recorded: str, space: str) -> None:
 def test_an_opaque_picture_is_converted_as_it_is() -> None:
     config = PictureConfig(colour=ColourConfig(colorspace=LINEAR))
     renderer = Renderer()
-    got = Pictures(renderer, CLOUD, config, background=(0.2, 0.4, 0.6)).layers(still, ("rgb",))["rgb"]
+    got = drawn(FramePipeline(renderer, CLOUD, config, background=(0.2, 0.4, 0.6)), still, ("rgb",))["rgb"]
     assert_same_bits(got, srgb_to_linear(renderer.render(CLOUD, CAMERA, (0.2, 0.4, 0.6)).image))
 
 
@@ -72,32 +87,33 @@ def test_samples_in_linear_light() -> None:
         colour=ColourConfig(colorspace=LINEAR), sampling=SamplingConfig(samples=3, shutter_open=0.0, shutter_close=0.6)
     )
     renderer = Renderer()
-    pictures = Pictures(renderer, CLOUD, config)
-    got = pictures.layers(sliding, ("rgb", "depth"))
+    pipeline = FramePipeline(renderer, CLOUD, config)
+    got = drawn(pipeline, sliding, ("rgb", "depth"))
     times = (0.1, 0.3, 0.5)
     light = [srgb_to_linear(renderer.render(CLOUD, sliding(time)).image).astype(np.float64) for time in times]
     assert_close(got["rgb"], np.mean(light, axis=0), relative=1e-6, absolute=1e-6)
-    assert_same_bits(got["depth"], renderer.render_channels(CLOUD, sliding(0.3))[1].depth)
-    assert_close(pictures.camera(sliding).position, sliding(0.3).position, absolute=1e-12)
+    assert_same_bits(got["depth"], renderer.render_channels(CLOUD, sliding(0.3))[1]["depth"])
+    assert_close(picture_camera(pipeline, sliding).position, sliding(0.3).position, absolute=1e-12)
 
 
-def test_all_of_it_to_a_file_in_strips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_of_it_to_a_file_in_strips(tmp_path: Path) -> None:
     config = PictureConfig(
         ColourConfig(colorspace="ACEScg"),
         FramingConfig(overscan="10%", supersample=2, filter="blackman-harris"),
         SamplingConfig(samples=2, shutter_angle=90.0, aperture=0.05, focus=4.0),
     )
     names = ("rgb", "alpha", "depth", "motion")
-    pictures = Pictures(Renderer(), CLOUD, config)
+    pipeline = FramePipeline(Renderer(), CLOUD, config)
     after = sliding(1.0)
-    pictures.write(tmp_path / "whole.exr", sliding, names, Encoding(depth="float"), after=after)
-    monkeypatch.setattr("clsplat.frame.pipeline.strip_rows", lambda *_: 16)
-    pictures.write(tmp_path / "strips.exr", sliding, names, Encoding(depth="float"), after=after)
+    (draw, finish), camera = pipeline.draw(sliding, after), picture_camera(pipeline, sliding)
+    file = Encoding(depth="float"), Header(window=camera.window)
+    write_channels(tmp_path / "whole.exr", finish(draw(camera, names)), *file)
+    write_in_strips(tmp_path / "strips.exr", lambda strip, _: finish(draw(strip, names)), camera, names, 16, *file)
     assert (tmp_path / "strips.exr").read_bytes() == (tmp_path / "whole.exr").read_bytes()
     spec = oiio.ImageBuf(str(tmp_path / "whole.exr")).spec()
     assert (spec.x, spec.y, spec.width, spec.height) == (-10, -7, 120, 84)
     assert (spec.full_x, spec.full_y, spec.full_width, spec.full_height) == (0, 0, 100, 70)
-    pictures.write(tmp_path / "a.png", sliding, ("rgb", "alpha"))
+    write_channels(tmp_path / "a.png", drawn(pipeline, sliding, ("rgb", "alpha")))
     assert oiio.ImageBuf(str(tmp_path / "a.png")).spec().full_width == 120
 
 
@@ -113,4 +129,4 @@ def test_what_deep_pictures_have_not() -> None:
     with pytest.raises(InputError, match="deep EXR: a shutter or a lens has no deep samples"):
         PictureConfig(sampling=SamplingConfig(shutter_angle=9.0)).check_deep()
     with pytest.raises(InputError, match="--supersample 0"):
-        Pictures(Renderer(), CLOUD, PictureConfig(framing=FramingConfig(supersample=0)))
+        FramePipeline(Renderer(), CLOUD, PictureConfig(framing=FramingConfig(supersample=0)))

@@ -13,7 +13,7 @@ from scenes import one
 from clsplat.config.pictures import ColourConfig, Encoding
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.images.channels import write_layers
+from clsplat.images.channels import write_channels
 from clsplat.images.colour import (
     LINEAR,
     SRGB,
@@ -70,7 +70,7 @@ def test_to_acescg_and_back_through_a_file(tmp_path: Path) -> None:
     assert not converted[~some].any()
     assert converted.max() > 1 and converted.min() < 0
 
-    write_layers(tmp_path / "a.exr", {"rgb": converted, "alpha": alpha}, Encoding(depth="half"))
+    write_channels(tmp_path / "a.exr", {"rgb": converted, "alpha": alpha}, Encoding(depth="half"))
     held = oiio.ImageBuf(str(tmp_path / "a.exr")).get_pixels(oiio.FLOAT)
     assert held[:, :, :3].max() > 1 and held[:, :, :3].min() < 0
     back = colours.convert(held[:, :, :3], None, colours.output, LINEAR)

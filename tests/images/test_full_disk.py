@@ -87,12 +87,12 @@ PICTURES = """
 import sys
 from pathlib import Path
 import numpy as np
-from clsplat.config.pictures import Encoding; from clsplat.images.channels import is_whole, write_layers
+from clsplat.config.pictures import Encoding; from clsplat.images.channels import is_whole, write_channels
 folder, name = Path(sys.argv[1]), sys.argv[2]
 rng = np.random.default_rng(0)
 for size in range(*map(int, sys.argv[3:])):
     try:
-        write_layers(folder / name, {"rgb": rng.random((size, size, 3)).astype(np.float32)})
+        write_channels(folder / name, {"rgb": rng.random((size, size, 3)).astype(np.float32)})
         print("whole" if is_whole(folder / name, size, size, ["rgb"], Encoding()) else "cut")
         (folder / name).unlink()
     except OSError as error:
@@ -119,10 +119,12 @@ VIDEO = """
 import sys
 from pathlib import Path
 import numpy as np
-from clsplat.images.video import write_video
+from clsplat.images.video import VideoWriter, frame_planes
 rng = np.random.default_rng(0)
 try:
-    write_video(Path(sys.argv[1]), [(rng.random((200, 200, 3)) * 255).astype(np.uint8) for _ in range(10)])
+    with VideoWriter(Path(sys.argv[1])) as video:
+        for _ in range(10):
+            video.add(frame_planes((rng.random((200, 200, 3)) * 255).astype(np.uint8)))
 except OSError as error:
     print(error.exit_status, error)
 print(len(list(Path(sys.argv[1]).parent.iterdir())))

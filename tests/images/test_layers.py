@@ -18,7 +18,7 @@ from scenes import tilted_camera
 from clsplat.camera import Window
 from clsplat.config.pictures import Encoding
 from clsplat.errors import ClsplatError, InputError
-from clsplat.images.channels import LAYERS, check_format, parse_channels, write_layers
+from clsplat.images.channels import CHANNELS, check_format, parse_channels, write_channels
 from clsplat.images.exr_header import Header, camera_matrices
 from clsplat.reference.cameras import pixel_from_world
 
@@ -29,7 +29,7 @@ def everything() -> dict[str, NDArray[Any]]:
     """A value of its own for each channel; colours beyond 0 and 1, an index that a float32 does not hold."""
     rng = np.random.default_rng(0)
     made: dict[str, NDArray[Any]] = {}
-    for name, layer in LAYERS.items():
+    for name, layer in CHANNELS.items():
         shape = (HEIGHT, WIDTH, len(layer.names))
         made[name] = rng.uniform(-1, 3, shape).astype(np.float32)
     made["depth"] = rng.uniform(1e-3, 1e6, (HEIGHT, WIDTH)).astype(np.float32)
@@ -69,13 +69,13 @@ def test_exr(parts: Any, depth: Any, tmp_path: Path) -> None:
     layers, path = everything(), tmp_path / "a.exr"
     if parts == "one":
         with pytest.raises(InputError, match="more than a float holds exactly; use --parts several"):
-            write_layers(path, layers, Encoding(depth=depth, parts=parts))
+            write_channels(path, layers, Encoding(depth=depth, parts=parts))
         layers["id"] %= 2**24
-    write_layers(path, layers, Encoding(depth=depth, parts=parts))
+    write_channels(path, layers, Encoding(depth=depth, parts=parts))
     found, specs = read(path)
     assert [name for spec in specs for name in spec.channelnames].count("R") == 1
     assert len(specs) == (1 if parts == "one" else 9)
-    for name, layer in LAYERS.items():
+    for name, layer in CHANNELS.items():
         planes = layers[name].reshape(HEIGHT, WIDTH, -1)
         for index, channel in enumerate(layer.names):
             wanted = planes[:, :, index]
@@ -88,7 +88,7 @@ def test_exr(parts: Any, depth: Any, tmp_path: Path) -> None:
 
 
 def test_parts_have_names_and_formats(tmp_path: Path) -> None:
-    write_layers(tmp_path / "a.exr", everything(), Encoding("half", parts="several"))
+    write_channels(tmp_path / "a.exr", everything(), Encoding("half", parts="several"))
     _, specs = read(tmp_path / "a.exr")
     names = [spec.get_string_attribute("oiio:subimagename") for spec in specs]
     assert names == ["rgba", "depth", "median", "first", "N", "P", "forward", "count", "id"]
@@ -102,12 +102,11 @@ def test_the_header(tmp_path: Path) -> None:
     layers = everything()
     del layers["id"]
     camera = tilted_camera(WIDTH, HEIGHT)
-    header = Header({"clsplat:frame": 7, "Software": "clsplat"}, camera_matrices(camera), None, 2.0)
-    write_layers(tmp_path / "a.exr", layers, Encoding(compression="piz"), header)
+    header = Header({"clsplat:frame": 7, "Software": "clsplat"}, camera_matrices(camera))
+    write_channels(tmp_path / "a.exr", layers, Encoding(compression="piz"), header)
     _, (spec,) = read(tmp_path / "a.exr")
     assert spec.getattribute("clsplat:frame") == 7
     assert spec.get_string_attribute("compression") == "piz"
-    assert spec.get_float_attribute("PixelAspectRatio") == 2.0
     found = exr_attributes(tmp_path / "a.exr")
     for name, matrix in header.matrices.items():
         kind, data = found[name]
@@ -149,7 +148,7 @@ def test_matrices_of_an_orthographic_camera(far: float) -> None:
 
 
 def test_a_window(tmp_path: Path) -> None:
-    write_layers(tmp_path / "a.exr", everything(), Encoding(parts="several"), Header(window=Window(5, 3, 100, 50)))
+    write_channels(tmp_path / "a.exr", everything(), Encoding(parts="several"), Header(window=Window(5, 3, 100, 50)))
     _, (spec, *_) = read(tmp_path / "a.exr")
     assert (spec.x, spec.y, spec.width, spec.height) == (5, 3, WIDTH, HEIGHT)
     assert (spec.full_x, spec.full_y, spec.full_width, spec.full_height) == (0, 0, 100, 50)
@@ -157,7 +156,7 @@ def test_a_window(tmp_path: Path) -> None:
 
 def test_what_a_half_cannot_hold_is_its_largest(tmp_path: Path) -> None:
     layers = {"rgb": np.full((4, 4, 3), 1e9, np.float32), "depth": np.full((4, 4), 1e9, np.float32)}
-    write_layers(tmp_path / "a.exr", layers, Encoding("half"))
+    write_channels(tmp_path / "a.exr", layers, Encoding("half"))
     found, _ = read(tmp_path / "a.exr")
     assert (found["R"] == 65504).all()
     assert (found["Z"] == 1e9).all()
@@ -169,7 +168,7 @@ def test_pictures(extension: str, bits: int, tmp_path: Path) -> None:
     rgb = np.full((HEIGHT, WIDTH, 3), 0.25, np.float32)
     rgb[0, 0] = (-1.0, 2.0, np.nan)
     layers = {"rgb": rgb} if extension == "jpg" else {"rgb": rgb, "alpha": alpha}
-    write_layers(tmp_path / f"a.{extension}", layers, Encoding(bits=bits))
+    write_channels(tmp_path / f"a.{extension}", layers, Encoding(bits=bits))
     source = oiio.ImageInput.open(str(tmp_path / f"a.{extension}"), oiio.ImageSpec())
     spec = source.spec()
     assert str(spec.format) == f"uint{bits}"
@@ -193,7 +192,7 @@ def test_every_step_of_a_picture(bits: int, tmp_path: Path) -> None:
     wanted[0, :4, 0], wanted[1, :3, 0] = 0, most
     planes = np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32)  # as they come from a device
     for layer in (planes.transpose(1, 2, 0), np.ascontiguousarray(planes.transpose(1, 2, 0))):
-        write_layers(tmp_path / "a.png", {"rgb": layer}, Encoding(bits=bits))
+        write_channels(tmp_path / "a.png", {"rgb": layer}, Encoding(bits=bits))
         found = oiio.ImageInput.open(str(tmp_path / "a.png")).read_image(oiio.UINT8 if bits == 8 else oiio.UINT16)
         np.testing.assert_array_equal(found, wanted)
 
@@ -223,10 +222,10 @@ def test_formats_that_cannot(path: str, channels: tuple[str, ...], message: str)
 def test_nowhere_to_write(tmp_path: Path) -> None:
     layers = {"rgb": np.zeros((4, 4, 3), np.float32)}
     with pytest.raises(InputError, match="no such folder to write"):
-        write_layers(tmp_path / "none" / "a.exr", layers)
+        write_channels(tmp_path / "none" / "a.exr", layers)
     (tmp_path / "a.exr").mkdir()
     with pytest.raises(ClsplatError, match=r"a\.exr: cannot be written"):
-        write_layers(tmp_path / "a.exr", layers)
+        write_channels(tmp_path / "a.exr", layers)
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
@@ -234,6 +233,6 @@ def test_nowhere_to_write(tmp_path: Path) -> None:
 def test_the_same_bytes_a_second_later(extension: str, tmp_path: Path) -> None:
     layers = everything() if extension == "exr" else {"rgb": everything()["rgb"]}
     for name in ("a", "b"):
-        write_layers(tmp_path / f"{name}.{extension}", layers, Encoding(parts="several"))
+        write_channels(tmp_path / f"{name}.{extension}", layers, Encoding(parts="several"))
         time.sleep(1.1 if name == "a" else 0)
     assert (tmp_path / f"a.{extension}").read_bytes() == (tmp_path / f"b.{extension}").read_bytes()

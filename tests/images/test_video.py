@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 
 from clsplat.config.pictures import VideoConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.images.video import VideoWriter, check_video, write_video, yuv420
+from clsplat.images.video import VideoWriter, check_video, frame_planes
 
 require("av")
 import av  # noqa: E402
@@ -25,6 +27,14 @@ def frames(count: int, width: int, height: int) -> list[NDArray[np.float32]]:
     y, x = np.mgrid[0:height, 0:width]
     base = np.stack([x / width, y / height, 0.5 + 0 * x], axis=2)
     return [(0.6 * base + 0.35 * index / count).astype(np.float32) for index in range(count)]
+
+
+def write_video(path: Path, images: Iterable[NDArray[Any]], config: VideoConfig | None = None) -> int:
+    """Write all images; returns how many."""
+    with VideoWriter(path, config) as video:
+        for image in images:
+            video.add(frame_planes(image))
+        return video.frames
 
 
 def read(path: Path) -> tuple[list[NDArray[np.float64]], object]:
@@ -46,7 +56,7 @@ def test_frames_in_order(width: int, height: int, tmp_path: Path) -> None:
     assert stream.codec_context.colorspace == 1  # the matrix that the values were made with
     for picture, wanted in zip(pictures, made, strict=True):
         # what crf 12 leaves of a smooth ramp: a few levels of 219; frames are 8 of them apart
-        error = picture.astype(int) - yuv420(wanted)
+        error = picture.astype(int) - frame_planes(wanted)
         assert np.abs(error).max() <= 6
         assert abs(error.mean()) < 0.5
     assert list(tmp_path.iterdir()) == [path]
@@ -70,7 +80,7 @@ def test_chroma_is_where_it_belongs() -> None:
     # A ramp of blue to the right: at the left site, a quarter of it each side, of its own column's value.
     rgb = np.zeros((4, 8, 3), np.float32)
     rgb[:, :, 2] = np.arange(8) / 10
-    planes = yuv420(rgb)
+    planes = frame_planes(rgb)
     assert planes.shape == (6, 8)
     luma, blue, red = planes[:4], planes[4].reshape(2, 4), planes[5].reshape(2, 4)
     np.testing.assert_array_equal(luma[0], np.rint(16 + 219 * 0.0722 * np.arange(8) / 10))
@@ -78,7 +88,7 @@ def test_chroma_is_where_it_belongs() -> None:
     at = np.array([0.25, 2, 4, 6]) / 10
     np.testing.assert_array_equal(blue[1], np.rint(128 + 224 * at * (1 - 0.0722) / (2 * (1 - 0.0722))))
     np.testing.assert_array_equal(red[0], np.rint(128 - 224 * at * 0.0722 / (2 * (1 - 0.2126))))
-    white = yuv420(np.ones((2, 2, 3), np.float32))
+    white = frame_planes(np.ones((2, 2, 3), np.float32))
     assert (white[:2] == 235).all() and (white[2:] == 128).all()
 
 
@@ -111,7 +121,7 @@ def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
     path.write_bytes(b"before")
     made = frames(2, 32, 32)
     with pytest.raises(KeyboardInterrupt), VideoWriter(path) as video:
-        video.add(made[0])
+        video.add(frame_planes(made[0]))
         raise KeyboardInterrupt
     with pytest.raises(InputError, match="a video of no frames"):
         write_video(path, [])

@@ -29,7 +29,7 @@ from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import InputError
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.sequence.settings_digest import digest_of
+from clsplat.sequence.task import digest_of
 from clsplat.stages.device_gaussians import upload_gaussians
 
 EXACT_OFF = {

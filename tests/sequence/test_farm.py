@@ -28,8 +28,7 @@ from clsplat.errors import InputError
 from clsplat.files import digest
 from clsplat.sequence import farm
 from clsplat.sequence.existing import stamp
-from clsplat.sequence.task import RenderOptions
-from clsplat.sequence.task_list import make_tasks
+from clsplat.sequence.task import RenderOptions, make_tasks
 from clsplat.shots.shot import Shot, numbered
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -176,8 +175,8 @@ def test_without_the_extra(shot: list[str], tmp_path: Path, capsys: Capture, mon
     )
 
 
-def scene_of(shot: list[str]) -> farm.Scene:
-    return farm.Scene(shot[0], digest(shot[0]), RenderOptions(), RasterizerConfig())
+def job_of(shot: list[str]) -> farm.WorkerJob:
+    return farm.WorkerJob(shot[0], digest(shot[0]), RenderOptions(), RasterizerConfig())
 
 
 def record_of(result: farm.Result | farm.Failure) -> farm.Record:
@@ -190,32 +189,32 @@ def record_of(result: farm.Result | farm.Failure) -> farm.Record:
 def test_what_a_worker_does(shot: list[str], tmp_path: Path) -> None:
     path = Shot(numbered(cameras()))
     (task,) = make_tasks(path.only("3"), path, str(tmp_path / "#.exr"), lambda camera: camera, ("rgb",))
-    scene = scene_of(shot)
-    record = record_of(farm.render_frame(task, scene))
+    job = job_of(shot)
+    record = record_of(farm.render_frame(task, job))
     assert record.seconds > 0
     first = stamp(task.path)
     # another worker finished the frame and was lost before it could say so
-    assert record_of(farm.render_frame(task, scene)) == replace(record, seconds=0.0, blank=None)
+    assert record_of(farm.render_frame(task, job)) == replace(record, seconds=0.0, blank=None)
     assert stamp(task.path) == first
     # what was there before the job is rendered again
-    again = record_of(farm.render_frame(replace(task, before=first), scene))
+    again = record_of(farm.render_frame(replace(task, before=first), job))
     assert again.seconds > 0
     assert stamp(task.path) != first
-    shader = farm._HELD.shader
-    farm.render_frame(replace(task, before=stamp(task.path)), scene)
-    assert farm._HELD.shader is shader, "the model is loaded once"
+    renderer = farm._HELD.renderer
+    farm.render_frame(replace(task, before=stamp(task.path)), job)
+    assert farm._HELD.renderer is renderer, "the model is loaded once"
     task = replace(task, before=stamp(task.path))
     for wrong, message in [
-        (replace(scene, digest="0" * 64), "on a worker, expected 000000000000"),
-        (replace(scene, version="0.0"), "a worker has clsplat "),
-        (replace(scene, model="/nowhere.ply"), "/nowhere.ply: no such file"),
+        (replace(job, digest="0" * 64), "on a worker, expected 000000000000"),
+        (replace(job, version="0.0"), "a worker has clsplat "),
+        (replace(job, model="/nowhere.ply"), "/nowhere.ply: no such file"),
     ]:
         found = farm.render_frame(task, wrong)
         assert isinstance(found, farm.Failure)
         assert found.wrong_input
         assert message in found.message
     with pytest.raises(ValueError, match="no channels"):
-        farm.render_on_farm([task], replace(scene, options=RenderOptions(())), print, workers=1)
+        farm.render_on_farm([task], replace(job, options=RenderOptions(())), print, workers=1)
 
 
 def test_a_frame_whose_workers_are_always_lost(shot: list[str], tmp_path: Path, monkeypatch: Any) -> None:
@@ -247,7 +246,7 @@ def test_a_frame_whose_workers_are_always_lost(shot: list[str], tmp_path: Path, 
     for error, message in ((killed, "frame 7: every worker that took it was lost"), (OSError(), "scheduler was lost")):
         monkeypatch.setattr(distributed, "as_completed", lambda _, error=error: iter([Future(error)]))
         with pytest.raises(farm.ClsplatError, match=message) as caught:
-            list(farm._results(Client(), tasks, scene_of(shot)))
+            list(farm._results(Client(), tasks, job_of(shot)))
         assert not isinstance(caught.value, InputError)
 
 

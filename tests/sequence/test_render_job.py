@@ -22,18 +22,17 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import temporary_name
-from clsplat.frame.draw import Layers
-from clsplat.images.channels import LAYERS
+from clsplat.frame.draw import Planes
+from clsplat.images.channels import CHANNELS
 from clsplat.sequence import existing, workers
 from clsplat.sequence.existing import is_complete
-from clsplat.sequence.frame_renderer import FrameShader, Shaded
-from clsplat.sequence.task import Record, RenderOptions, Task, settings_digest
-from clsplat.sequence.task_list import make_tasks
-from clsplat.sequence.workers import run_tasks, write_frame
+from clsplat.sequence.frame_renderer import FrameRenderer, RenderedFrame
+from clsplat.sequence.task import Record, RenderOptions, Task, make_tasks, settings_digest
+from clsplat.sequence.workers import encode_frame, run_tasks
 from clsplat.shots.motion import camera_after, stretches
 from clsplat.shots.shot import Frame, Shot, numbered
 
-EVERYTHING = tuple(LAYERS)
+EVERYTHING = tuple(CHANNELS)
 OPTIONS = RenderOptions(("rgb", "alpha", "depth"), attributes={"clsplat:model": "abc", "Software": "clsplat"})
 
 
@@ -53,14 +52,14 @@ def tasks_in(folder: Path, count: int = 6, channels: tuple[str, ...] = OPTIONS.c
     return make_tasks(shot, shot, str(folder / "a.####.exr"), lambda camera: camera, channels)
 
 
-def layers_of(task: Task, channels: tuple[str, ...] = OPTIONS.channels) -> Layers:
+def planes_of(task: Task, channels: tuple[str, ...] = OPTIONS.channels) -> Planes:
     rng = np.random.default_rng(task.number)
     size = (task.camera.height, task.camera.width)
-    return {name: rng.uniform(0, 1, (*size, len(LAYERS[name].names))).astype(np.float32) for name in channels}
+    return {name: rng.uniform(0, 1, (*size, len(CHANNELS[name].names))).astype(np.float32) for name in channels}
 
 
-def shader(task: Task) -> Shaded:
-    return Shaded(layers_of(task), 0.5)
+def rendered(task: Task) -> RenderedFrame:
+    return RenderedFrame(planes_of(task), 0.5)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -148,17 +147,17 @@ class FakeRenderer:
     def render_channels(self, gaussians: object, camera: Camera, wanted: Any, **how: Any) -> Any:
         self.asked.append((wanted, how))
         size = (camera.height, camera.width)
-        plain = {
+        planes = {
             name: np.full(size, value) for value, name in enumerate(("depth", "median", "first", "count", "index"))
         }
         fields = {"normal": np.full((*size, 3), 7.0), "position": np.full((*size, 3), 8.0)}
         fields["motion"] = np.broadcast_to(np.float32([2, 3]), (*size, 2))
-        found = type("Channels", (), {**plain, "fields": {name: fields[name] for name in wanted}})
-        return self.render(gaussians, camera, None), found
+        planes |= {name: fields[name] for name in wanted if name in fields}
+        return self.render(gaussians, camera, None), planes
 
 
-def shade(renderer: Any, task: Task, options: RenderOptions) -> Layers:
-    made = FrameShader(renderer, None, options)(task).layers  # type: ignore[arg-type]
+def shade(renderer: Any, task: Task, options: RenderOptions) -> Planes:
+    made = FrameRenderer(renderer, None, options)(task).planes  # type: ignore[arg-type]
     assert made is not None
     return made
 
@@ -173,7 +172,7 @@ def test_shade_takes_each_channel_from_its_place(tmp_path: Path) -> None:
         assert (made[name] == value).all(), name
     assert (made["motion"] == [2, -3]).all()  # y is down in docs/channels.md, v is up in a file
     wanted, how = renderer.asked[0]
-    assert set(wanted) == {"normal", "position", "motion"}
+    assert set(wanted) == {"depth", "normal", "position", "motion"}
     assert task.after is not None
     assert (how["after"].width, how["after"].translation is task.after.translation) == (task.after.width, True)
     renderer.asked.clear()
@@ -188,10 +187,10 @@ def test_the_loop_writes_every_frame_once(tmp_path: Path) -> None:
     tasks, done = tasks_in(tmp_path, 20), []
     threads = set()
 
-    def noting(task: Task) -> Shaded:
+    def noting(task: Task) -> RenderedFrame:
         threads.add(threading.current_thread())
         time.sleep(0.005)
-        return shader(task)
+        return rendered(task)
 
     def on_done(record: Record) -> None:
         assert Path(record.path).is_file()
@@ -204,7 +203,7 @@ def test_the_loop_writes_every_frame_once(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"a.{index:04d}.exr" for index in range(1, 21)]
     alone = tmp_path / "alone"
     alone.mkdir()
-    run_tasks(tasks_in(alone, 20), [shader], OPTIONS, lambda record: None)
+    run_tasks(tasks_in(alone, 20), [rendered], OPTIONS, lambda record: None)
     assert contents(alone) == contents(tmp_path)
     source = oiio.ImageInput.open(done[0].path)
     assert source.spec().getattribute("clsplat:frame") == done[0].frame
@@ -218,22 +217,22 @@ def test_frames_that_wait_are_bounded(tmp_path: Path, monkeypatch: pytest.Monkey
     assert held <= writers + 2
     waiting, most, lock = 0, 0, threading.Lock()
 
-    def counting(task: Task) -> Shaded:
+    def counting(task: Task) -> RenderedFrame:
         nonlocal waiting, most
         with lock:
             waiting += 1
             most = max(most, waiting)
-        return shader(task)
+        return rendered(task)
 
-    def slow(task: Task, *rest: Any) -> Record:
+    def slow(task: Task, *rest: Any) -> Any:
         nonlocal waiting
         time.sleep(0.01)
-        record = write_frame(task, *rest)
+        record = encode_frame(task, *rest)
         with lock:
             waiting -= 1
         return record
 
-    monkeypatch.setattr(workers, "write_frame", slow)
+    monkeypatch.setattr(workers, "encode_frame", slow)
     run_tasks(tasks, [counting], OPTIONS, lambda record: None)
     assert 1 < most <= held
     huge = [replace(task, camera=replace(task.camera, width=40_000, height=20_000)) for task in tasks]
@@ -245,22 +244,22 @@ def test_trouble_ends_the_job(where: str, tmp_path: Path, monkeypatch: pytest.Mo
     tasks, shaded = tasks_in(tmp_path, 30), []
     error = ClsplatError("disk full")
 
-    def failing(task: Task) -> Shaded:
+    def failing(task: Task) -> RenderedFrame:
         shaded.append(task.number)
         if where == "render" and task.number == 5:
             raise error
-        return shader(task)
+        return rendered(task)
 
-    def broken(task: Task, *rest: Any) -> Record:
+    def broken(task: Task, *rest: Any) -> Any:
         if where == "write" and task.number == 5:
             raise error
-        return write_frame(task, *rest)
+        return encode_frame(task, *rest)
 
     def on_done(record: Record) -> None:
         if where == "report":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(workers, "write_frame", broken)
+    monkeypatch.setattr(workers, "encode_frame", broken)
     before = threading.active_count()
     with pytest.raises(KeyboardInterrupt if where == "report" else ClsplatError):
         run_tasks(tasks, [failing], OPTIONS, on_done)
@@ -273,7 +272,7 @@ def test_trouble_ends_the_job(where: str, tmp_path: Path, monkeypatch: pytest.Mo
 def written(tmp_path: Path, extension: str, options: RenderOptions) -> Task:
     (task,) = tasks_in(tmp_path, 1)
     task = replace(task, path=tmp_path / f"a.{extension}")
-    write_frame(task, Shaded(layers_of(task, options.channels), 0.0), options)
+    encode_frame(task, RenderedFrame(planes_of(task, options.channels), 0.0), options)
     return task
 
 

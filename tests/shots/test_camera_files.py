@@ -244,7 +244,7 @@ def test_lenses_of_own_format(tmp_path: Path) -> None:
         ({"keys": [key(frame=None, seconds=1)]}, "key 0: 'seconds' without 'fps' in the file"),
         ({"keys": [key(frame="1")]}, "key 0: 'frame' is '1', expected a number"),
         ({"keys": [key(), key(), key(frame=3)]}, "has two keys at frame 1, expected one"),
-        ({"keys": [key(frame=1.25), key(frame=1.75)]}, "has no whole frame between its keys at 1.25 and 1.75"),
+        ({"keys": [key(frame=1.25), key(frame=1.75)]}, "has no whole frame from 1.25 to 1.75"),
         ({"keys": [key(), key(frame=1e9)]}, "has the frames 1 to 1e+09, expected at most 100,000"),
         ({"loop_frames": 4}, "'loop_frames' is 4, expected more than the 4 that the keys span"),
         ({"keys": [key(position=None)]}, "key 0: has no 'position', expected a list of 3 numbers"),
@@ -304,12 +304,12 @@ def test_files_and_folders_that_are_missing(tmp_path: Path) -> None:
 
 def test_only_some_frames(tmp_path: Path) -> None:
     path = write(tmp_path / "camera_path.json", camera_path(10))
-    assert [frame.number for frame in choose_shot(path, frames="7,2-9:3").frames] == [2, 5, 7, 8]
-    shot = choose_shot(path, frames="9-12")
+    assert [frame.number for frame in choose_shot(path).only("7,2-9:3").frames] == [2, 5, 7, 8]
+    shot = choose_shot(path).only("9-12")
     assert [frame.number for frame in shot.frames] == [9, 10]
     assert shot.warnings == ("--frames 9-12: 2 of these frames do not exist; there are the frames 1-10",)
     with pytest.raises(InputError, match=r"--frames 11-20: holds none of the frames to render, .* the frames 1-10"):
-        choose_shot(path, frames="11-20")
+        choose_shot(path).only("11-20")
 
 
 def test_paths_made_of_cameras(tmp_path: Path) -> None:

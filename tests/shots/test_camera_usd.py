@@ -116,7 +116,7 @@ def test_what_is_authored_and_not_applied_is_one_warning(stage: Path) -> None:
 )
 def test_the_rate_of_the_stage(stage: Path, authored: str, rate: float) -> None:
     stage.write_text(STAGE.replace("timeCodesPerSecond = 24", authored))
-    shot = choose_shot(stage, size=(90, 60), frames="1001-1003")
+    shot = choose_shot(stage, size=(90, 60)).only("1001-1003")
     assert shot.fps == rate
     assert shot.frames[2].time == pytest.approx(2 / rate)
     assert choose_shot(stage, size=(90, 60), path="spiral").fps is None, "a path of its own has no rate"
@@ -186,8 +186,12 @@ def test_one_camera_of_several(stage: Path) -> None:
         ("(0.5, 500)", "(0, 500)", "/rig/shot at 1001: clippingRange 0 to 500, expected 0 < near < far"),
         ("1001: 35,", "1001: 0,", "/rig/shot at 1001: focalLength is 0, expected more than 0"),
         ("1001: 35,", "1001: nan,", "/rig/shot at 1001: focalLength is nan, expected a number"),
-        ("endTimeCode = 1005", "endTimeCode = 1000.5", "/rig/shot: no whole time code from 1001 to 1000.5"),
-        ("endTimeCode = 1005", "endTimeCode = 1e12", "/rig/shot: time codes 1001 to 1e+12, expected at most 100,000"),
+        ("endTimeCode = 1005", "endTimeCode = 1000.5", "/rig/shot: has no whole time code from 1001 to 1000.5"),
+        (
+            "endTimeCode = 1005",
+            "endTimeCode = 1e12",
+            "/rig/shot: has the time codes 1001 to 1e+12, expected at most 100,000",
+        ),
     ],
 )
 def test_stages_that_cannot_be(stage: Path, old: str, new: str, message: str) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clsplat.errors import InputError
-from clsplat.shots.frame_numbers import Pattern, output_paths, parse_frames, ranges
+from clsplat.shots.frame_numbers import output_paths, parse_frames, path_of, ranges
 
 
 @pytest.mark.parametrize(
@@ -83,12 +83,12 @@ def test_ranges_are_read_again(frames: set[int]) -> None:
     ],
 )
 def test_patterns(pattern: str, path: str) -> None:
-    assert Pattern(pattern).path(42, "cam#1/%04d.v2.jpg") == Path(path)
+    assert path_of(pattern, 42, "cam#1/%04d.v2.jpg") == Path(path)
 
 
 def test_more_digits_than_the_pattern_has_and_negative_ones() -> None:
-    assert Pattern("a.###.exr").path(12345, "x") == Path("a.12345.exr")
-    assert Pattern("a.####.exr").path(-5, "x") == Path("a.-005.exr")
+    assert path_of("a.###.exr", 12345, "x") == Path("a.12345.exr")
+    assert path_of("a.####.exr", -5, "x") == Path("a.-005.exr")
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_fields_that_are_not_known(pattern: str) -> None:
 
 
 def test_what_is_no_field() -> None:
-    assert Pattern("{8f-2c}/100%/50%.png").path(1, "a") == Path("{8f-2c}/100%/50%.png")
+    assert path_of("{8f-2c}/100%/50%.png", 1, "a") == Path("{8f-2c}/100%/50%.png")
 
 
 def test_every_frame_has_a_file_of_its_own() -> None:

@@ -19,7 +19,7 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images import channels as layers
 from clsplat.runs.run import Run
-from clsplat.sequence.frame_renderer import FrameShader
+from clsplat.sequence.frame_renderer import FrameRenderer
 from clsplat.sequence.task import RenderOptions
 from clsplat.shots import read
 
@@ -59,7 +59,7 @@ class Pipeline:
     def main(self, arguments: list[str]) -> int:
         return command_line.main(arguments, self.services)
 
-    def write_layers(self, path: Path, made: dict[str, np.ndarray], *_: object) -> None:
+    def write_channels(self, path: Path, made: dict[str, np.ndarray], *_: object) -> None:
         """In place of the real one."""
         planes = [plane if plane.ndim == 3 else plane[:, :, None] for plane in made.values()]
         self.written[str(path)] = np.concatenate(planes, axis=2)
@@ -149,13 +149,13 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             raise DeviceError("--device nosuch: no such device")
         return FakeDevice()
 
-    def open_shader(
+    def open_frame_renderer(
         gaussians: Gaussians, options: RenderOptions, rasterizer: RasterizerConfig, *, device: str | None, **_: Any
-    ) -> FrameShader:
-        return FrameShader(Renderer(open_device(device), rasterizer), gaussians, options)
+    ) -> FrameRenderer:
+        return FrameRenderer(Renderer(open_device(device), rasterizer), gaussians, options)
 
     monkeypatch.setattr(read, "read_cameras", lambda _: pipe.cameras)
-    monkeypatch.setattr(layers, "write_layers", pipe.write_layers)
+    monkeypatch.setattr(layers, "write_channels", pipe.write_channels)
     pipe.services = replace(
         pipe.services,
         load_scene=load_scene,
@@ -163,7 +163,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         require=lambda device, *_: device,
         train=train,
         renderer=Renderer,
-        open_shader=open_shader,
+        open_frame_renderer=open_frame_renderer,
     )
     return pipe
 

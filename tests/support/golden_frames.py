@@ -19,7 +19,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
-from clsplat.sequence.frame_renderer import FrameShader
+from clsplat.sequence.frame_renderer import FrameRenderer
 from clsplat.sequence.task import RenderOptions, Task
 
 Array = NDArray[np.float32]
@@ -75,8 +75,8 @@ def pictures_of(device: Device) -> dict[str, dict[str, str]]:
         view = camera if focal is None else replace(camera, fx=focal, fy=focal, projection=kind)  # type: ignore[arg-type]
         after = replace(view, translation=view.translation + np.array([-0.0625, 0.03125, 0.125]))
         renderer = Renderer(device)
-        shader = FrameShader(renderer, gaussians, RenderOptions(channels=CHANNELS[:-1]))
-        layers = shader(Task(1, "1", view, Path(), after)).layers
+        render_frame = FrameRenderer(renderer, gaussians, RenderOptions(channels=CHANNELS[:-1]))
+        layers = render_frame(Task(1, "1", view, Path(), after)).planes
         layers["deep"] = renderer.render_deep(gaussians, view, BOUNDS)
         found[kind] = {name: checksum([np.ascontiguousarray(values)]) for name, values in layers.items()}
     return found

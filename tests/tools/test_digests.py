@@ -16,7 +16,7 @@ from pipeline import shaped
 from quick import quick
 
 from clsplat.device.context import Device
-from clsplat.images.channels import LAYERS
+from clsplat.images.channels import CHANNELS
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ROOT / "tools"
@@ -83,7 +83,7 @@ def test_a_child(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     told = json.loads(done.stdout.splitlines()[-1])
     assert set(told) == {"frame", "gradient", "pictures"}
-    channels = {"deep", *LAYERS}
+    channels = {"deep", *CHANNELS}
     kinds = ("perspective", "orthographic", "equirectangular", "fisheye")
     assert {kind: set(each) for kind, each in told["pictures"].items()} == dict.fromkeys(kinds, channels)
     assert (tmp_path / "arrays.npz").exists()

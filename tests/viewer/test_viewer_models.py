@@ -40,8 +40,8 @@ def test_every_mode_is_the_renderers(default_device: Device) -> None:
     wanted = {
         "colour": (colour_picture(frame.image), ""),
         "alpha": (alpha_picture(frame.alpha), ""),
-        "depth": depth_picture(channels.depth, frame.alpha),
-        "count": count_picture(channels.count),
+        "depth": depth_picture(channels["depth"], frame.alpha),
+        "count": count_picture(channels["count"]),
     }
     for mode, (image, text) in wanted.items():
         got, said = model.picture(CAMERA, Look(mode), exact=True)  # type: ignore[arg-type]
