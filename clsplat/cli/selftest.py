@@ -8,8 +8,8 @@ import sys
 from dataclasses import asdict
 
 from clsplat.cli.main import Selftest
-from clsplat.device.advice import no_device
 from clsplat.device.context import DeviceInfo, find_device, list_devices
+from clsplat.device.quirks import no_device
 from clsplat.selftest.result import Result
 from clsplat.selftest.trust import Report, examine_device
 

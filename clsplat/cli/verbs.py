@@ -59,8 +59,8 @@ def run(verb: Verb) -> int:
 
 def devices(verb: Devices) -> int:
     """Print the table of devices."""
-    from clsplat.device.advice import no_device
     from clsplat.device.context import find_device, list_devices
+    from clsplat.device.quirks import no_device
 
     found = list_devices() if verb.device is None else [find_device(verb.device)]
     if not found:

@@ -14,7 +14,7 @@ import pyopencl as cl
 
 from clsplat.device import known
 from clsplat.device.child import regardless
-from clsplat.device.quirks import is_rusticl, kind_of, pocl_version
+from clsplat.device.quirks import kind_of, most_lanes
 from clsplat.errors import DeviceError, reason_of
 from clsplat.files import atomic_write, parse_json
 
@@ -56,12 +56,8 @@ def default_shape(device: cl.Device) -> Shape:
     if kind_of(device) != "cpu":
         items = next((n for n in (256, 128, 64, 32, 16) if n <= most_items(device)), 1)
         return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
-    lanes = 16 if device.native_vector_width_float >= 16 else 8
-    if pocl_version(device) == (3, 0):
-        lanes = 8  # its compiler aborts on some float16 built-ins
-    if is_rusticl(device):  # with vectors llvmpipe does not come back from the larger kernels
-        return Shape(lanes=1, items=64, chunks=4 * device.max_compute_units)
-    return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units)
+    lanes = min(16 if device.native_vector_width_float >= 16 else 8, most_lanes(device))
+    return Shape(lanes=lanes, items=1 if lanes > 1 else 64, chunks=4 * device.max_compute_units)
 
 
 def most_items(device: cl.Device) -> int:
