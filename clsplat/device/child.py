@@ -85,16 +85,16 @@ def ending_at_once() -> Iterator[None]:
             before[number](number, frame)
         raise TrialInterrupted(number)
 
-    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, *endings())}
-    before = {int(each): handler for each, handler in handlers.items() if callable(handler)}
-    for each in before:
-        signal.signal(each, interrupt)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *endings())}
+    before = {int(number): handler for number, handler in handlers.items() if callable(handler)}
+    for number in before:
+        signal.signal(number, interrupt)
     try:
         yield
     finally:
-        for each, handler in before.items():
-            if signal.getsignal(each) is interrupt:  # a handler may have put another one in its own place
-                signal.signal(each, handler)
+        for number, handler in before.items():
+            if signal.getsignal(number) is interrupt:  # a handler may have put another one in its own place
+                signal.signal(number, handler)
 
 
 _alive: weakref.WeakSet[Child] = weakref.WeakSet()

@@ -80,7 +80,7 @@ def _first(
             kernel.name,
             f"has {prod(local)} items in a group, where the driver allows it {most}",
         )
-    typed = [value if of is None else np.dtype(of).type(value) for of, value in zip(types, values, strict=True)]
+    typed = [value if kind is None else np.dtype(kind).type(value) for kind, value in zip(types, values, strict=True)]
     device.rehearsal.launch(kernel, size, local, typed, form)
     kernel.cl_kernel.set_scalar_arg_dtypes(types)
     kernel.tried.add(form)
