@@ -75,7 +75,6 @@ def bench(
             frame.projected.splats,
             frame.background,
             subject.camera,
-            band,
         )
         contributing, evaluated = contributing + added, evaluated + looked_at
     in_frame = _measure(device, draw, repeat)

@@ -33,7 +33,7 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
     corner of the display window, (1, 1) the lower right one; z, of which OpenEXR says nothing, is 0 at the near plane
     and 1 at infinity, or of an orthographic camera at its far plane; if that has none, 1 more a world unit.
     """
-    if camera.projection not in ("perspective", "orthographic"):
+    if not camera.kind.flat:
         return {}
     to_camera = np.eye(4)
     flip = np.diag([1.0, -1.0, 1.0])

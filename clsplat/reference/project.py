@@ -188,13 +188,6 @@ def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
     return np.stack([result[:, 0, 0], result[:, 0, 1], result[:, 1, 1]], axis=1)
 
 
-def conic_grad(covariances: Float64, d_covariances: Float64) -> Float64:
-    """The way back from `covariance_grad`: dL/d(a, b, c) from dL/dSigma, both (N, 3)."""
-    as_numbers = np.array([1.0, 2.0, 1.0])  # the off-diagonal entry stands twice
-    d_conics: Float64 = covariance_grad(covariances, d_covariances * as_numbers) * as_numbers
-    return d_conics
-
-
 def _quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
     """Eqs. (34), (35): raw quaternions (N, 4), dL/dR (N, 3, 3) -> dL/dq (N, 4), orthogonal to q."""
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def largest_contributions(
     """
     config = config or RasterizerConfig()
     for camera in cameras:
-        if camera.projection not in ("perspective", "orthographic"):
+        if not camera.kind.flat:
             raise InputError(
                 f"contributions to {camera.projection} cameras are not known, expected perspective or orthographic ones"
             )
@@ -47,21 +47,17 @@ def largest_contributions(
     background = allocate(device, (3,), np.float32)
     background.fill(0.0)
     largest = np.zeros(len(gaussians), np.float32)
-    for camera in _from_origin(cameras, gaussians):
-        frame = rasterizer.forward(model, camera, background)
+    for camera in cameras:
+        frame = rasterizer.forward(model, gaussians.local(camera), background)
         image_gradient = rasterizer.work.array("image_gradient", frame.blended.image.shape)
         image_gradient.fill(0.0)
         slots = rasterizer.pair_gradients(frame, image_gradient, fields=FIELDS, contributions_alone=True)
         for start, stop, (part,) in parts(rasterizer.work, model):
             projected = frame.projected.rows(start, stop)
-            of = (frame, projected, slots.rows(start, stop), gradients)
-            screen = rasterizer.row_gradients(part, *of, fields=FIELDS)
+            rows = slots.rows(start, stop)
+            screen = rasterizer.row_gradients(part, frame, projected, rows, gradients, fields=FIELDS)
             assert screen.contributions is not None
             seen = projected.tile_counts.get() > 0
-            found = np.where(seen, screen.contributions.get()[: stop - start], 0)
-            largest[start:stop] = np.fmax(largest[start:stop], found)
+            contributions = np.where(seen, screen.contributions.get()[: stop - start], 0)
+            largest[start:stop] = np.fmax(largest[start:stop], contributions)
     return largest
-
-
-def _from_origin(cameras: Iterable[Camera], gaussians: Gaussians) -> Iterable[Camera]:
-    return (gaussians.local(camera) for camera in cameras)

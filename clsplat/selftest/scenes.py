@@ -53,10 +53,6 @@ class Frozen:
     background: Float32
     photograph: Float32
 
-    def image_gradient(self) -> Float32:
-        """(3, rows, stride), zero in the padding."""
-        return padded(self.camera, 31, -0.5, 0.5)
-
 
 def padded(camera: Camera, seed: int, low: float, high: float) -> Float32:
     """Planes (3, rows, stride) of noise in the image and zeros beside it."""

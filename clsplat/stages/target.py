@@ -14,6 +14,9 @@ from clsplat.device.launch import launch_grid
 from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
 
+PIXEL_BYTES = 12 + 16
+"""Bytes of each pixel with its padding: three planes, and the photograph, at most RGBA in floats."""
+
 
 @stage("target")
 def target(device: Device, work: Workspace, image: NDArray[Any], background: DeviceArray) -> DeviceArray:
@@ -24,17 +27,6 @@ def target(device: Device, work: Workspace, image: NDArray[Any], background: Dev
     source.set(image)
     planes = work.array("target", (3, rows, stride))
     kernels = device.kernels("target", **({"BYTES": True} if image.dtype == np.uint8 else {}))
-    launch_grid(
-        device,
-        kernels.target,
-        (stride, rows),
-        width,
-        height,
-        channels,
-        stride,
-        rows * stride,
-        source,
-        background,
-        planes,
-    )
+    sizes = (width, height, channels, stride, rows * stride)
+    launch_grid(device, kernels.target, (stride, rows), *sizes, source, background, planes)
     return planes

@@ -28,14 +28,14 @@ from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
-from clsplat.device.layout import SPLAT, SlotFields
+from clsplat.device.layout import REFUSED, SPLAT, SlotFields
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import atomic_writer, parse_json
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.runs.checkpoints import read_arrays
 from clsplat.runs.settings import config_text, parse_config
-from clsplat.stages.adam import REFUSED, adam
+from clsplat.stages.adam import adam
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.loss import loss
 from clsplat.stages.target import target
@@ -189,8 +189,8 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     result["project_grad"] = _wrong(gradients)
     step, rates = bundle.record["step"], bundle.record["rates"]
     moved = (parameters, gradients, first, second)
-    adam(device, step, rates, config.optimiser, *moved, frame.projected.tile_counts, rasterizer.found)
-    result["adam"] = int(rasterizer.found.get()[-len(REFUSED) :].sum())
+    adam(device, step, rates, config.optimiser, *moved, frame.projected.tile_counts, rasterizer.readback)
+    result["adam"] = int(rasterizer.readback.get()[-len(REFUSED) :].sum())
     return result
 
 

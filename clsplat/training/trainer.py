@@ -93,7 +93,7 @@ class Trainer:
         )
         self.background = allocate(device, (3,), np.float32)
         self.given = initial
-        self.watch = Watch(self.rasterizer.found, [view.name for view in self.views])
+        self.watch = Watch(self.rasterizer.readback, [view.name for view in self.views])
         self._start()
 
     def _start(self) -> None:
@@ -216,7 +216,7 @@ class Trainer:
                 sh_rest=updates_sh_rest(config.optimiser, self.step),
             )
             moved = (parameters, self.gradients, first, second)
-            counted = (projected.tile_counts, self.rasterizer.found)
+            counted = (projected.tile_counts, self.rasterizer.readback)
             self._try_second_half(view, camera, projected, screen, moved)
             self._mark = None
             self._add_statistics(self.statistics.rows(start, stop), view, camera, projected, screen)
@@ -256,7 +256,9 @@ class Trainer:
             self._add_statistics(
                 self.statistics.rows(0, projected.tile_counts.shape[0]), view, camera, projected, screen
             )
-            adam(self.device, self.step, self.rates(), settings, *moved, projected.tile_counts, self.rasterizer.found)
+            adam(
+                self.device, self.step, self.rates(), settings, *moved, projected.tile_counts, self.rasterizer.readback
+            )
         self._second_halves.add(key)
 
     def _add_statistics(
