@@ -56,11 +56,11 @@ class _Process:
                 raise
             if ending:
                 self._end()
-                return answer, ending, crashed
-            self._timer = threading.Timer(IDLE, self.close)
-            self._timer.daemon = True
-            self._timer.start()
-            return answer, "", False
+            else:
+                self._timer = threading.Timer(IDLE, self.close)
+                self._timer.daemon = True
+                self._timer.start()
+            return answer, ending, crashed
 
     def _asked(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
         if self._child is None:

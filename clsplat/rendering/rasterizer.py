@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The forward pass and its gradient, each on one screen, and the renderer that callers use."""
+"""The forward pass and its gradient, each on one screen."""
 
 from __future__ import annotations
 
@@ -78,7 +78,8 @@ class Rasterizer:
         switches = {**device.switches, **kernel_defines(self.config)}
         self.device = device.with_switches(switches)
         self._by_projection = {
-            name: device.with_switches({**switches, **kind.defines}) for name, kind in PROJECTIONS.items()
+            name: device.with_switches({**switches, **kind.defines}) if kind.defines else self.device
+            for name, kind in PROJECTIONS.items()
         }
         self.work = work or Workspace(device)
         self.readback = allocate(device, (len(READBACK),), np.uint32)
@@ -98,7 +99,7 @@ class Rasterizer:
     ) -> Frame:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
-        backward: whether the gradient will be asked for; what only that needs is left out else.
+        backward: True if the gradient will be asked for. Without it, what only that needs is left out.
         """
         device, work = self.device_of(camera), self.work
         camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
@@ -123,8 +124,8 @@ class Rasterizer:
         return self._part(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
     def by_band(self, frame: Frame, work_on: Callable[[Part], R]) -> list[R]:
-        """The results of each of the frame's bands in turn. Its part is let go of before the next one is made, whose
-        arrays may be larger."""
+        """What `work_on` gives for each of the frame's bands in turn. No part is kept: its arrays may have to make room
+        for larger ones of the next."""
         return [work_on(self.part(frame, band)) for band in frame.bands]
 
     def channels(self, gaussians: AnyGaussians, frame: Frame, wanted: Features, after: DeviceArray) -> Channels:

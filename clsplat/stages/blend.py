@@ -15,6 +15,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 from clsplat.device.layout import PLAIN_SLOTS, TILE, SlotFields
 from clsplat.device.profile import stage
+from clsplat.stages.device_camera import padded_size
 from clsplat.stages.ranges import TileLists
 
 PIXEL_BYTES = 20
@@ -41,7 +42,7 @@ class Blended:
 
 def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
     """Image, transmittance and stops of a frame: the workspace's, whoever asks; kept: as the last one left them."""
-    rows, stride = -(-height // TILE) * TILE, -(-width // TILE) * TILE
+    rows, stride = padded_size(width, height)
     return (
         work.array("image", (3, rows, stride), kept=kept),
         work.array("transmittance", (rows, stride), kept=kept),
@@ -141,22 +142,9 @@ def blend_grad(
     if pairs == 0:
         return slots
     cells = blended.cells_from_sorted
-    launch_tiles(
-        device,
-        "blend_grad",
-        {**fields.defines, **({"RECORD_CELLS": True} if cells else {})},
-        lists,
-        stride // TILE,
-        rows,
-        lists.ranges,
-        lists.gaussian_from_sorted,
-        lists.slot_from_sorted,
-        splats,
-        background,
-        image_gradient,
-        blended.transmittance,
-        blended.stops,
-        slots,
-        *([cells] if cells else []),
-    )
+    defines = {**fields.defines, **({"RECORD_CELLS": True} if cells else {})}
+    listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
+    planes = (image_gradient, blended.transmittance, blended.stops)
+    arrays = (*listed, splats, background, *planes, slots, *([cells] if cells else []))
+    launch_tiles(device, "blend_grad", defines, lists, stride // TILE, rows, *arrays)
     return slots

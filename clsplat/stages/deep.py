@@ -30,20 +30,7 @@ def deep(
     plane_rows, stride = blended.stops.shape
     bins = bounds.shape[0]
     planes = work.array("deep", (bins, DEEP_FLOATS, plane_rows, stride))
-    launch_tiles(
-        device,
-        "deep",
-        {"DEEP_SIZE": DEEP_FLOATS},
-        lists,
-        stride // TILE,
-        height,
-        bins,
-        bounds,
-        lists.ranges,
-        lists.gaussian_from_sorted,
-        splats,
-        blended.stops,
-        planes,
-        *([camera_array] if device.switched("RAYS") else []),
-    )
+    arrays = (bounds, lists.ranges, lists.gaussian_from_sorted, splats, blended.stops, planes)
+    rays = (camera_array,) if device.switched("RAYS") else ()
+    launch_tiles(device, "deep", {"DEEP_SIZE": DEEP_FLOATS}, lists, stride // TILE, height, bins, *arrays, *rays)
     return planes

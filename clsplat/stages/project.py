@@ -117,16 +117,8 @@ def add_slots(
     if sums is None:
         sums = work.array("slot_sums", (n, slots.values.shape[1]))
         sums.fill(0.0)
-    launch_items(
-        device,
-        device.kernels("project_grad", **fields.defines).add_slots,
-        n if slots.values.shape[0] else 0,
-        n,
-        tile_counts,
-        slots.first_slots,
-        slots.values,
-        sums,
-    )
+    kernel, items = device.kernels("project_grad", **fields.defines).add_slots, n if slots.values.shape[0] else 0
+    launch_items(device, kernel, items, n, tile_counts, slots.first_slots, slots.values, sums)
     return sums
 
 
@@ -148,6 +140,7 @@ def project_grad(
     wanted = {"ADDED_UP": slots.first_slots is None, "NO_SH_REST": not sh_rest and gaussians.coefficients > 1}
     defines = {**fields.defines, **{name: True for name, needed in wanted.items() if needed}}
     n = gaussians.count
+    first_slots = slots.first_slots or projected.tile_counts  # not looked at where they are added up
     launch_items(
         device,
         device.kernels("project_grad", **defines).project_grad,
@@ -156,11 +149,10 @@ def project_grad(
         gaussians.coefficients,
         camera_array,
         projected.tile_counts,
-        slots.first_slots or projected.tile_counts,  # not looked at where they are added up
+        first_slots,
         slots.values,
         projected.splats,
-        *(gaussians[group] for group in GROUPS),
-        *(gradients[group] for group in GROUPS),
+        *(model[group] for model in (gaussians, gradients) for group in GROUPS),
         screen.gradients,
         *([screen.contributions] if fields.contributions else []),
     )

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
-from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
+from clsplat.stages.device_camera import padded_size
 
 PIXEL_BYTES = 12 + 16
 """Bytes of each pixel with its padding: three planes, and the photograph, at most RGBA in floats."""
@@ -22,7 +22,7 @@ PIXEL_BYTES = 12 + 16
 def target(device: Device, work: Workspace, image: NDArray[Any], background: DeviceArray) -> DeviceArray:
     """image (H, W, 3 or 4), uint8 or float32, straight alpha -> planes (3, rows, stride) over the background."""
     height, width, channels = image.shape
-    rows, stride = -(-height // TILE) * TILE, -(-width // TILE) * TILE
+    rows, stride = padded_size(width, height)
     source = work.array("target_source", image.shape, image.dtype)
     source.set(image)
     planes = work.array("target", (3, rows, stride))
