@@ -25,7 +25,7 @@ static inline floatL change(floatL g, float rate, float root, float beta1, float
   return rate * *m / fmaL(sqrt(*v), (floatL)(root), (floatL)(epsilon));
 }
 
-// Whether new values may be stored. A second moment is a square as well, so that the sum is one test of both.
+// True if new values may be stored. A second moment is a square as well, so that the sum is one test of both.
 #ifdef UNGUARDED
 #define WELL(parameter, second) ((intL)(-1))
 #else
@@ -46,7 +46,7 @@ static inline void refuse(size_t i, float limit2, float p, float g, float m, flo
                                      : READBACK_REFUSED_STEPS));
 }
 
-// One element, as `change` has it.
+// The step of one element, by `change`.
 static inline void step_element(size_t i, float rate, float root, float beta1, float beta2, float epsilon, float limit2,
                                 __global uint *readback, __global float *parameters, __global float *gradients,
                                 __global float *first, __global float *second) {

@@ -101,7 +101,7 @@ _alive: weakref.WeakSet[Child] = weakref.WeakSet()
 
 
 def abandon() -> None:
-    """End all of them at once, whoever waits for one: that raises TrialInterrupted."""
+    """End all of them at once. A thread that waits for one gets TrialInterrupted."""
     for child in list(_alive):
         child.abandon()
 

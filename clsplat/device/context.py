@@ -139,20 +139,15 @@ class Device:
         return device
 
     def with_switches(self, switches: Mapping[str, object]) -> Device:
-        """The same device, queue and cache of kernels, with these defines for the kernels whose text names them."""
+        """The same device, queue and cache of kernels, adding these defines for kernels whose text names them."""
         device = copy(self)
-        device._switches = switches  # noqa: SLF001  # a copy of our own class
+        device._switches = {**self._switches, **switches}  # noqa: SLF001  # a copy of our own class
         return device
 
     @property
     def is_another(self) -> bool:
         """True if this shape was taken because the driver had failed in the one that is wanted."""
         return bool(self._why_another)
-
-    @property
-    def switches(self) -> Mapping[str, object]:
-        """The defines that `with_switches` gave it."""
-        return self._switches
 
     def switched(self, *names: str) -> bool:
         """True if kernels are built with any of these switches."""

@@ -28,7 +28,7 @@ BY_FEATURES = (
 )
 """LLVM's names from the most to the least that a processor can have, by features as Linux calls them."""
 LIMIT = 2048
-"""Bytes of PoCL's record of a device in which the name is looked for; PoCL 3.0 has it at 640."""
+"""Bytes of PoCL's record of a device in which the name is looked for; in PoCL 3.0 it is at 640."""
 _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
 """Texts that the devices' records point to, by address of a device."""
 

@@ -117,10 +117,11 @@ def failures(device: cl.Device) -> dict[str, str]:
 def shape_of(device: cl.Device) -> Shape:
     """The shape that a device gets which is opened without another: `wanted_shape`, or the first other one where the
     driver has failed in that before. Raises DeviceError as `wanted_shape`."""
-    wanted = wanted_shape(device)
-    if wanted.label not in failures(device):
+    wanted, failed = wanted_shape(device), failures(device)
+    if wanted.label not in failed:
         return wanted
-    return another_shape(device) or wanted  # with none left it is told when it fails again
+    others = (shape for shape in shapes_in_turn(device) if shape.label not in failed)
+    return next(others, wanted)  # with none left it is told when it fails again
 
 
 def why_another(device: cl.Device, shape: Shape) -> str:
@@ -147,12 +148,6 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
     smaller = [replace(default, lanes=lanes, items=1) for lanes in (4, 1)] if default.items == 1 else []
     smaller += [replace(default, items=items) for items in (128, 64, 32) if items < default.items]
     return [*first, *(shape for shape in smaller if shape not in first)]
-
-
-def another_shape(device: cl.Device) -> Shape | None:
-    """The first shape in which the driver has not failed, if there is one."""
-    failed = failures(device)
-    return next((shape for shape in shapes_in_turn(device) if shape.label not in failed), None)
 
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:

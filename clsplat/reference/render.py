@@ -13,7 +13,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.blend import Blended, blend, blend_grad
-from clsplat.reference.project import Projected, project, project_grad
+from clsplat.reference.project import Projected, covariance_grad, project, project_grad
 from clsplat.reference.sort import depth_order
 
 BLACK = (0.0, 0.0, 0.0)
@@ -89,8 +89,9 @@ def render_grad(
         **arrays,
         camera=camera,
         sh_degree=degree,
+        projected=projected,
         d_means2d=screen.means2d,
-        d_conics=screen.conics,
+        d_covariances=covariance_grad(projected.conics, screen.conics),
         d_opacities=screen.opacities,
         d_colors=screen.colors,
     )

@@ -75,10 +75,9 @@ class Rasterizer:
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
-        switches = {**device.switches, **kernel_defines(self.config)}
-        self.device = device.with_switches(switches)
+        self.device = device.with_switches(kernel_defines(self.config))
         self._by_projection = {
-            name: device.with_switches({**switches, **kind.defines}) if kind.defines else self.device
+            name: self.device.with_switches(kind.defines) if kind.defines else self.device
             for name, kind in PROJECTIONS.items()
         }
         self.work = work or Workspace(device)
@@ -106,7 +105,7 @@ class Rasterizer:
         camera_array.set(pack)
         projected = project(device, work, gaussians, camera, camera_array)
         counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
-        bands = self._plan(device, projected, counted, tiles_of(camera))
+        bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
         record = backward and len(bands) == 1 and self.config.record_cells
         part = None
         for band in bands:
@@ -140,7 +139,7 @@ class Rasterizer:
         return self.by_band(frame, blended)[-1]
 
     def deep(self, frame: Frame, bounds: DeviceArray) -> DeviceArray:
-        """The frame in slices by depth, as `stages.deep` has them."""
+        """The frame in slices by depth: the array of `stages.deep`."""
         device = self.device_of(frame.camera)
         pixels = (frame.projected.splats, frame.blended, frame.camera.height, frame.camera_array)
         return self.by_band(frame, lambda part: deep(device, self.work, bounds, part.lists, *pixels))[-1]
@@ -148,11 +147,6 @@ class Rasterizer:
     def device_of(self, camera: Camera) -> Device:
         """The device with the switches that the camera's projection wants of the kernels."""
         return self._by_projection[camera.projection]
-
-    def _plan(self, device: Device, projected: Projected, counted: Counted, tiles: tuple[int, int]) -> tuple[Band, ...]:
-        if counted.pairs <= self.capacity:
-            return (Band(0, tiles[0] * tiles[1]),)
-        return plan_bands(device, self.work, projected, tiles, self.capacity)
 
     def _part(
         self,
@@ -192,8 +186,8 @@ class Rasterizer:
         fields: SlotFields = PLAIN_SLOTS,
         sh_rest: bool = True,
     ) -> Screen:
-        """The gradient of projection, for some rows or all: as `backward`, from what blending's gradient is; that of
-        the higher SH bands if asked for."""
+        """The gradient of projection, for some rows or all, from the gradient of blending. sh_rest: with that of the
+        higher SH bands."""
         device, n, work = self.device, gaussians.count, self.work
         contributions = work.array("contributions", (n,)) if fields.contributions else None
         screen = Screen(work.array("screen", (n, 2)), contributions)
@@ -210,8 +204,8 @@ class Rasterizer:
         contributions_alone: bool = False,
     ) -> Slots:
         """The gradient of blending: of every pair, or with several bands their sums by Gaussian. Raises InputError for
-        another projection than perspective, which has none; contributions_alone: nothing but them is taken from it, and
-        an orthographic camera's splats have them too."""
+        a projection that has no gradient. contributions_alone: the caller takes nothing else from the slots; these an
+        orthographic camera has too."""
         camera, device, work = frame.camera, self.device, self.work
         if not (camera.kind.gradient or (contributions_alone and camera.kind.flat)):
             raise InputError(

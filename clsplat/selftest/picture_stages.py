@@ -36,7 +36,7 @@ DOUBT = 1e-5
 """Margin like `harness.MARGIN`, of the light that is left to one half, and of the two largest weights."""
 
 FEW = 500
-"""Gaussians whose picture around the camera the reference has in a second: it has each at every pixel."""
+"""Gaussians whose picture around the camera the reference makes in a second: it looks at each at every pixel."""
 
 
 def _after(camera: Camera) -> Camera:

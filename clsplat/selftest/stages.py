@@ -306,7 +306,7 @@ def _project_grad(bench: Bench) -> Outcome:
     d_covariances = half * np.stack(entries, axis=1)
     model = parameters(bench.frozen.gaussians)
     true = reference_project.project(**model, camera=bench.camera, sh_degree=bench.frozen.gaussians.sh_degree)
-    wanted = reference_project.project_grad_covariances(
+    wanted = reference_project.project_grad(
         **model,
         camera=bench.camera,
         sh_degree=bench.frozen.gaussians.sh_degree,

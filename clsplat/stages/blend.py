@@ -41,7 +41,7 @@ class Blended:
 
 
 def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Image, transmittance and stops of a frame: the workspace's, whoever asks; kept: as the last one left them."""
+    """Image, transmittance and stops of a frame, in the workspace. kept: as the last call left them."""
     rows, stride = padded_size(width, height)
     return (
         work.array("image", (3, rows, stride), kept=kept),
@@ -58,8 +58,8 @@ def tile_items(device: Device) -> int:
 def launch_tiles(
     device: Device, stem: str, defines: Mapping[str, object], lists: TileLists, tiles_x: int, *arguments: Any
 ) -> None:
-    """A group for each of the lists' tiles, of the kernel that is called as its file. Its arguments are the first
-    tile, the tiles in a row of the image, and these."""
+    """Launch the kernel that is named like its file, with a group for each of the lists' tiles. The kernel's arguments
+    are the first tile, the tiles in a row of the image, and `arguments`."""
     items = tile_items(device)
     kernel = getattr(device.kernels(stem, ITEMS=items, **defines), stem)
     launch_groups(device, kernel, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)

@@ -131,8 +131,8 @@ def add_statistics(
     screen: Screen,
     threshold: float = 0.0,
 ) -> None:
-    """Add one view: the norm of each visible mean's gradient, from pixels to NDC, as the paper's threshold wants; where
-    agreeing views are counted, whether that is at least the threshold."""
+    """Add one view: the norm of each visible mean's gradient, in NDC as the paper's threshold is. Where agreeing views
+    are counted, those with at least the threshold count."""
     n = projected.tile_counts.shape[0]
     kernels = device.kernels("density")
     to_ndc = (0.5 * camera.width, 0.5 * camera.height)

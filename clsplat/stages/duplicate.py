@@ -140,9 +140,11 @@ def count_band(
 
 @stage("duplicate")
 def plan_bands(
-    device: Device, work: Workspace, projected: Projected, tiles: tuple[int, int], capacity: int
+    device: Device, work: Workspace, projected: Projected, counted: Counted, tiles: tuple[int, int], capacity: int
 ) -> tuple[Band, ...]:
     """The fewest bands of at most `capacity` pairs each. Raises CapacityError where one tile has more."""
+    if counted.pairs <= capacity:
+        return (Band(0, tiles[0] * tiles[1]),)
     n = projected.tile_counts.shape[0]
     counts = work.array("counts_by_tile", (tiles[0] * tiles[1],), np.uint32)
     counts.fill(0)

@@ -22,7 +22,7 @@ SCREEN_BYTES = 8
 
 
 def gaussian_bytes(*, keeps_culled: bool) -> int:
-    """Bytes of each Gaussian: splat and count of tiles, and whether it is shown where nothing is culled."""
+    """Bytes of each Gaussian: splat and count of tiles; where culling is switched off also `shown`."""
     return 4 * (len(SPLAT) + 1 + keeps_culled)
 
 

@@ -17,7 +17,7 @@ from clsplat.stages.sort import SORT_BYTES, sort
 PAIR_BYTES = SORT_BYTES + 8
 """Bytes of each pair: its sort by tile, and the two lists."""
 TILE_BYTES = 8
-"""Bytes of each tile: its range."""
+"""Bytes of each tile: where its list begins and ends."""
 
 
 @dataclass(frozen=True, eq=False)

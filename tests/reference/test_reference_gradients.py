@@ -66,8 +66,9 @@ class Objective:
             **self.arrays,
             camera=self.camera,
             sh_degree=3,
+            projected=projected,
             d_means2d=screen.means2d,
-            d_conics=screen.conics,
+            d_covariances=covariance_grad(projected.conics, screen.conics),
             d_opacities=screen.opacities,
             d_colors=screen.colors,
         )
