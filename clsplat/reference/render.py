@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.reference.blend import Blended, blend, blend_grad
 from clsplat.reference.project import Projected, covariance_grad, project, project_grad
 from clsplat.reference.sort import depth_order
@@ -42,8 +42,8 @@ class Gradients:
 
 def parameters(gaussians: Gaussians) -> dict[str, Float64]:
     """The five arrays by name, in float64; means in the world."""
-    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-    arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in names}
+    fields = dict.fromkeys(group.field for group in GROUPS.values())
+    arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in fields}
     return {**arrays, "means": arrays["means"] + gaussians.origin}
 
 

@@ -123,7 +123,7 @@ class Rasterizer:
         return self._part(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
     def by_band(self, frame: Frame, work_on: Callable[[Part], R]) -> list[R]:
-        """What `work_on` gives for each of the frame's bands in turn. No part is kept: its arrays may have to make room
+        """Results of `work_on` for each of the frame's bands in turn. No part is kept: its arrays may have to make room
         for larger ones of the next."""
         return [work_on(self.part(frame, band)) for band in frame.bands]
 

@@ -316,10 +316,11 @@ def _project_grad(bench: Bench) -> Outcome:
         d_opacities=sums[:, SLOT.index("G")] / np.where(visible, true.opacities, 1.0),
         d_colors=sums[:, COLOUR],
     )
-    names = ("means", "quaternions", "log_scales", "opacity_logits")
-    parts = {name: (got[visible], wanted[name][visible]) for name, got in zip(names, arrays[:4], strict=True)}
-    parts["SH"] = (np.concatenate([arrays[4][:, None], arrays[5]], axis=1)[visible], wanted["sh"][visible])
-    parts["means on the image"] = (arrays[6], d_means[visible])
+    got = dict(zip(GROUPS, arrays[: len(GROUPS)], strict=True))
+    parts = {name: (got[name][visible], wanted[name][visible]) for name in got if name in wanted}
+    sh = np.concatenate([got["sh_dc"][:, None], got["sh_rest"]], axis=1)
+    parts["SH"] = (sh[visible], wanted["sh"][visible])
+    parts["means on the image"] = (arrays[-1], d_means[visible])
     return Outcome(arrays, worst(parts), ms, trouble)
 
 
