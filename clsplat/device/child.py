@@ -74,8 +74,8 @@ def end_with_parent() -> None:
 
 @contextmanager
 def ending_at_once() -> Iterator[None]:
-    """Inside, what asks this process to end raises TrialInterrupted, after its own handler, which may only take note of
-    it. Nothing in other threads than the main one, which hears no signals."""
+    """Inside, a signal that asks this process to end raises TrialInterrupted, after its own handler, which may only
+    take note of it. No effect in other threads than the main one: they get no signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

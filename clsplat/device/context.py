@@ -81,7 +81,7 @@ def list_devices() -> list[DeviceInfo]:
 class Device:
     """A device with its context, in-order queue, kernel shape and built kernels.
 
-    why: the warning that this is not the shape that is wanted, told when the device is used; only_tries: a launch is
+    why: the warning that this is not the wanted shape, given when the device is used; only_tries: a launch is
     rehearsed, if it has to be, and not made (`launch.only_tried`).
     """
 

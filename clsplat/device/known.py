@@ -64,7 +64,7 @@ def _kernels_digest(broken: str) -> str:
 
 
 def driver_key(device: cl.Device) -> str:
-    """All that an answer hangs on beside the shape."""
+    """Everything beside the shape that an entry counts for."""
     driver = f"{device.platform.version.strip()} | {device.driver_version.strip()}"
     kernels = _kernels_digest(os.environ.get(BREAK, ""))
     return f"{device.name.strip()} | {driver} | clsplat {clsplat.__version__} {kernels}"
@@ -90,7 +90,7 @@ _unwritten: dict[Path, list[tuple[str, str, Entry]]] = {}
 
 
 def _read() -> dict[str, Any]:
-    """The file, with what is to be added to it."""
+    """The file, with the additions that are not in it yet."""
     try:
         saved = parse_json(memory_path().read_bytes())
     except (OSError, ValueError):
@@ -131,7 +131,7 @@ def remember(
     failed: str | None = None,
     trial: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add to what is known of the driver in a shape, LANESxITEMS. failed: None keeps the recorded failure; trial: see
+    """Add to the entry of the driver in a shape, LANESxITEMS. failed: None keeps the recorded failure; trial: see
     `Entry`.
 
     A folder that cannot be written is a warning; while it cannot, everything is tried anew by the next process.

@@ -63,6 +63,10 @@ READBACK = (*COUNTED, *(f"REFUSED_{reason.upper()}" for reason in REFUSED))
 complement of the smallest depth key and the largest one; and what `adam` has counted since."""
 
 
+DEEP = ("RED", "GREEN", "BLUE", "ALPHA", "FIRST", "LAST")
+"""A pixel and bin of a deep picture: colour, associated with alpha; alpha; least and largest depth."""
+
+
 @dataclass(frozen=True)
 class SlotFields:
     """Fields of a slot beside the plain gradients: absolute ones (AbsGS), the contribution to the image."""
@@ -89,7 +93,8 @@ WIDEST_SLOTS = SlotFields(absolute=True, contributions=True)
 def header() -> str:
     """The declarations as OpenCL C."""
     lines = [f"#define TILE {TILE}", f"#define PAD {PAD}"]
-    for prefix, fields in (("CAMERA", CAMERA), ("SPLAT", SPLAT), ("RAY", RAY), ("SLOT", SLOT), ("READBACK", READBACK)):
+    layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK, "DEEP": DEEP}
+    for prefix, fields in layouts.items():
         lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]
         lines.append(f"#define {prefix}_SIZE {len(fields)}")
     lines.append(f"#define SLOT_PLAIN {SLOT_PLAIN}")

@@ -52,8 +52,8 @@ def better_name(name: str, present: frozenset[str]) -> str:
 
 
 def name_processor(device: cl.Device) -> str:
-    """See that PoCL 3.0 for x86-64 has a name for the processor that its compiler knows; the name that is in use after
-    it, empty for another driver or where the name is not found."""
+    """Give PoCL 3.0 for x86-64 a name for the processor that its compiler knows. Returns the name that is then in use;
+    empty for another driver, or where the name is not found."""
     if not misnames_processors(device):
         return ""
     address = _place(device.int_ptr)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Device memory that frames and training steps need: what the stages say of their arrays, added up for the plan."""
+"""Device memory that frames and training steps need: the sums of the bytes that the stages state, for the plan."""
 
 from __future__ import annotations
 

@@ -26,14 +26,12 @@ from clsplat.selftest.scenes import scenes
 from clsplat.selftest.stages import RUN
 from clsplat.stages.blend import tile_items
 from clsplat.stages.channels import WIDTHS, Features
-from clsplat.stages.deep import DEEP_FLOATS
 
 DIGESTS = Path(__file__).with_name("digests.json")
 _FEATURES = Features.of(WIDTHS).defines
 BUILT_WITH: dict[str, dict[str, object]] = {
     "features": {**_FEATURES, "LANES": 1},
     "channels": _FEATURES,
-    "deep": {"DEEP_SIZE": DEEP_FLOATS},
     "project_rays": {"LANES": 1, "RAYS": 1},
 }
 """Defines of the kernels that are not built without."""

@@ -149,7 +149,7 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
     if report.failure:
         raise DeviceError(f"{_name(device)}: the driver {report.verdict}; {_ADVICE}")
     if report.other_bits:
-        warnings.warn(f"{_name(device)}: {report.verdict}", stacklevel=3)
+        warnings.warn(f"{_name(device)}: {report.verdict}", stacklevel=2)
     known.remember(device.cl_device, device.shape.label, stages=wanted, kernels=report.kernels, failed="")
     return ""
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
-from clsplat.device.layout import TILE
+from clsplat.device.layout import DEEP, TILE
 from clsplat.device.profile import stage
 from clsplat.stages.blend import Blended, launch_tiles
 from clsplat.stages.ranges import TileLists
 
-DEEP_FLOATS = 6
-"""Floats of a pixel and bin: red, green, blue, associated with alpha; alpha; least and largest depth."""
+DEEP_FLOATS = len(DEEP)
+"""Floats of a pixel and bin."""
 
 
 @stage("deep")
@@ -32,5 +32,5 @@ def deep(
     planes = work.array("deep", (bins, DEEP_FLOATS, plane_rows, stride))
     arrays = (bounds, lists.ranges, lists.gaussian_from_sorted, splats, blended.stops, planes)
     rays = (camera_array,) if device.switched("RAYS") else ()
-    launch_tiles(device, "deep", {"DEEP_SIZE": DEEP_FLOATS}, lists, stride // TILE, height, bins, *arrays, *rays)
+    launch_tiles(device, "deep", {}, lists, stride // TILE, height, bins, *arrays, *rays)
     return planes
