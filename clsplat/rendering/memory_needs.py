@@ -93,8 +93,9 @@ def _plane_bytes(camera: Camera, pixel_bytes: int) -> int:
 
 def _frame_need(device: Device, gaussians: int, floats: int, planes: int, config: RasterizerConfig) -> Need:
     """The need of a frame without channels. planes: bytes of all that is as large as the image."""
-    keeps_culled = not (config.frustum_cull and config.opacity_cull)
-    pair = duplicate.pair_bytes(sorts_pairs=config.depth_sort == "pairs") + ranges.PAIR_BYTES
+    switches = config.switches()
+    keeps_culled = not (switches.frustum_cull and switches.opacity_cull)
+    pair = duplicate.pair_bytes(sorts_pairs=switches.depth_sort == "pairs") + ranges.PAIR_BYTES
     return Need(
         gaussians=gaussians,
         row=project.gaussian_bytes(keeps_culled=keeps_culled) + duplicate.GAUSSIAN_BYTES,

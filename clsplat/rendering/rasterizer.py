@@ -75,6 +75,7 @@ class Rasterizer:
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
+        self._switches = self.config.switches()
         self.device = device.with_switches(kernel_defines(self.config))
         self._by_projection = {
             name: self.device.with_switches(kind.defines) if kind.defines else self.device
@@ -83,7 +84,7 @@ class Rasterizer:
         self.work = work or Workspace(device)
         self.readback = allocate(device, (len(READBACK),), np.uint32)
         self.readback.fill(0)
-        self._all_bits = self.config.key_bits == "all"
+        self._all_bits = self._switches.key_bits == "all"
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS)
 
     def follow(self, plan: Plan) -> None:
@@ -106,7 +107,7 @@ class Rasterizer:
         projected = project(device, work, gaussians, camera, camera_array)
         counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
         bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
-        record = backward and len(bands) == 1 and self.config.record_cells
+        record = backward and len(bands) == 1 and self._switches.record_cells
         part = None
         for band in bands:
             del part  # its arrays may have to make room for larger ones
@@ -158,7 +159,7 @@ class Rasterizer:
     ) -> Part:
         work = self.work
         counted = counted or count_band(device, work, projected, tiles, band, all_bits=self._all_bits)
-        listing = duplicate_and_sort if self.config.depth_sort == "pairs" else duplicate
+        listing = duplicate_and_sort if self._switches.depth_sort == "pairs" else duplicate
         pairs = listing(device, work, projected.splats, counted, tiles, band)
         return Part(counted, pairs, tile_lists(device, work, pairs, band, all_bits=self._all_bits))
 

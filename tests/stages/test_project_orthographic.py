@@ -15,7 +15,7 @@ from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 
 from clsplat.camera import Camera
 from clsplat.config.pictures import DeepConfig
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep
@@ -149,7 +149,7 @@ def assert_same_pictures(got: tuple[RenderResult, ChannelResult], wanted: tuple[
 def test_exact_switches_change_no_bit(default_device: Device, change: dict[str, bool]) -> None:
     gaussians, camera = orthographic(scenes.off_frustum())
     plain = Renderer(default_device).render(gaussians, camera, BACKGROUND)
-    other = Renderer(default_device, config=RasterizerConfig(**change)).render(gaussians, camera, BACKGROUND)  # type: ignore[arg-type]
+    other = Renderer(default_device, config=BenchSwitches(**change)).render(gaussians, camera, BACKGROUND)  # type: ignore[arg-type]
     assert_same_bits(other.image, plain.image)
     assert_same_bits(other.alpha, plain.alpha)
 
