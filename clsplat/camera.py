@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -13,6 +14,28 @@ from clsplat.arrays import Float64
 from clsplat.errors import InputError
 
 Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
+
+
+@dataclass(frozen=True)
+class ProjectionKind:
+    """Properties of a projection.
+
+    flat: True if there is an image plane, on which Gaussians are ellipses and depth is z; else a pixel is a ray, and
+    depth the distance; gradient: True if the backward pass has it; defines: those that the kernels are built with.
+    """
+
+    flat: bool = True
+    gradient: bool = False
+    defines: Mapping[str, object] = field(default_factory=dict)
+
+
+PROJECTIONS: dict[Projection, ProjectionKind] = {
+    "perspective": ProjectionKind(gradient=True),
+    "orthographic": ProjectionKind(defines={"ORTHOGRAPHIC": True}),
+    "equirectangular": ProjectionKind(flat=False, defines={"RAYS": 1}),
+    "fisheye": ProjectionKind(flat=False, defines={"RAYS": 2}),
+}
+"""Every projection. Its equations are in kernels/project*.cl and, in float64, in clsplat/reference/cameras.py."""
 
 FRAME_CLAMP = 0.3
 NEAR = 0.01
@@ -74,6 +97,11 @@ class Camera:
     window: Window | None = None
 
     @property
+    def kind(self) -> ProjectionKind:
+        """The properties of its projection."""
+        return PROJECTIONS[self.projection]
+
+    @property
     def position(self) -> Float64:
         """The camera's centre in the world, (3,)."""
         centre: Float64 = -self.rotation.T @ self.translation
@@ -104,9 +132,8 @@ class Camera:
             )
         if not 0 < self.near < self.far:
             raise InputError(f"camera: near is {self.near}, far {self.far}, expected 0 < near < far")
-        if self.projection not in get_args(Projection):
-            known = ", ".join(get_args(Projection))
-            raise InputError(f"camera: projection is {self.projection!r}, expected one of {known}")
+        if self.projection not in PROJECTIONS:
+            raise InputError(f"camera: projection is {self.projection!r}, expected one of {', '.join(PROJECTIONS)}")
 
     def from_origin(self, origin: Float64) -> Camera:
         """The same view, for coordinates of the world that are counted from origin (3,)."""

@@ -15,13 +15,6 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#define DEEP_RED 0
-#define DEEP_GREEN 1
-#define DEEP_BLUE 2
-#define DEEP_ALPHA 3
-#define DEEP_FIRST 4
-#define DEEP_LAST 5
-
 GROUP __kernel void deep(const int first_tile, const int tiles_x, const int height, const int bins,
                          __constant float *bounds, __global const uint *ranges,
                          __global const uint *gaussian_from_sorted, __global const float *splats,

@@ -22,35 +22,35 @@ static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, in
 }
 
 // shown (n), ranks (n): scan of the visible, visible and pairs (1): totals -> gaussian_from_visible, depth_keys
-// (visible); found (4), zeroed before: both totals, the complement of the smallest key, the largest. A positive
-// float's bits sort as it does. A group owns a chunk.
+// (visible); the first four of readback, zeroed before: both totals, the complement of the smallest key, the largest.
+// A positive float's bits sort as it does. A group owns a chunk.
 GROUP __kernel void compact_visible(const uint n, const uint chunk, __global const uint *shown,
                                     __global const uint *ranks, __global const float *splats,
                                     __global const uint *visible, __global const uint *pairs,
                                     __global uint *gaussian_from_visible, __global uint *depth_keys,
-                                    __global uint *found) {
+                                    __global uint *readback) {
   __local uint extremes[2];
   if (get_local_id(0) == 0) extremes[0] = extremes[1] = 0;
   BARRIER_LOCAL();
   const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
-  uint turned = 0, largest = 0;
+  uint complement = 0, largest = 0;
   for (uint i = begin + get_local_id(0); i < end; i += ITEMS) {
     if (shown[i] == 0) continue;
     const uint key = as_uint(splats[(size_t)SPLAT_SIZE * i + SPLAT_DEPTH]);
     gaussian_from_visible[ranks[i]] = i;
     depth_keys[ranks[i]] = key;
-    turned = max(turned, ~key);
+    complement = max(complement, ~key);
     largest = max(largest, key);
   }
-  atomic_max(extremes, turned);
+  atomic_max(extremes, complement);
   atomic_max(extremes + 1, largest);
   BARRIER_LOCAL();
   if (get_local_id(0) != 0) return;
-  atomic_max(found + 2, extremes[0]);
-  atomic_max(found + 3, extremes[1]);
+  atomic_max(readback + READBACK_KEY_COMPLEMENT, extremes[0]);
+  atomic_max(readback + READBACK_LARGEST_KEY, extremes[1]);
   if (get_group_id(0) == 0) {
-    found[0] = visible[0];
-    found[1] = pairs[0];
+    readback[READBACK_VISIBLE] = visible[0];
+    readback[READBACK_PAIRS] = pairs[0];
   }
 }
 

@@ -17,7 +17,7 @@
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 
-// Whether a Gaussian goes on that reaches no tile (RasterizerConfig.frustum_cull, opacity_cull).
+// True for a Gaussian that goes on though it reaches no tile (RasterizerConfig.frustum_cull, opacity_cull).
 #if defined(NO_FRUSTUM_CULL)
 #define KEEP_CULLED 1
 #elif defined(NO_OPACITY_CULL)

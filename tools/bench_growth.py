@@ -24,10 +24,11 @@ from measuring import Result, machine, number, options_parser, reporting, requir
 from plotting import Panel, plot_growth
 
 from clsplat.bench.plots import check_plot
-from clsplat.bench.stages import columns, wall_ms
+from clsplat.bench.stages import wall_ms
 from clsplat.bench.subject import synthetic
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
+from clsplat.progress import aligned
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.stages.device_gaussians import upload_gaussians
 
@@ -58,7 +59,7 @@ def measure(device: Device, count: int, width: int, height: int, repeat: int) ->
 
     frames = [draw() for _ in range(2)]  # kernels are built in the first, and the memory has grown after it
     ms = statistics.median(wall_ms(device, draw) for _ in range(repeat))
-    pairs = frames[-1].pairs.tile_keys.shape[0]
+    pairs = frames[-1].part.pairs.tile_keys.shape[0]
     return {"gaussians": count, "width": width, "height": height, "pairs": pairs, "ms": ms}
 
 
@@ -86,7 +87,7 @@ def table(part: Result) -> list[str]:
         size, off = f"{row['width']}x{row['height']}", f"{row['residual']:+.1%}"
         rows.append((f"{row['gaussians']:,}", size, f"{row['pairs']:,}", f"{row['ms']:.2f}", off))
     line = f"ms = {part['ms_at_zero']:.2f} + {part['ms_per_unit']:.2f} x, x in {part['unit']}"
-    return [*columns(rows), "", f"{line}; largest residual {part['largest_residual']:+.1%}"]
+    return [*aligned(rows), "", f"{line}; largest residual {part['largest_residual']:+.1%}"]
 
 
 def panel(part: Result) -> Panel:

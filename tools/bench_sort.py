@@ -28,10 +28,11 @@ from numpy.typing import NDArray
 from plotting import Panel, plot_growth
 
 from clsplat.bench.plots import check_plot
-from clsplat.bench.stages import columns, wall_ms
+from clsplat.bench.stages import wall_ms
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device, open_device
 from clsplat.errors import ClsplatError
+from clsplat.progress import aligned
 from clsplat.stages.sort import sort
 
 SMALLEST, LINEAR_FROM = 10_000, 100_000
@@ -136,7 +137,7 @@ def table(result: Result) -> list[str]:
         rows.append((row["sort"], f"{row['n']:,}", *times))
     found = ", ".join(f"{name} {value:.2f}" for name, value in result["deviation"].items() if value is not None)
     note = f"largest over smallest time a key, from {LINEAR_FROM:,} up: {found}" if found else ""
-    return [*columns(rows), *(["", note] if note else [])]
+    return [*aligned(rows), *(["", note] if note else [])]
 
 
 def plot(path: Path, result: Result) -> None:

@@ -31,10 +31,11 @@ from pathlib import Path
 
 from measuring import Result, machine, reporting, require, show
 
-from clsplat.bench.stages import columns, wall_ms
+from clsplat.bench.stages import wall_ms
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
+from clsplat.progress import aligned
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.limit import measure_limits
 from clsplat.training.trainer import Trainer
@@ -142,7 +143,7 @@ def table(result: Result) -> list[str]:
         for row in result["rows"]
         if len(row["limits"]) > 1
     ]
-    return [*columns(rows), "", note, *([f"limits, the largest counts: {'; '.join(others)}"] if others else [])]
+    return [*aligned(rows), "", note, *([f"limits, the largest counts: {'; '.join(others)}"] if others else [])]
 
 
 def run(arguments: list[str]) -> int:

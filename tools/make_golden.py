@@ -80,7 +80,7 @@ def write_selftest(path: Path) -> None:
     for lanes, items in SHAPES:
         shaped = device.with_shape(lanes=lanes, items=items)
         found = by_shape.setdefault(shape_label(shaped), {})
-        for result in run(shaped, found=found):
+        for result in run(shaped, digests=found):
             if not result.passed:
                 raise SystemExit(f"{lanes}x{items}: {result}")
     digests: dict[str, object] = {}

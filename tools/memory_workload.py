@@ -104,7 +104,7 @@ def frames(device: Device) -> None:
             raise SystemExit("a gradient is not finite")
         if not small:
             count_pairs(
-                rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, background, frame.camera
+                rasterizer.device, rasterizer.work, frame.part.lists, frame.projected.splats, background, frame.camera
             )
 
 

@@ -17,7 +17,7 @@ from clsplat.device.context import Device
 from clsplat.device.layout import PLAIN_SLOTS, SPLAT
 from clsplat.gaussians import Gaussians
 from clsplat.reference.blend import footprint
-from clsplat.reference.project import ALPHA_MIN, Projected, project, project_grad_covariances, view_directions
+from clsplat.reference.project import ALPHA_MIN, Projected, project, project_grad, view_directions
 from clsplat.reference.render import parameters
 from clsplat.spherical_harmonics import sh_basis
 from clsplat.stages import device_camera, device_gaussians
@@ -95,7 +95,7 @@ def wanted_gradients(
         d_opacities = np.where(wanted.visible, g / wanted.opacities, 0)
     of = (camera, DEGREE, wanted, d_means2d, d_covariances, d_opacities, sums[:, 6:9].astype(np.longdouble))
     with np.errstate(all="ignore"):
-        by = project_grad_covariances(*(arrays[name] for name in GROUPS), *of)
+        by = project_grad(*(arrays[name] for name in GROUPS), *of)
         # 1 - o is nothing but rounding where o is next to 1
         rest = 1 / (1 + np.exp(arrays["opacity_logits"]))
     by["opacity_logits"] = np.where(wanted.visible, g * rest, 0)

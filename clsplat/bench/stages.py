@@ -70,7 +70,7 @@ def bench(
     for band in frame.bands:
         part = rasterizer.part(frame, band)
         listed += part.counted.pairs
-        drawn = (part.lists, frame.projected.splats, frame.background, subject.camera, band)
+        drawn = (part.lists, frame.projected.splats, frame.background, subject.camera)
         added, looked_at = count_pairs(rasterizer.device, rasterizer.work, *drawn)
         contributing, evaluated = contributing + added, evaluated + looked_at
     in_frame = _measure(device, draw, repeat)

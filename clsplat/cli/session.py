@@ -63,8 +63,8 @@ def run_of(model: Path) -> Run | None:
 
 def chosen_devices(selector: str | None) -> list[DeviceInfo]:
     """The device that `selector` names, or all devices. Raises DeviceError where there is none."""
-    from clsplat.device.advice import no_device
     from clsplat.device.context import find_device, list_devices
+    from clsplat.device.quirks import no_device
 
     devices = list_devices() if selector is None else [find_device(selector)]
     if not devices:

@@ -7,12 +7,12 @@ import os
 # front of theirs only adds binaries that some of them fail to load again, and wants a home that can be written.
 os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 
-from clsplat.device import driver_cache, packaged
+from clsplat.device import quirks
 from clsplat.process import undisturbed
 
 # before a driver is loaded
-driver_cache.make_room()
-packaged.offer()
+quirks.make_cache_folder()
+quirks.offer_packaged()
 with undisturbed():  # an exception of a signal's handler while it is imported would abort the process
     import pyopencl as cl  # for all that follow
 

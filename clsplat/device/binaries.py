@@ -20,14 +20,11 @@ import pyopencl as cl
 
 from clsplat.device.known import cache_folder
 from clsplat.device.processor import features
-from clsplat.device.quirks import wants_cache
+from clsplat.device.quirks import TARGET, wants_cache
 from clsplat.files import atomic_write
 
 MOST_BYTES = 256 << 20
 """Limit of all files together; the oldest go. A binary takes 30 to 500 KB, all tests together 90 MB."""
-TARGET = "CL_CONFIG_"
-"""Variables that begin so tell Intel's runtime which processor to build for, and how."""
-
 
 FOLDER = "CLSPLAT_BINARIES"
 """The variable that names another place."""
@@ -44,9 +41,9 @@ def _processor() -> str:
 
 
 def _path(device: cl.Device, digest: str) -> Path:
-    told = sorted(f"{name}={value}" for name, value in os.environ.items() if name.startswith(TARGET))
+    settings = sorted(f"{name}={value}" for name, value in os.environ.items() if name.startswith(TARGET))
     driver = (device.name, device.platform.version, device.driver_version)
-    key = "\0".join((digest, *driver, _processor(), *told))
+    key = "\0".join((digest, *driver, _processor(), *settings))
     return folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.bin"
 
 

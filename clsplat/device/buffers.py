@@ -175,8 +175,3 @@ class Workspace:
     def clear(self) -> None:
         """Let go of every buffer."""
         self._arrays.clear()
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes held."""
-        return sum(array.buffer.size for array in self._arrays.values())

@@ -74,8 +74,8 @@ def end_with_parent() -> None:
 
 @contextmanager
 def ending_at_once() -> Iterator[None]:
-    """Inside, what asks this process to end raises TrialInterrupted, after its own handler, which may only take note of
-    it. Nothing in other threads than the main one, which hears no signals."""
+    """Inside, a signal that asks this process to end raises TrialInterrupted, after its own handler, which may only
+    take note of it. No effect in other threads than the main one: they get no signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -85,23 +85,23 @@ def ending_at_once() -> Iterator[None]:
             before[number](number, frame)
         raise TrialInterrupted(number)
 
-    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, *endings())}
-    before = {int(each): handler for each, handler in handlers.items() if callable(handler)}
-    for each in before:
-        signal.signal(each, interrupt)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *endings())}
+    before = {int(number): handler for number, handler in handlers.items() if callable(handler)}
+    for number in before:
+        signal.signal(number, interrupt)
     try:
         yield
     finally:
-        for each, handler in before.items():
-            if signal.getsignal(each) is interrupt:  # a handler may have put another one in its own place
-                signal.signal(each, handler)
+        for number, handler in before.items():
+            if signal.getsignal(number) is interrupt:  # a handler may have put another one in its own place
+                signal.signal(number, handler)
 
 
 _alive: weakref.WeakSet[Child] = weakref.WeakSet()
 
 
 def abandon() -> None:
-    """End all of them at once, whoever waits for one: that raises TrialInterrupted."""
+    """End all of them at once. A thread that waits for one gets TrialInterrupted."""
     for child in list(_alive):
         child.abandon()
 

@@ -14,7 +14,6 @@ import numpy as np
 import pyopencl as cl
 
 from clsplat.device.account import Memory
-from clsplat.device.advice import no_device
 from clsplat.device.buffers import allocate
 from clsplat.device.child import patience
 from clsplat.device.known import tell_once
@@ -22,7 +21,7 @@ from clsplat.device.launch import launch_groups
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernels, build, variant_of
-from clsplat.device.quirks import compiles_by_size, kind_of
+from clsplat.device.quirks import compiles_by_size, kind_of, no_device
 from clsplat.device.rehearsal import Rehearsal
 from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text, why_another
 from clsplat.device.source import kernel_source
@@ -64,27 +63,25 @@ def list_devices() -> list[DeviceInfo]:
     """Every OpenCL device that is visible, GPUs and CPUs, in the order of their index. Raises DeviceError for a
     CLSPLAT_SHAPE that makes no sense for any."""
     asked_shape()
-    infos = []
-    for index, device in enumerate(all_devices()):
-        infos.append(
-            DeviceInfo(
-                index=index,
-                name=device.name.strip(),
-                platform=device.platform.name.strip(),
-                version=device.platform.version.strip(),
-                kind=kind_of(device),
-                compute_units=device.max_compute_units,
-                memory_bytes=device.global_mem_size,
-                shape=shape_text(device),
-            )
+    return [
+        DeviceInfo(
+            index=index,
+            name=device.name.strip(),
+            platform=device.platform.name.strip(),
+            version=device.platform.version.strip(),
+            kind=kind_of(device),
+            compute_units=device.max_compute_units,
+            memory_bytes=device.global_mem_size,
+            shape=shape_text(device),
         )
-    return infos
+        for index, device in enumerate(all_devices())
+    ]
 
 
 class Device:
     """A device with its context, in-order queue, kernel shape and built kernels.
 
-    why: the warning that this is not the shape that is wanted, told when the device is used; only_tries: a launch is
+    why: the warning that this is not the wanted shape, given when the device is used; only_tries: a launch is
     rehearsed, if it has to be, and not made (`launch.only_tried`).
     """
 
@@ -121,12 +118,12 @@ class Device:
             text = kernel_source(stem)
             defines = {**{name: value for name, value in self._switches.items() if name in text}, **defines}
         key = (stem, tuple(sorted(defines.items())))
-        found = self._kernels.get(key)
-        if found is None:
+        kernels = self._kernels.get(key)
+        if kernels is None:
             if not self._fma:
                 self._fma.append(self._probe_fma())  # in place: copies of a device share it
-            found = self._kernels[key] = self._built(stem, {**self._fma[0], **defines})
-        return found
+            kernels = self._kernels[key] = self._built(stem, {**self._fma[0], **defines})
+        return kernels
 
     def _built(self, stem: str, defines: Mapping[str, object]) -> Kernels:
         shape = {"LANES": self.shape.lanes, "ITEMS": self.shape.items}
@@ -142,20 +139,15 @@ class Device:
         return device
 
     def with_switches(self, switches: Mapping[str, object]) -> Device:
-        """The same device, queue and cache of kernels, with these defines for the kernels whose text names them."""
+        """The same device, queue and cache of kernels, adding these defines for kernels whose text names them."""
         device = copy(self)
-        device._switches = switches  # noqa: SLF001  # a copy of our own class
+        device._switches = {**self._switches, **switches}  # noqa: SLF001  # a copy of our own class
         return device
 
     @property
     def is_another(self) -> bool:
         """True if this shape was taken because the driver had failed in the one that is wanted."""
         return bool(self._why_another)
-
-    @property
-    def switches(self) -> Mapping[str, object]:
-        """The defines that `with_switches` gave it."""
-        return self._switches
 
     def switched(self, *names: str) -> bool:
         """True if kernels are built with any of these switches."""
@@ -199,11 +191,6 @@ class Device:
         return f"<Device {self.name} | {self.driver.split('  ')[0].strip()} | {self.shape.label}>"
 
 
-def _matches(selector: str, info: DeviceInfo) -> bool:
-    wanted = selector.lower()
-    return wanted == info.kind or wanted in f"{info.name} {info.platform} {info.version}".lower()
-
-
 def select(selector: str | None) -> cl.Device:
     """The device that `selector` names: an index, `cpu`, `gpu`, or a part of its name, platform or version.
 
@@ -219,8 +206,10 @@ def select(selector: str | None) -> cl.Device:
         return next((d for d, i in zip(devices, infos, strict=True) if i.kind == "gpu"), devices[0])
     if selector.isdigit() and int(selector) < len(devices):
         return devices[int(selector)]
+    wanted = selector.lower()
     for device, info in zip(devices, infos, strict=True):
-        if not selector.isdigit() and _matches(selector, info):
+        words = f"{info.name} {info.platform} {info.version}".lower()
+        if not selector.isdigit() and (wanted == info.kind or wanted in words):
             return device
     names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for info in infos)
     raise DeviceError(f"{named}: no such device, expected cpu, gpu, a part of a name, or an index of these: {names}")

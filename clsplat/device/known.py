@@ -34,12 +34,13 @@ MOST = 16
 @dataclass(frozen=True)
 class Entry:
     """One driver in one shape. stages: those of the self-test that passed; kernels: what has been built and launched,
-    as `rehearsal` names it, with the salt that its text needs; failed: how the driver failed, or empty; trial: what
-    it failed in, if that was a single kernel: its name, and what `Rehearsal.again` needs to try it."""
+    as `rehearsal` names it, with the salt that its text needs; failed: how the driver failed, or empty, or in an
+    addition None to leave it as it is; trial: what it failed in, if that was a single kernel: its name, and what
+    `rehearsal.again` needs to try it."""
 
     stages: frozenset[str] = frozenset()
     kernels: Mapping[str, str] = field(default_factory=dict)
-    failed: str = ""
+    failed: str | None = ""
     trial: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -63,7 +64,7 @@ def _kernels_digest(broken: str) -> str:
 
 
 def driver_key(device: cl.Device) -> str:
-    """All that an answer hangs on beside the shape."""
+    """Everything beside the shape that an entry counts for."""
     driver = f"{device.platform.version.strip()} | {device.driver_version.strip()}"
     kernels = _kernels_digest(os.environ.get(BREAK, ""))
     return f"{device.name.strip()} | {driver} | clsplat {clsplat.__version__} {kernels}"
@@ -77,29 +78,19 @@ def _entry(value: object) -> Entry:
     trial = value.get("trial", {})
     if not (isinstance(stages, list) and isinstance(kernels, dict) and isinstance(failed, str)):
         return Entry()
-    if not all(isinstance(each, str) for each in (*stages, *kernels.values())):
+    if not all(isinstance(text, str) for text in (*stages, *kernels.values())):
         return Entry()
     return Entry(frozenset(stages), kernels, failed, trial if isinstance(trial, dict) else {})
 
 
-@dataclass(frozen=True)
-class _Addition:
-    """The part of an entry, of a driver and shape, that `remember` adds."""
-
-    driver: str
-    shape: str
-    stages: frozenset[str]
-    kernels: Mapping[str, str]
-    failed: str | None
-    trial: Mapping[str, Any]
-
-
-_unwritten: dict[Path, list[_Addition]] = {}
-"""Additions that could not be written yet, by file."""
+_LOCK = threading.Lock()
+"""Several devices may be at work at once."""
+_unwritten: dict[Path, list[tuple[str, str, Entry]]] = {}
+"""Additions that could not be written yet, by file: driver, shape and what is added to the entry."""
 
 
 def _read() -> dict[str, Any]:
-    """The file, with what is to be added to it."""
+    """The file, with the additions that are not in it yet."""
     try:
         saved = parse_json(memory_path().read_bytes())
     except (OSError, ValueError):
@@ -107,24 +98,22 @@ def _read() -> dict[str, Any]:
     if not isinstance(saved, dict):
         saved = {}
     for addition in _unwritten.get(memory_path(), []):
-        _add(saved, addition)
+        _add(saved, *addition)
     return saved
 
 
-def _add(saved: dict[str, Any], addition: _Addition) -> None:
-    shapes = saved.pop(addition.driver, None)
+def _add(saved: dict[str, Any], driver: str, shape: str, addition: Entry) -> None:
+    shapes = saved.pop(driver, None)
     shapes = shapes if isinstance(shapes, dict) else {}
-    known = _entry(shapes.get(addition.shape))
+    known = _entry(shapes.get(shape))
     entry: dict[str, object] = {
         "stages": sorted(known.stages | addition.stages),
         "kernels": {**known.kernels, **addition.kernels},
     }
-    new = addition.failed is not None
-    if failed := addition.failed if new else known.failed:
-        entry["failed"] = failed
-        if trial := addition.trial if new else known.trial:
-            entry["trial"] = trial
-    saved[addition.driver] = {**shapes, addition.shape: entry}
+    last = known if addition.failed is None else addition
+    if last.failed:
+        entry |= {"failed": last.failed, **({"trial": last.trial} if last.trial else {})}
+    saved[driver] = {**shapes, shape: entry}
 
 
 def entries(device: cl.Device) -> dict[str, Entry]:
@@ -142,33 +131,25 @@ def remember(
     failed: str | None = None,
     trial: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add to what is known of the driver in a shape, LANESxITEMS. failed: None keeps the recorded failure; trial: see
+    """Add to the entry of the driver in a shape, LANESxITEMS. failed: None keeps the recorded failure; trial: see
     `Entry`.
 
     A folder that cannot be written is a warning; while it cannot, everything is tried anew by the next process.
     """
-    addition = _Addition(driver_key(device), shape, frozenset(stages), kernels or {}, failed, trial or {})
-    with _LOCK:
-        _remember(addition)
-
-
-_LOCK = threading.Lock()
-"""Several devices may be at work at once."""
-
-
-def _remember(addition: _Addition) -> None:
     path = memory_path()
-    _unwritten.setdefault(path, []).append(addition)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with locked(path):
-            saved = _read()
-            for oldest in list(saved)[:-MOST]:
-                del saved[oldest]
-            atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
-        del _unwritten[path]
-    except OSError as error:
-        tell_once(f"{path}: cannot be written ({reason_of(error)}), so that drivers are tested anew each time")
+    addition = Entry(frozenset(stages), kernels or {}, failed, trial or {})
+    with _LOCK:
+        _unwritten.setdefault(path, []).append((driver_key(device), shape, addition))
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with locked(path):
+                saved = _read()
+                for oldest in list(saved)[:-MOST]:
+                    del saved[oldest]
+                atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
+            del _unwritten[path]
+        except OSError as error:
+            tell_once(f"{path}: cannot be written ({reason_of(error)}), so that drivers are tested anew each time")
 
 
 @lru_cache(maxsize=8)

@@ -28,8 +28,8 @@ _MANY = 1 << 16
 
 @contextmanager
 def only_tried(device: Device) -> Iterator[None]:
-    """Inside, the launches of this device are rehearsed where they have to be, and not made: what comes of a driver's
-    failure is then nothing that is half done."""
+    """Inside, the launches of this device are rehearsed where they have to be, and not made. So a driver's failure
+    leaves nothing half done."""
     device.only_tries = True
     try:
         yield
@@ -45,7 +45,7 @@ def _value(argument: Any) -> Any:
 
 
 def _type(value: Any) -> Any:
-    """The type that OpenCL's wrapper is told of an argument; None for what is no scalar."""
+    """The type of an argument for OpenCL's wrapper; None for one that is no scalar."""
     if isinstance(value, int):
         return np.uint32
     if isinstance(value, float):
@@ -54,9 +54,9 @@ def _type(value: Any) -> Any:
 
 
 def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None) -> str:
-    """A name for what else than the kernel decides what a driver compiles for a launch; empty for the usual.
+    """A name for the form of a launch, where the driver compiles a kernel anew for each form; empty for the usual one.
 
-    The sizes of groups themselves are not in it: an image's width is one, and each would be a trial.
+    The sizes of groups are not in it: an image's width is one, and each would be a trial.
     """
     if not device.compiles_by_size:
         return ""
@@ -71,7 +71,7 @@ def _first(
     values: Sequence[Any],
     form: str,
 ) -> None:
-    """Tell the types of the kernel's arguments, and see that the driver can launch it. Raises DriverError."""
+    """Set the types of the kernel's arguments, and check that the driver can launch it. Raises DriverError."""
     types = [_type(value) for value in values]
     most = kernel.most_items(device.cl_device) if tells_group_sizes(device.cl_device) else device.max_group
     if local is not None and prod(local) > most:
@@ -80,7 +80,7 @@ def _first(
             kernel.name,
             f"has {prod(local)} items in a group, where the driver allows it {most}",
         )
-    typed = [value if of is None else np.dtype(of).type(value) for of, value in zip(types, values, strict=True)]
+    typed = [value if kind is None else np.dtype(kind).type(value) for kind, value in zip(types, values, strict=True)]
     device.rehearsal.launch(kernel, size, local, typed, form)
     kernel.cl_kernel.set_scalar_arg_dtypes(types)
     kernel.tried.add(form)
@@ -108,7 +108,7 @@ def _enqueue(
         return
     try:
         event = kernel.cl_kernel(device.queue, size, local, *values)
-        if first and device.rehearsal.say is not None:  # so that what was told last is what a driver fails in
+        if first and device.rehearsal.say is not None:  # so that the last kernel that was named is the one that fails
             device.queue.finish()
     except cl.Error as error:
         text = " ".join(str(error).split())

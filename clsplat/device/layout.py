@@ -24,10 +24,12 @@ CAMERA = (*_ROUNDED, "NEAR", "HAND", "WINDOW_X", "WINDOW_Y", *(f"{name}_LOW" for
 where its rotation is a reflection; the first pixel in its frame (`Camera.window`); and what the rounding of them to
 float32 left, so that a mean's place on the image is good to 1e-6 pixels, and a needle's ellipse to 1e-4."""
 
+_SEEN = ("LOG2O", "RED", "GREEN", "BLUE", "DEPTH")
+"""The part of SPLAT and of RAY that is one thing at one place: blending reads it whichever it has."""
+
 SPLAT = (
-    *("PIXEL_X", "PIXEL_Y", "SUB_X", "SUB_Y"),
-    *("L11", "L12", "L22", "LOG2O"),
-    *("RED", "GREEN", "BLUE", "DEPTH"),
+    *("PIXEL_X", "PIXEL_Y", "SUB_X", "SUB_Y", "L11", "L12", "L22"),
+    *_SEEN,
     *("HALF_W", "HALF_H", "INVERSE_L11", "UNUSED"),
 )
 """A projected Gaussian in 64 bytes, a cache line: mean in whole pixels and the rest; the whitening W of
@@ -35,11 +37,13 @@ docs/gradients.md times sqrt(log2(e) / 2), so that log2(alpha) = LOG2O - u^2 - v
 in pixels of the ellipse where alpha is 1/255."""
 
 RAY = (
-    *("FX", "FY", "FZ", "UX", "UY", "UZ", "VX", "LOG2O"),
-    *("RED", "GREEN", "BLUE", "DEPTH"),
+    *("FX", "FY", "FZ", "UX", "UY", "UZ", "VX"),
+    *_SEEN,
     *("VY", "VZ", "COLUMNS", "ROWS"),
 )
-"""The same of an equirectangular or fisheye camera, colour and depth where SPLAT has them: the mean's direction F; U
+assert len(RAY) == len(SPLAT), "they share the array"
+assert all(RAY.index(name) == SPLAT.index(name) for name in _SEEN), "blending reads either"
+"""The same of an equirectangular or fisheye camera: the mean's direction F; U
 and V, of which a ray r in the camera makes u = U.r / F.r and v = V.r / F.r, so that log2(alpha) = LOG2O - u^2 - v^2;
 distance; tiles of the box, 16 bits each, first and one past the last (kernels/shared/tile.h)."""
 
@@ -48,6 +52,19 @@ SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "A
 contributions are kept, the sum of the blending weights is behind them all (`kernels/shared/splat.h`: SLOT_WEIGHT)."""
 
 SLOT_PLAIN = SLOT.index("ABSX")
+
+REFUSED = ("parameters", "gradients", "moments", "steps")
+"""Reasons that adam.cl counts for refused steps of elements."""
+
+COUNTED = ("VISIBLE", "PAIRS", "KEY_COMPLEMENT", "LARGEST_KEY")
+
+READBACK = (*COUNTED, *(f"REFUSED_{reason.upper()}" for reason in REFUSED))
+"""Numbers that a forward pass reads back, in one copy: of its own the totals of visible Gaussians and of pairs, the
+complement of the smallest depth key and the largest one; and what `adam` has counted since."""
+
+
+DEEP = ("RED", "GREEN", "BLUE", "ALPHA", "FIRST", "LAST")
+"""A pixel and bin of a deep picture: colour, associated with alpha; alpha; least and largest depth."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +93,8 @@ WIDEST_SLOTS = SlotFields(absolute=True, contributions=True)
 def header() -> str:
     """The declarations as OpenCL C."""
     lines = [f"#define TILE {TILE}", f"#define PAD {PAD}"]
-    for prefix, fields in (("CAMERA", CAMERA), ("SPLAT", SPLAT), ("RAY", RAY), ("SLOT", SLOT)):
+    layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK, "DEEP": DEEP}
+    for prefix, fields in layouts.items():
         lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]
         lines.append(f"#define {prefix}_SIZE {len(fields)}")
     lines.append(f"#define SLOT_PLAIN {SLOT_PLAIN}")

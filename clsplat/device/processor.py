@@ -18,6 +18,8 @@ from pathlib import Path
 
 import pyopencl as cl
 
+from clsplat.device.quirks import misnames_processors
+
 BY_FEATURES = (
     ("skylake-avx512", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
     ("haswell", {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"}),
@@ -26,7 +28,7 @@ BY_FEATURES = (
 )
 """LLVM's names from the most to the least that a processor can have, by features as Linux calls them."""
 LIMIT = 2048
-"""Bytes of PoCL's record of a device in which the name is looked for; PoCL 3.0 has it at 640."""
+"""Bytes of PoCL's record of a device in which the name is looked for; in PoCL 3.0 it is at 640."""
 _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
 """Texts that the devices' records point to, by address of a device."""
 
@@ -41,18 +43,18 @@ def features(path: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
     return frozenset()
 
 
-def better_name(name: str, has: frozenset[str]) -> str:
+def better_name(name: str, present: frozenset[str]) -> str:
     """The name for a processor with these features that LLVM 14 calls `name`; the same where that will do."""
-    if not has or not (name == "generic" or name.startswith("znver")):
+    if not present or not (name == "generic" or name.startswith("znver")):
         return name
-    by_features = next(better for better, needed in BY_FEATURES if needed <= has)
+    by_features = next(better for better, needed in BY_FEATURES if needed <= present)
     return by_features if name == "generic" or by_features == BY_FEATURES[0][0] else name
 
 
 def name_processor(device: cl.Device) -> str:
-    """See that PoCL 3.0 for x86-64 has a name for the processor that its compiler knows; the name that is in use after
-    it, empty for another driver or where the name is not found."""
-    if not str(device.platform.version).startswith("OpenCL 3.0 PoCL 3.0"):
+    """Give PoCL 3.0 for x86-64 a name for the processor that its compiler knows. Returns the name that is then in use;
+    empty for another driver, or where the name is not found."""
+    if not misnames_processors(device):
         return ""
     address = _place(device.int_ptr)
     if address is None:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from functools import wraps
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
+import pyopencl as cl
+
 if TYPE_CHECKING:
     from clsplat.device.context import Device
 
@@ -105,8 +107,6 @@ def stage(name: str) -> Callable[[Callable[Concatenate[Device, P], R]], Callable
 
 
 def _milliseconds(event: Any) -> float:
-    import pyopencl as cl
-
     try:
         return 1e-6 * float(event.profile.end - event.profile.start)
     except cl.Error:  # a queue without profiling

@@ -16,6 +16,7 @@ import pyopencl as cl
 
 from clsplat.device import binaries
 from clsplat.device.known import BREAK
+from clsplat.device.quirks import build_advice
 from clsplat.device.source import kernel_source
 from clsplat.errors import DriverError, InputError, KernelBuildError
 
@@ -89,12 +90,9 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
         numbered = "\n".join(f"{number:4d}  {line}" for number, line in enumerate(source.splitlines(), 1))
         log = str(error)
         first = next((line.strip() for line in log.splitlines() if "error:" in line), log.splitlines()[0])
-        advice = "CLSPLAT_DEBUG=1 shows the log and the source"
-        if "unknown target CPU" in log:
-            advice = "this driver is older than the processor: take another one, such as your distribution's PoCL"
         raise KernelBuildError(
             f"{variant.stem}.cl does not build on {device.name.strip()} with {' '.join(variant.options)}: {first} "
-            f"({advice})",
+            f"({build_advice(log)})",
             log,
             numbered,
         ) from None

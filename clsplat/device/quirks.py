@@ -1,19 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differences between drivers, by the drivers' names."""
+"""Differences between drivers. This is the one module that knows drivers by their names.
+
+It is imported before pyopencl: what `offer_packaged` and `make_cache_folder` put into the environment is read as a
+driver is loaded.
+"""
 
 from __future__ import annotations
 
-import pyopencl as cl
+import atexit
+import os
+import platform
+import shutil
+import sys
+import tempfile
+from collections.abc import MutableMapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from clsplat.errors import DeviceError
+
+if TYPE_CHECKING:
+    import pyopencl as cl
+
+CPU, GPU = 2, 4
+"""Bits of a device's type: CL_DEVICE_TYPE_CPU and CL_DEVICE_TYPE_GPU."""
+TARGET = "CL_CONFIG_"
+"""Variables that begin so tell Intel's runtime which processor to build for, and how."""
+_ICD_FILENAMES = "OCL_ICD_FILENAMES"
+_INTEL = Path("Library", "bin", "intelocl64.dll")
+"""Path of intel-opencl-rt's driver, below `sys.prefix`, with the libraries that it needs beside it."""
+_POCL_CACHE = "POCL_CACHE_DIR"
 
 
 def kind_of(device: cl.Device) -> str:
     """cpu, gpu or other."""
-    if device.type & cl.device_type.GPU:
+    if device.type & GPU:
         return "gpu"
-    return "cpu" if device.type & cl.device_type.CPU else "other"
+    return "cpu" if device.type & CPU else "other"
 
 
-def pocl_version(device: cl.Device) -> tuple[int, int] | None:
+def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
     words = device.platform.version.split()
     if "PoCL" not in words:
         return None
@@ -21,27 +47,123 @@ def pocl_version(device: cl.Device) -> tuple[int, int] | None:
     return int(digits[0]), int(digits[1])
 
 
-def is_rusticl(device: cl.Device) -> bool:
+def _is_rusticl(device: cl.Device) -> bool:
     return str(device.platform.name).strip() == "rusticl"
+
+
+def most_lanes(device: cl.Device) -> int:
+    """Pixels in the longest vectors that the driver's compiler can take, of a CPU."""
+    if _is_rusticl(device):  # with vectors llvmpipe does not come back from the larger kernels
+        return 1
+    return 8 if _pocl_version(device) == (3, 0) else 16  # PoCL 3.0 aborts on some float16 built-ins
+
+
+def misnames_processors(device: cl.Device) -> bool:
+    """True for PoCL 3.0, whose compiler may not know the name that it gives to the processor."""
+    return str(device.platform.version).startswith("OpenCL 3.0 PoCL 3.0")
 
 
 def tells_group_sizes(device: cl.Device) -> bool:
     """False for a driver that is wrong about the work-items that it allows a group of a kernel: Rusticl of Mesa 22.3
     says 32 of every kernel, and runs groups of 1024."""
-    return not is_rusticl(device)
+    return not _is_rusticl(device)
 
 
 def caches_programs(device: cl.Device) -> bool:
     """True for a driver that keeps what it builds on the disk, so that a second build takes no time."""
-    return pocl_version(device) is not None
+    return _pocl_version(device) is not None
 
 
 def compiles_by_size(device: cl.Device) -> bool:
     """True for a driver that compiles a kernel anew for a group of another size, and for launches from 65,536 items."""
-    return pocl_version(device) is not None
+    return _pocl_version(device) is not None
 
 
 def wants_cache(device: cl.Device) -> bool:
     """True for a driver that is known to build everything anew in each process, and to load its binaries again:
     Intel's runtime for CPUs. Other drivers have a cache of their own, or have not been tried."""
     return kind_of(device) == "cpu" and str(device.platform.name).strip() == "Intel(R) OpenCL"
+
+
+def build_advice(log: str) -> str:
+    """Advice on a build that failed with this log."""
+    if "unknown target CPU" in log:
+        return "this driver is older than the processor: take another one, such as your distribution's PoCL"
+    return "CLSPLAT_DEBUG=1 shows the log and the source"
+
+
+def driver_advice(system: str | None = None, machine: str | None = None) -> str:
+    """Advice on which driver to install, in a line without a full stop.
+
+    system, machine: as `platform.system` and `platform.machine` give them; this one's unless given.
+    """
+    system, machine = system or platform.system(), (machine or platform.machine()).lower()
+    pc = machine in ("x86_64", "amd64")
+    if system == "Darwin":
+        return "take conda-forge's packages, with a driver for the CPU: conda install pyopencl pocl (see README)"
+    if system == "Windows" and pc:
+        cpu = ", or one for the CPU: pip install intel-opencl-rt (an administrator has to register it, see README)"
+    elif system == "Windows":
+        cpu = ""
+    elif system == "Linux" and pc:
+        cpu = ", or one for the CPU: pip install 'pyopencl[pocl]'"
+    else:
+        cpu = ", or one for the CPU: your distribution's PoCL, such as apt install pocl-opencl-icd"
+    return f"install your GPU's driver{cpu}"
+
+
+def no_device() -> DeviceError:
+    """The error that there is no device at all."""
+    return DeviceError(f"no OpenCL device found: {driver_advice()}")
+
+
+def offer_packaged(
+    *,
+    windows: bool = os.name == "nt",
+    prefix: str = sys.prefix,
+    environment: MutableMapping[str, str] = os.environ,
+) -> None:
+    """Tell OpenCL's loader, in this process and its children, of Intel's driver for CPUs that pip has installed.
+
+    On Windows the loader reads the registry, which pip does not write, and OCL_ICD_FILENAMES, which it passes over in a
+    process with an administrator's rights. A variable that is set is left as it is. On Linux PyPI's PoCL is found by
+    itself; macOS has no loader.
+    """
+    driver = Path(prefix) / _INTEL
+    if windows and _ICD_FILENAMES not in environment and driver.is_file():
+        environment[_ICD_FILENAMES] = str(driver)
+
+
+def make_cache_folder(environment: MutableMapping[str, str] = os.environ) -> Path | None:
+    """Give PoCL a folder for this process and its children, where it could not make its own below the home.
+
+    PoCL shows no device at all then, as if it were not installed. Returns the folder, which goes when this process
+    ends; None where nothing had to be done, or could be.
+    """
+    if os.name == "nt" or environment.get(_POCL_CACHE):
+        return None
+    home = environment.get("HOME")
+    base = environment.get("XDG_CACHE_HOME") or (f"{home}/.cache" if home else "")
+    if not base or _can_be_made(Path(base) / "pocl" / "kcache"):
+        return None
+    try:
+        folder = tempfile.mkdtemp(prefix="clsplat-pocl-")
+    except OSError:
+        return None
+    owner = os.getpid()
+
+    def remove() -> None:
+        if os.getpid() == owner:  # and not a fork of it
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
+    environment[_POCL_CACHE] = folder
+    return Path(folder)
+
+
+def _can_be_made(folder: Path) -> bool:
+    """True if files can be put there, once folders that are missing are made."""
+    for place in (folder, *folder.parents):
+        if os.path.lexists(place):
+            return place.is_dir() and os.access(place, os.W_OK | os.X_OK)
+    return False

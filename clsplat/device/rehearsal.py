@@ -56,11 +56,11 @@ class _Process:
                 raise
             if ending:
                 self._end()
-                return answer, ending, crashed
-            self._timer = threading.Timer(IDLE, self.close)
-            self._timer.daemon = True
-            self._timer.start()
-            return answer, "", False
+            else:
+                self._timer = threading.Timer(IDLE, self.close)
+                self._timer.daemon = True
+                self._timer.start()
+            return answer, ending, crashed
 
     def _asked(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
         if self._child is None:
@@ -119,7 +119,7 @@ class Rehearsal:
         self.say: Callable[[str], None] | None = None
 
     def build(self, variant: Variant) -> Variant:
-        """See that the kernel file can be built; the text that can. Raises DriverError."""
+        """Check that the kernel file can be built, and return the text that can. Raises DriverError."""
         if regardless():
             self._begin(f"{variant.stem}.cl", variant.digest)
             return variant
@@ -135,7 +135,7 @@ class Rehearsal:
         arguments: Sequence[Any],
         form: str = "",
     ) -> None:
-        """See that the kernel can be launched in this form (`launch.form_of`). Raises DriverError."""
+        """Check that the kernel can be launched in this form (`launch.form_of`). Raises DriverError."""
         name = f"{kernel.variant.digest} {kernel.name}{form}"
         if regardless():
             self._begin(f"{kernel.variant.stem}.cl, {kernel.name}", name)

@@ -14,7 +14,7 @@ import pyopencl as cl
 
 from clsplat.device import known
 from clsplat.device.child import regardless
-from clsplat.device.quirks import is_rusticl, kind_of, pocl_version
+from clsplat.device.quirks import kind_of, most_lanes
 from clsplat.errors import DeviceError, reason_of
 from clsplat.files import atomic_write, parse_json
 
@@ -56,12 +56,8 @@ def default_shape(device: cl.Device) -> Shape:
     if kind_of(device) != "cpu":
         items = next((n for n in (256, 128, 64, 32, 16) if n <= most_items(device)), 1)
         return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
-    lanes = 16 if device.native_vector_width_float >= 16 else 8
-    if pocl_version(device) == (3, 0):
-        lanes = 8  # its compiler aborts on some float16 built-ins
-    if is_rusticl(device):  # with vectors llvmpipe does not come back from the larger kernels
-        return Shape(lanes=1, items=64, chunks=4 * device.max_compute_units)
-    return Shape(lanes=lanes, items=1, chunks=4 * device.max_compute_units)
+    lanes = min(16 if device.native_vector_width_float >= 16 else 8, most_lanes(device))
+    return Shape(lanes=lanes, items=1 if lanes > 1 else 64, chunks=4 * device.max_compute_units)
 
 
 def most_items(device: cl.Device) -> int:
@@ -121,10 +117,11 @@ def failures(device: cl.Device) -> dict[str, str]:
 def shape_of(device: cl.Device) -> Shape:
     """The shape that a device gets which is opened without another: `wanted_shape`, or the first other one where the
     driver has failed in that before. Raises DeviceError as `wanted_shape`."""
-    wanted = wanted_shape(device)
-    if wanted.label not in failures(device):
+    wanted, failed = wanted_shape(device), failures(device)
+    if wanted.label not in failed:
         return wanted
-    return another_shape(device) or wanted  # with none left it is told when it fails again
+    others = (shape for shape in shapes_in_turn(device) if shape.label not in failed)
+    return next(others, wanted)  # with none left it is told when it fails again
 
 
 def why_another(device: cl.Device, shape: Shape) -> str:
@@ -151,12 +148,6 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
     smaller = [replace(default, lanes=lanes, items=1) for lanes in (4, 1)] if default.items == 1 else []
     smaller += [replace(default, items=items) for items in (128, 64, 32) if items < default.items]
     return [*first, *(shape for shape in smaller if shape not in first)]
-
-
-def another_shape(device: cl.Device) -> Shape | None:
-    """The first shape in which the driver has not failed, if there is one."""
-    failed = failures(device)
-    return next((shape for shape in shapes_in_turn(device) if shape.label not in failed), None)
 
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:

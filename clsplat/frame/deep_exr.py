@@ -55,7 +55,7 @@ def depths_in_view(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
     """Depths of the means that are in front of the camera and, if it has an image plane, in its frame."""
     camera = gaussians.local(camera)
     p = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
-    if camera.projection not in ("perspective", "orthographic"):
+    if not camera.kind.flat:
         distances: NDArray[np.float64] = np.linalg.norm(p, axis=1)
         return distances[distances > camera.near]
     p = p[p[:, 2] > camera.near]

@@ -32,7 +32,7 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
     corner of the display window, and (1, 1) the lower right one. OpenEXR says nothing of z: here it is 0 at the near
     plane and 1 at infinity. Of an orthographic camera it is 1 at the far plane, or without one grows by 1 a world unit.
     """
-    if camera.projection not in ("perspective", "orthographic"):
+    if not camera.kind.flat:
         return {}
     to_camera = np.eye(4)
     flip = np.diag([1.0, -1.0, 1.0])

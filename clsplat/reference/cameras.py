@@ -87,12 +87,6 @@ def wrapped(camera: Camera, u: Float64) -> Float64:
     return np.where(moved >= low + turn, low, moved)  # np.mod of a tiny negative number rounds up to `turn` itself
 
 
-def world_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
-    """Origins (N, 3) and unit directions (N, 3) of the rays of pixels (N, 2) in the world: eq. (1)."""
-    origins, directions = cam_from_pixel(camera, pixels)
-    return (origins - camera.translation) @ camera.rotation, directions @ camera.rotation
-
-
 def pixel_from_world(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
     """Pixels (N, 2) and depths (N,) of points (N, 3) in the world: eq. (1), then as `pixel_from_cam`."""
     return pixel_from_cam(camera, np.asarray(points, np.float64) @ camera.rotation.T + camera.translation)

@@ -29,12 +29,12 @@ def deep(
         after = transmittance[box] * (1 - alpha)
         added = seen & (after > TRANSMITTANCE_MIN)
         depth = projected.depths[gaussian]
-        own = int(np.searchsorted(bounds, np.float32(depth), side="right"))
-        here, u = slices[own][box], left[own][box]
+        index = int(np.searchsorted(bounds, np.float32(depth), side="right"))
+        here, u = slices[index][box], left[index][box]
         here[:, :, :3] += np.where(added, u * alpha, 0.0)[:, :, None] * projected.colors[gaussian]
         here[:, :, 4] = np.where(added & (u == 1), depth, here[:, :, 4])
         here[:, :, 5] = np.where(added, depth, here[:, :, 5])
-        left[own][box] = np.where(added, u * (1 - alpha), u)
+        left[index][box] = np.where(added, u * (1 - alpha), u)
         transmittance[box] = np.where(added, after, transmittance[box])
         alive[box] &= added | ~seen
     slices[:, :, :, 3] = 1 - left

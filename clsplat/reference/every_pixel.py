@@ -95,7 +95,7 @@ def _alphas(
     """The projected Gaussians, and a function of a Gaussian: opacity times falloff at each pixel (P,), not yet
     clamped."""
     pixels = pixel_grid(camera)
-    if camera.projection in ("equirectangular", "fisheye"):
+    if not camera.kind.flat:
         t = tangents(gaussians, camera)
         rays = np.nan_to_num(cam_from_pixel(camera, pixels)[1])
         return t, lambda gaussian: ray_alphas(t, gaussian, rays)

@@ -188,13 +188,6 @@ def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
     return np.stack([result[:, 0, 0], result[:, 0, 1], result[:, 1, 1]], axis=1)
 
 
-def conic_grad(covariances: Float64, d_covariances: Float64) -> Float64:
-    """The way back from `covariance_grad`: dL/d(a, b, c) from dL/dSigma, both (N, 3)."""
-    as_numbers = np.array([1.0, 2.0, 1.0])  # the off-diagonal entry stands twice
-    d_conics: Float64 = covariance_grad(covariances, d_covariances * as_numbers) * as_numbers
-    return d_conics
-
-
 def _quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
     """Eqs. (34), (35): raw quaternions (N, 4), dL/dR (N, 3, 3) -> dL/dq (N, 4), orthogonal to q."""
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
@@ -222,39 +215,17 @@ def project_grad(
     sh: Float64,
     camera: Camera,
     sh_degree: int,
-    d_means2d: Float64,
-    d_conics: Float64,
-    d_opacities: Float64,
-    d_colors: Float64,
-) -> dict[str, Float64]:
-    """Eqs. (30) to (41): gradients by the five parameter arrays, keyed by their names; zero where culled.
-
-    d_means2d (N, 2), d_conics (N, 3) by a, b, c, d_opacities (N,), d_colors (N, 3).
-    """
-    parameters = (means, quaternions, log_scales, opacity_logits, sh)
-    projected = project(*parameters, camera, sh_degree)
-    d_covariances = covariance_grad(projected.conics, d_conics)
-    return project_grad_covariances(
-        *parameters, camera, sh_degree, projected, d_means2d, d_covariances, d_opacities, d_colors
-    )
-
-
-def project_grad_covariances(
-    means: Float64,
-    quaternions: Float64,
-    log_scales: Float64,
-    opacity_logits: Float64,
-    sh: Float64,
-    camera: Camera,
-    sh_degree: int,
     projected: Projected,
     d_means2d: Float64,
     d_covariances: Float64,
     d_opacities: Float64,
     d_colors: Float64,
 ) -> dict[str, Float64]:
-    """The gradient of `project_grad`, from what `project` made and the gradient by the covariances (N, 3): xx, xy, yy
-    of (28). For perspective cameras alone."""
+    """Eqs. (31) to (41): gradients by the five parameter arrays, keyed by their names; zero where culled.
+
+    projected: what `project` made; d_means2d (N, 2), d_covariances (N, 3): xx, xy, yy as in (28), d_opacities (N,),
+    d_colors (N, 3). For perspective cameras alone.
+    """
     assert camera.projection == "perspective"
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)

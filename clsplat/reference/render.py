@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.reference.blend import Blended, blend, blend_grad
-from clsplat.reference.project import Projected, project, project_grad
+from clsplat.reference.project import Projected, covariance_grad, project, project_grad
 from clsplat.reference.sort import depth_order
 
 BLACK = (0.0, 0.0, 0.0)
@@ -42,8 +42,8 @@ class Gradients:
 
 def parameters(gaussians: Gaussians) -> dict[str, Float64]:
     """The five arrays by name, in float64; means in the world."""
-    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-    arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in names}
+    fields = dict.fromkeys(group.field for group in GROUPS.values())
+    arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in fields}
     return {**arrays, "means": arrays["means"] + gaussians.origin}
 
 
@@ -89,8 +89,9 @@ def render_grad(
         **arrays,
         camera=camera,
         sh_degree=degree,
+        projected=projected,
         d_means2d=screen.means2d,
-        d_conics=screen.conics,
+        d_covariances=covariance_grad(projected.conics, screen.conics),
         d_opacities=screen.opacities,
         d_colors=screen.colors,
     )

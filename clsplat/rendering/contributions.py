@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import drop_sh
 from clsplat.rendering.memory_needs import plan_step
-from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.stages.device_gaussians import allocate_gaussians, host_gaussians, parts, upload_gaussians
+from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.stages.device_gaussians import host_gaussians, upload_gaussians
+from clsplat.stages.project import add_slots
 
 FIELDS = SlotFields(contributions=True)
 
@@ -27,14 +28,14 @@ def largest_contributions(
     gaussians: Gaussians, cameras: Sequence[Camera], device: Device, config: RasterizerConfig | None = None
 ) -> Float32:
     """(n,) the most that each adds to one camera's picture: the sum over its pixels of alpha times transmittance, in
-    pixels, as `--density.min-contribution` has it; 0 where no camera sees it.
+    pixels, like `--density.min-contribution`; 0 where no camera sees it.
 
-    It comes from the backward pass, whose image gradient is 0 here. Raises InputError for a camera without an image
-    plane, CapacityError where the device is too small.
+    It comes from the gradient of blending, and is the same for any gradient of the image. Raises InputError for a
+    camera without an image plane, CapacityError where the device is too small.
     """
     config = config or RasterizerConfig()
     for camera in cameras:
-        if camera.projection not in ("perspective", "orthographic"):
+        if not camera.kind.flat:
             raise InputError(
                 f"contributions to {camera.projection} cameras are not known, expected perspective or orthographic ones"
             )
@@ -43,25 +44,19 @@ def largest_contributions(
     rasterizer = Rasterizer(device, config)
     rasterizer.follow(plan)
     model = host_gaussians(alpha_alone, plan.rows) if plan.streamed else upload_gaussians(device, alpha_alone)
-    gradients = allocate_gaussians(device, plan.rows if plan.streamed else len(gaussians), 1)
     background = allocate(device, (3,), np.float32)
     background.fill(0.0)
     largest = np.zeros(len(gaussians), np.float32)
-    for camera in _from_origin(cameras, gaussians):
-        frame = rasterizer.forward(model, camera, background)
-        image_gradient = rasterizer.work.array("image_gradient", frame.blended.image.shape)
-        image_gradient.fill(0.0)
-        slots = rasterizer.pair_gradients(frame, image_gradient, fields=FIELDS, contributions_alone=True)
-        for start, stop, (part,) in parts(rasterizer.work, model):
-            projected = frame.projected.rows(start, stop)
-            of = (frame, projected, slots.rows(start, stop), gradients)
-            screen = rasterizer.row_gradients(part, *of, fields=FIELDS)
-            assert screen.contributions is not None
-            seen = projected.tile_counts.get() > 0
-            found = np.where(seen, screen.contributions.get()[: stop - start], 0)
-            largest[start:stop] = np.fmax(largest[start:stop], found)
+    for camera in cameras:
+        frame = rasterizer.forward(model, gaussians.local(camera), background)
+        largest = np.fmax(largest, sums_of_weights(rasterizer, frame))
     return largest
 
 
-def _from_origin(cameras: Iterable[Camera], gaussians: Gaussians) -> Iterable[Camera]:
-    return (gaussians.local(camera) for camera in cameras)
+def sums_of_weights(rasterizer: Rasterizer, frame: Frame) -> Float32:
+    """(n,) the sum over the frame's pixels of each Gaussian's alpha times transmittance."""
+    slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=FIELDS, contributions_alone=True)
+    sums, tile_counts = slots.values, frame.projected.tile_counts
+    if slots.first_slots is not None:
+        sums = add_slots(rasterizer.device, rasterizer.work, tile_counts, slots, None, fields=FIELDS)
+    return np.where(tile_counts.get() > 0, sums.get()[:, -1], np.float32(0))

@@ -1,24 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Device memory that frames and training steps need: the sizes of the stages' arrays, for the plan."""
+"""Device memory that frames and training steps need: the sums of the bytes that the stages state, for the plan."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
-from clsplat.device.layout import PAD, TILE, SlotFields
+from clsplat.device.layout import TILE, SlotFields
 from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_plan import Need, Plan, plan
+from clsplat.stages import blend, density, duplicate, loss, project, ranges, target
 from clsplat.stages.device_camera import tiles_of
-from clsplat.stages.loss import strips
+from clsplat.stages.duplicate import MAX_PAIRS
 from clsplat.stages.sort import scratch_bytes
 
-_SOURCE = 16
-"""Bytes of a photograph's pixel at most: RGBA in floats."""
+_CHANNEL_PLANES = 4
+"""Planes of a frame with channels beside those of its features: median, first, count and index."""
+_MODELS = 4
+"""Arrays of a training step for each parameter: itself, its gradient and two moments."""
 _SMALL = 4096
-"""Camera, background, totals and the like."""
+"""Bytes of camera, background, totals and the like."""
 
 
 def plan_frame(
@@ -33,16 +37,8 @@ def plan_frame(
     """Memory plan of a frame, without training. floats: parameters of a Gaussian (`ShStorage.floats`); features: floats
     of each Gaussian's that go into channels beside colour; planes: bytes of a pixel in further planes. Raises
     CapacityError."""
-    beside = {"slot": 0, "statistics": 0, "features": features, "more": planes}
-    return _plan(device, gaussians, floats, [camera], config, training=False, **beside)
-
-
-def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:
-    """Pixels that a frame may have, for its planes to leave three quarters of the device's memory to the model and its
-    pairs, and to be allocated at all."""
-    each = 21 + (4 * (features + 4) if features else 0) + planes
-    largest = max(12, 4 * (features + 2) if features else 0, planes)
-    return min(device.budget // (4 * each), device.max_allocation // largest)
+    need = _frame_need(device, gaussians, floats, _plane_bytes(camera, _pixel_bytes(features, planes)), config)
+    return _plan(device, replace(need, row=need.row + 4 * features))
 
 
 def plan_step(
@@ -57,47 +53,62 @@ def plan_step(
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted. Raises
     CapacityError."""
-    floats = floats_of(coefficients)
-    statistics = 4 * (5 * fields.contributions + agreement)  # contributions and two epochs of two statistics each
-    return _plan(device, gaussians, floats, cameras, config, training=True, slot=fields.floats, statistics=statistics)
-
-
-def _plan(
-    device: Device,
-    gaussians: int,
-    floats: int,
-    cameras: Iterable[Camera],
-    config: RasterizerConfig,
-    *,
-    training: bool,
-    slot: int,
-    statistics: int,
-    features: int = 0,
-    more: int = 0,
-) -> Plan:
-    switches = config.switches()
-    planes = loss = 0
+    planes = scratch = 0
     for camera in cameras:
-        tiles_x, tiles_y = tiles_of(camera)
-        pixels, stride = tiles_x * tiles_y * TILE * TILE, tiles_x * TILE
-        scratch = 5 * 3 * 4 * camera.height * (stride + 2 * PAD) + 9 * 4 * camera.height * stride
-        sums = 9 * 4 * camera.height * strips(device)
-        # image, transmittance, stops; ranges, counts_by_tile; in training target, its source, image_gradient
-        own = 20 * pixels + 12 * tiles_x * tiles_y + ((24 + _SOURCE) * pixels + sums if training else 0)
-        own += 4 * (features + 4) * pixels if features else 0  # with median, first, count and index
-        own += more * pixels
-        loss = max(loss, scratch if training else 0)
-        planes = max(planes, own)
-    longest = max(gaussians, device.budget // 36)
-    need = Need(
-        gaussians=gaussians,
-        floats=floats,
-        models=4 if training else 1,
-        slot=slot,
-        planes=planes + loss,
-        loss=loss,
-        scratch=scratch_bytes(device, longest) + _SMALL,
-        sorts_pairs=switches.depth_sort == "pairs",
-        extra=statistics + 4 * features + (0 if switches.frustum_cull and switches.opacity_cull else 4),
+        pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES)
+        planes = max(planes, pixels + loss.sums_bytes(device, camera.height))
+        scratch = max(scratch, loss.scratch_bytes(camera.height, tiles_of(camera)[0] * TILE))
+    frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
+    screen = project.SCREEN_BYTES + 4 * fields.contributions
+    statistics = density.gaussian_bytes(agreement=agreement, contributions=fields.contributions)
+    step = replace(
+        frame,
+        row=frame.row + screen + statistics,
+        banded=frame.banded + 4 * fields.floats,
+        model=_MODELS * frame.model,
+        pair=frame.pair + blend.gradient_pair_bytes(fields),
+        most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS),
+        planes=planes + scratch,
+        loss=scratch,
     )
+    return _plan(device, step)
+
+
+def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:
+    """Pixels that a frame may have, for its planes to leave three quarters of the device's memory to the model and its
+    pairs, and to be allocated at all."""
+    per_pixel = _pixel_bytes(features, planes) + 1  # with its share of the tile's
+    largest = max(12, 4 * (features + 2) if features else 0, planes)
+    return min(device.budget // (4 * per_pixel), device.max_allocation // largest)
+
+
+def _pixel_bytes(features: int = 0, planes: int = 0) -> int:
+    return blend.PIXEL_BYTES + (4 * (features + _CHANNEL_PLANES) if features else 0) + planes
+
+
+def _plane_bytes(camera: Camera, pixel_bytes: int) -> int:
+    tiles_x, tiles_y = tiles_of(camera)
+    return tiles_x * tiles_y * (TILE * TILE * pixel_bytes + ranges.TILE_BYTES + duplicate.TILE_BYTES)
+
+
+def _frame_need(device: Device, gaussians: int, floats: int, planes: int, config: RasterizerConfig) -> Need:
+    """The need of a frame without channels. planes: bytes of all that is as large as the image."""
+    switches = config.switches()
+    keeps_culled = not (switches.frustum_cull and switches.opacity_cull)
+    pair = duplicate.pair_bytes(sorts_pairs=switches.depth_sort == "pairs") + ranges.PAIR_BYTES
+    return Need(
+        gaussians=gaussians,
+        row=project.gaussian_bytes(keeps_culled=keeps_culled) + duplicate.GAUSSIAN_BYTES,
+        banded=duplicate.BAND_BYTES,
+        model=4 * floats,
+        widest=4 * max(floats - floats_of(1), 4),  # of the higher SH bands, or quaternions
+        pair=pair,
+        most_pairs=min(device.max_allocation // 4, MAX_PAIRS),
+        planes=planes,
+        loss=0,
+        scratch=scratch_bytes(device, max(gaussians, device.budget // pair)) + _SMALL,
+    )
+
+
+def _plan(device: Device, need: Need) -> Plan:
     return plan(need, device.budget, device.max_allocation, device.row_alignment)

@@ -17,42 +17,22 @@ def mebibytes(nbytes: int) -> str:
 class Need:
     """Device memory that a frame, or a training step, needs, in bytes unless said otherwise.
 
-    gaussians: their number; floats: parameters of one; models: arrays of `floats` parameters, 1 for a frame and 4 for a
-    step; slot: floats of a pair's slot, 0 for a frame; planes: all that is as large as the image; loss: the loss's
-    scratch memory, a part of that; scratch: whatever is left over; sorts_pairs: True if all pairs are sorted by depth;
-    extra: bytes of each Gaussian that switches and statistics add.
+    gaussians: their number; model: each one's parameters, in a step with gradients and moments; widest: each one's part
+    of the widest of these arrays; row: of each, all the rest; banded: of each, what several bands of tiles add; pair:
+    of each pair; most_pairs: their number at which the widest of their arrays is full; planes: all that is as large as
+    the image; loss: the loss's scratch memory, a part of that; scratch: whatever is left over.
     """
 
     gaussians: int
-    floats: int
-    models: int
-    slot: int
+    model: int
+    widest: int
+    row: int
+    banded: int
+    pair: int
+    most_pairs: int
     planes: int
     loss: int
     scratch: int
-    sorts_pairs: bool = False
-    extra: int = 0
-
-    @property
-    def row(self) -> int:
-        """Bytes of each Gaussian, beside its parameters: splat, counts, scans, sort by depth; screen and statistics."""
-        return 64 + 12 + 36 + (20 if self.slot else 0) + self.extra
-
-    @property
-    def banded_row(self) -> int:
-        """`row`, with what several bands of tiles want: counts of the band, sums of slots."""
-        return self.row + 4 + 4 * self.slot
-
-    @property
-    def model(self) -> int:
-        """Bytes of each Gaussian's parameters, gradients and moments."""
-        return 4 * self.floats * self.models
-
-    @property
-    def pair(self) -> int:
-        """Bytes of each pair: keys, sort, lists; slot and cells where there is a gradient."""
-        gradient = 4 * self.slot + 4 if self.slot else 0
-        return 36 + (24 if self.sorts_pairs else 0) + gradient
 
     @property
     def pairs(self) -> int:
@@ -68,27 +48,34 @@ class Need:
 PAIRS_EACH = 8
 """Tiles that a Gaussian reaches, as a guess. Trained scenes have 3 to 8."""
 
-_MAX_PAIRS = 2**31 - 1024
-
 
 @dataclass(frozen=True)
 class Plan:
     """Division of the work, so that it fits the memory.
 
     rows: Gaussians whose parameters, gradients and moments are on the device at once; streamed: not all of them; pairs:
-    most (tile, Gaussian) pairs at once; channels: of the loss, at once; gathers: rows move on the device; needed and
-    allowed: bytes, the first estimated; groups: of tiles, estimated too.
+    most (tile, Gaussian) pairs at once; channels: of the loss, at once; gathers: rows move on the device; allowed:
+    bytes; groups: of tiles, estimated.
     """
 
-    gaussians: int
+    need: Need
     rows: int
     streamed: bool
     pairs: int
     channels: int
     gathers: bool
-    needed: int
     allowed: int
     groups: int
+
+    @property
+    def gaussians(self) -> int:
+        """The number that it was made for."""
+        return self.need.gaussians
+
+    @property
+    def needed(self) -> int:
+        """Bytes with everything at once, estimated."""
+        return self.need.total
 
     @property
     def pieces(self) -> tuple[bool, bool, bool]:
@@ -119,24 +106,22 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
 
     alignment: what the number of rows is a multiple of. Raises CapacityError where not even the smallest pieces fit.
     """
-    widest = 4 * max(need.floats - 14, 4)
-    most_pairs = min(max_allocation // (4 * max(need.slot, 1)), _MAX_PAIRS)
     channels = 3 if need.total <= budget and need.loss * 4 // 5 <= max_allocation else 1
     planes = need.planes - (need.loss * 2 // 3 if channels == 1 else 0)
-    room = budget - planes - need.scratch - need.gaussians * need.banded_row
+    room = budget - planes - need.scratch - need.gaussians * (need.row + need.banded)
 
     def made(rows: int, *, streamed: bool) -> Plan:
-        pairs = min((room - rows * need.model) // need.pair, most_pairs)
+        pairs = min((room - rows * need.model) // need.pair, need.most_pairs)
         gathers = not streamed and need.total + need.gaussians * need.model * 3 // 4 <= budget
-        groups = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > most_pairs else 1
-        return Plan(need.gaussians, rows, streamed, pairs, channels, gathers, need.total, budget, groups)
+        groups = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > need.most_pairs else 1
+        return Plan(need, rows, streamed, pairs, channels, gathers, budget, groups)
 
     whole = made(need.gaussians, streamed=False)
     enough = min(need.pairs // 8, need.gaussians) + 1
-    if need.gaussians * widest <= max_allocation and whole.pairs >= enough:
+    if need.gaussians * need.widest <= max_allocation and whole.pairs >= enough:
         return whole
     for_rows = min(room // 4, room - need.gaussians * need.pair)  # a tile may have all Gaussians
-    rows = max(min(for_rows // need.model, max_allocation // widest, need.gaussians), alignment)
+    rows = max(min(for_rows // need.model, max_allocation // need.widest, need.gaussians), alignment)
     rows -= rows % alignment
     streamed = made(rows, streamed=True)
     if streamed.pairs < 1:

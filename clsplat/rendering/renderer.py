@@ -14,9 +14,8 @@ from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.config.memory import parse_bytes
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device.buffers import DeviceArray, allocate, upload
+from clsplat.device.buffers import allocate, upload
 from clsplat.device.context import Device, open_device
-from clsplat.device.layout import CAMERA
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.memory_needs import plan_frame
@@ -70,7 +69,6 @@ class Renderer:
         self._sh: tuple[Gaussians, ShStorage] | None = None
         self._held: AnyGaussians | None = None
         self._planned: tuple[object, ...] | None = None
-        self._after: DeviceArray | None = None
 
     def render(
         self,
@@ -87,9 +85,7 @@ class Renderer:
         ValueError for arrays that are not as `Gaussians` says, InputError for a camera that is none.
         """
         camera.check()
-        if isinstance(gaussians, Gaussians):
-            camera = gaussians.local(camera)
-        on_device = self._hold(gaussians, camera) if isinstance(gaussians, Gaussians) else gaussians
+        on_device, camera = self._placed(gaussians, camera)
         return self._result(self._forward(on_device, camera, background), contiguous=contiguous)
 
     def render_channels(
@@ -107,7 +103,7 @@ class Renderer:
         wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None. The
         rest is like `render`. Raises InputError for motion from one projection to another.
         """
-        of = Features.of(wanted)
+        features = Features.of(wanted)
         after = after or camera
         camera.check()
         after.check()
@@ -116,33 +112,28 @@ class Renderer:
                 f"motion goes from a camera to one that is {after.projection}, expected {camera.projection}"
             )
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
-        if isinstance(gaussians, Gaussians):
-            camera, after = gaussians.local(camera), gaussians.local(after)
-        on_device = self._hold(gaussians, camera, of.floats) if isinstance(gaussians, Gaussians) else gaussians
+        on_device, camera = self._placed(gaussians, camera, features.floats)
+        after = gaussians.local(after) if isinstance(gaussians, Gaussians) else after
         frame = self._forward(on_device, camera, background)
-        if self._after is None:
-            self._after = allocate(self.device, (len(CAMERA),), np.float32)
-        self._after.set(pack_camera(after))
-        found = self._rasterizer.channels(on_device, frame, of, self._after)
+        planes = self._rasterizer.channels(on_device, frame, features, upload(self.device, pack_camera(after)))
         height, width = camera.height, camera.width
-        means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (found.means, found.whole))
+        means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (planes.means, planes.whole))
         if contiguous:
             means, whole = np.ascontiguousarray(means), np.ascontiguousarray(whole)
-        planes = of.named(means, whole)
-        if "position" in planes and origin.any():  # in the world: float32 keeps what it can of that
-            shown = planes["count"][:, :, None] > 0
-            planes["position"] = np.where(shown, planes["position"] + origin, 0).astype(np.float32)
-        return self._result(frame, contiguous=contiguous), planes
+        named = features.named(means, whole)
+        if "position" in named and origin.any():  # in the world: float32 keeps what it can of that
+            shown = named["count"][:, :, None] > 0
+            named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
+        return self._result(frame, contiguous=contiguous), named
 
     def render_deep(self, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
         """(bins, H, W, 6): the view in slices by depth, the next of which begins at each of the bounds (bins - 1,):
         red, green, blue, associated with alpha; alpha; least and largest depth. All 0 where there is nothing."""
         camera.check()
-        bins, camera = len(bounds) + 1, gaussians.local(camera)
-        on_device = self._hold(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
+        on_device, camera = self._placed(gaussians, camera, planes=4 * DEEP_FLOATS * (len(bounds) + 1))
         frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
-        found = self._rasterizer.deep(frame, upload(self.device, np.append(bounds, np.inf).astype(np.float32)))
-        planes = found.get()[:, :, : camera.height, : camera.width]
+        slices = self._rasterizer.deep(frame, upload(self.device, np.append(bounds, np.inf).astype(np.float32)))
+        planes = slices.get()[:, :, : camera.height, : camera.width]
         return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
 
     def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:
@@ -159,9 +150,13 @@ class Renderer:
         alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(image) if contiguous else image, alpha)
 
-    def _hold(self, gaussians: Gaussians, camera: Camera, features: int = 0, planes: int = 0) -> AnyGaussians:
-        """The model on the device, or on the host if a frame of this size leaves too little room for it. planes: bytes
-        of a pixel beside the picture's."""
+    def _placed(
+        self, gaussians: Gaussians | AnyGaussians, camera: Camera, features: int = 0, planes: int = 0
+    ) -> tuple[AnyGaussians, Camera]:
+        """The model on the device, or on the host if a frame of this size leaves too little room for it; and the camera
+        that counts from where it does. planes: bytes of a pixel beside the picture's."""
+        if not isinstance(gaussians, Gaussians):
+            return gaussians, camera
         if self._sh is None or self._sh[0] is not gaussians:
             gaussians.check()
             self._sh = self._held = None
@@ -178,7 +173,7 @@ class Renderer:
         if self._held is None:
             rows = self._rows
             self._held = host_gaussians(gaussians, rows, sh) if rows else upload_gaussians(self.device, gaussians, sh)
-        return self._held
+        return self._held, gaussians.local(camera)
 
 
 def render(

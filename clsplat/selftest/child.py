@@ -26,14 +26,12 @@ from clsplat.selftest.scenes import scenes
 from clsplat.selftest.stages import RUN
 from clsplat.stages.blend import tile_items
 from clsplat.stages.channels import WIDTHS, Features
-from clsplat.stages.deep import DEEP_FLOATS
 
 DIGESTS = Path(__file__).with_name("digests.json")
 _FEATURES = Features.of(WIDTHS).defines
 BUILT_WITH: dict[str, dict[str, object]] = {
     "features": {**_FEATURES, "LANES": 1},
     "channels": _FEATURES,
-    "deep": {"DEEP_SIZE": DEEP_FLOATS},
     "project_rays": {"LANES": 1, "RAYS": 1},
 }
 """Defines of the kernels that are not built without."""
@@ -42,8 +40,8 @@ BUILT_WITH: dict[str, dict[str, object]] = {
 @cache
 def stored_digests() -> dict[str, Any]:
     """Digests by scene and stage: of all drivers and shapes, or by shape where the order of sums is the shape's."""
-    found: dict[str, Any] = json.loads(DIGESTS.read_text())["digests"]
-    return found
+    digests: dict[str, Any] = json.loads(DIGESTS.read_text())["digests"]
+    return digests
 
 
 def shape_label(device: Device) -> str:
@@ -57,12 +55,12 @@ def run(
     quick: bool = False,
     stages: Sequence[str] = STAGES,
     say: Callable[[str], None] = lambda name: None,
-    found: dict[str, str] | None = None,
+    digests: dict[str, str] | None = None,
 ) -> Iterator[Result]:
     """The stages one after the other, each on all scenes; it ends early where the next would read or write beside its
     arrays.
 
-    say: is told the stage that begins. found: gets the digests by "scene/stage".
+    say: is told the stage that begins. digests: gets those of this run by "scene/stage".
     """
     benches = [Bench(device, frozen) for frozen in scenes(quick=quick)]
     for name in stages:
@@ -76,9 +74,9 @@ def run(
             except Exception as error:  # noqa: BLE001  # drivers, and sizes that a wrong kernel has made, raise anything
                 text = " ".join(str(error).split())[:300]
                 outcomes.append(Outcome([], {}, 0.0, f"{type(error).__name__}: {text}"))
-        if found is not None:
-            names = [f"{bench.frozen.name}/{name}" for bench in benches]
-            found.update({key: digest_of(each.arrays) for key, each in zip(names, outcomes, strict=True)})
+        if digests is not None:
+            for bench, outcome in zip(benches, outcomes, strict=True):
+                digests[f"{bench.frozen.name}/{name}"] = digest_of(outcome.arrays)
         result = _result(name, benches, outcomes)
         yield result
         if result.trouble and name in INDICES:
@@ -86,7 +84,7 @@ def run(
 
 
 def _result(name: str, benches: list[Bench], outcomes: list[Outcome]) -> Result:
-    errors = [(ulp, absolute, of) for each in outcomes for of, (absolute, ulp) in each.errors.items()]
+    errors = [(ulp, absolute, place) for outcome in outcomes for place, (absolute, ulp) in outcome.errors.items()]
     ulp, _, where = max(errors, default=(0.0, 0.0, ""))
     same: list[bool | None] = []
     for bench, outcome in zip(benches, outcomes, strict=True):
@@ -100,8 +98,8 @@ def _result(name: str, benches: list[Bench], outcomes: list[Outcome]) -> Result:
         ulp=ulp,
         bound=BOUNDS[name][0],
         same_bits=False if False in same else (None if None in same else True),
-        ms=sum(each.ms for each in outcomes),
-        trouble=next((each.trouble for each in outcomes if each.trouble), ""),
+        ms=sum(outcome.ms for outcome in outcomes),
+        trouble=next((outcome.trouble for outcome in outcomes if outcome.trouble), ""),
         where=where,
         otherwise=outcomes[0].otherwise,
     )

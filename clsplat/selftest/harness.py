@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
@@ -77,6 +78,12 @@ def digest_of(arrays: Sequence[Array]) -> str:
     for array in arrays:
         total = zlib.crc32(np.ascontiguousarray(array).tobytes(), total)
     return f"{total:08x}"
+
+
+def cropped(planes: Array, camera: Camera) -> Array:
+    """(H, W) or (H, W, fields) of planes with their padding."""
+    inside = planes[..., : camera.height, : camera.width]
+    return inside.transpose(1, 2, 0) if inside.ndim == 3 else inside
 
 
 class Bench:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.camera import Camera, Projection
+from clsplat.camera import PROJECTIONS, Camera, Projection
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.layout import RAY
 from clsplat.reference import channels as reference_channels
@@ -20,7 +20,7 @@ from clsplat.reference import every_pixel
 from clsplat.reference import rays as reference_rays
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
-from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, worst, wrong_counts
+from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, worst, wrong_counts
 from clsplat.stages.blend import Blended, blend
 from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
 from clsplat.stages.deep import deep
@@ -36,7 +36,7 @@ DOUBT = 1e-5
 """Margin like `harness.MARGIN`, of the light that is left to one half, and of the two largest weights."""
 
 FEW = 500
-"""Gaussians whose picture around the camera the reference has in a second: it has each at every pixel."""
+"""Gaussians whose picture around the camera the reference makes in a second: it looks at each at every pixel."""
 
 
 def _after(camera: Camera) -> Camera:
@@ -75,14 +75,14 @@ def _features(bench: Bench) -> Outcome:
 
 def _channels(bench: Bench) -> Outcome:
     device, camera = bench.device, bench.camera
-    of = (bench.features, bench.lists, bench.projected, bench.blended, camera.height)
+    arguments = (bench.features, bench.lists, bench.projected, bench.blended, camera.height)
     _, arrays, ms, trouble = bench.twice(
-        lambda: channels(device, bench.work, ALL, *of), lambda found: [found.means.get(), found.whole.get()]
+        lambda: channels(device, bench.work, ALL, *arguments), lambda planes: [planes.means.get(), planes.whole.get()]
     )
     splats, frame = bench.splats(), bench.blend_reference()
     order = depth_order(splats.depths, splats.visible)
     wanted = reference_channels.channels(splats, order, camera, _after(camera), **_geometry(bench))
-    means, whole = (_cropped(planes, camera) for planes in arrays)
+    means, whole = (cropped(planes, camera) for planes in arrays)
     assert frame.margin is not None
     sure = (frame.margin > MARGIN) & (wanted.doubt > DOUBT)
     # a sum that cancels, as normals may where little is opaque, has no digits of its own
@@ -93,7 +93,8 @@ def _channels(bench: Bench) -> Outcome:
     }
     parts["median"] = (means[sure, -2], wanted.median[sure])
     parts["first"] = (means[sure, -1], wanted.first[sure])
-    counts, indices = (int((whole[sure, k] != of[sure]).sum()) for k, of in enumerate((wanted.count, wanted.index)))
+    counts = int((whole[sure, 0] != wanted.count[sure]).sum())
+    indices = int((whole[sure, 1] != wanted.index[sure]).sum())
     return Outcome(arrays, worst(parts), ms, trouble or wrong_counts(counts=counts, indices=indices))
 
 
@@ -101,8 +102,10 @@ def _deep(bench: Bench) -> Outcome:
     device, camera = bench.device, bench.camera
     bounds = np.array([1.75, 2.5, 4.0], np.float32)
     given = upload(device, np.append(bounds, np.float32(0)))
-    of = (bench.lists, bench.projected.splats, bench.blended, camera.height)
-    _, (planes,), ms, trouble = bench.twice(lambda: deep(device, bench.work, given, *of), lambda slices: [slices.get()])
+    arguments = (bench.lists, bench.projected.splats, bench.blended, camera.height)
+    _, (planes,), ms, trouble = bench.twice(
+        lambda: deep(device, bench.work, given, *arguments), lambda slices: [slices.get()]
+    )
     splats, margin = bench.splats(), bench.blend_reference().margin
     assert margin is not None
     order = depth_order(splats.depths, splats.visible)
@@ -112,17 +115,14 @@ def _deep(bench: Bench) -> Outcome:
     return Outcome([planes], worst({name: (got[..., at], wanted[..., at]) for name, at in fields.items()}), ms, trouble)
 
 
-_PROJECTIONS: dict[Projection, int] = {"equirectangular": 1, "fisheye": 2}
-
-
 def _rays(bench: Bench) -> Outcome:
     """Projection to tangent planes, and a frame with a channel of it, for both kinds of camera."""
-    outcomes = [_of_rays(bench, projection) for projection in _PROJECTIONS]
+    outcomes = [_of_rays(bench, name) for name, kind in PROJECTIONS.items() if not kind.flat]
     return Outcome(
-        [array for each in outcomes for array in each.arrays],
-        {name: error for each in outcomes for name, error in each.errors.items()},
-        sum(each.ms for each in outcomes),
-        next((each.trouble for each in outcomes if each.trouble), ""),
+        [array for outcome in outcomes for array in outcome.arrays],
+        {name: error for outcome in outcomes for name, error in outcome.errors.items()},
+        sum(outcome.ms for outcome in outcomes),
+        next((outcome.trouble for outcome in outcomes if outcome.trouble), ""),
     )
 
 
@@ -138,7 +138,7 @@ def _amid(camera: Camera, projection: Projection) -> Camera:
 
 
 def _of_rays(bench: Bench, projection: Projection) -> Outcome:
-    device = bench.device.with_switches({"RAYS": _PROJECTIONS[projection]})
+    device = bench.device.with_switches(PROJECTIONS[projection].defines)
     # memory of its own: the next stages want what those before have made
     work, camera, gaussians = Workspace(device), _amid(bench.camera, projection), bench.frozen.gaussians
     camera_array = upload(device, pack_camera(camera))
@@ -146,24 +146,20 @@ def _of_rays(bench: Bench, projection: Projection) -> Outcome:
 
     def launch() -> tuple[Projected, Blended, Channels]:
         projected = project(device, work, bench.model, camera, camera_array)
-        counted = count(device, work, projected.splats, projected.tile_counts)
-        lists = tile_lists(
-            device,
-            work,
-            duplicate(device, work, projected.splats, counted, bench.tiles, bench.band),
-            bench.band.tiles,
-        )
-        of = (projected.splats, bench.background, camera.width, camera.height)
-        blended = blend(device, work, lists, *of, record=False, camera_array=camera_array)
+        counted = count(device, work, projected)
+        pairs = duplicate(device, work, projected.splats, counted, bench.tiles, bench.band)
+        lists = tile_lists(device, work, pairs, bench.band)
+        pixels = (projected.splats, bench.background, camera.width, camera.height)
+        blended = blend(device, work, lists, *pixels, record=False, camera_array=camera_array)
         rows = features(device, work, depth, bench.model, camera_array, camera_array, projected)
         of_channels = (rows, lists, projected, blended, camera.height)
         return projected, blended, channels(device, work, depth, *of_channels, camera_array=camera_array)
 
-    def take(found: tuple[Projected, Blended, Channels]) -> list[Array]:
-        projected, blended, beside = found
+    def take(frame: tuple[Projected, Blended, Channels]) -> list[Array]:
+        projected, blended, planes = frame
         counts = projected.tile_counts.get()
-        own = [projected.splats.get()[counts > 0], counts]
-        return [*own, blended.image.get(), blended.transmittance.get(), beside.means.get(), beside.whole.get()]
+        arrays = (blended.image, blended.transmittance, planes.means, planes.whole)
+        return [projected.splats.get()[counts > 0], counts, *(array.get() for array in arrays)]
 
     _, arrays, ms, trouble = bench.twice(launch, take)
     splats, counts, image, left, means, _ = arrays
@@ -173,9 +169,9 @@ def _of_rays(bench: Bench, projection: Projection) -> Outcome:
         picture = every_pixel.render(gaussians, camera, bench.frozen.background.astype(np.float64))
         clear = picture.margin > 3 * MARGIN  # directions of float32 are good to 1e-7, a pixel is 0.1
         solid = clear & (picture.alpha > 0.5)
-        parts["image"] = (_cropped(image, camera)[clear], picture.image[clear])
-        parts["transmittance"] = (_cropped(left, camera)[clear], 1 - picture.alpha[clear])
-        parts["mean depth"] = (_cropped(means, camera)[solid, 0], picture.depth[solid])
+        parts["image"] = (cropped(image, camera)[clear], picture.image[clear])
+        parts["transmittance"] = (cropped(left, camera)[clear], 1 - picture.alpha[clear])
+        parts["mean depth"] = (cropped(means, camera)[solid, 0], picture.depth[solid])
     hidden = int((shown & ~tangents.visible).sum())
     errors = {f"{name}, {projection}": error for name, error in worst(parts).items()}
     return Outcome(arrays, errors, ms, trouble or wrong_counts(hidden_Gaussians=hidden))
@@ -200,12 +196,6 @@ def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array)
         "log2 of opacity": (column("LOG2O"), np.log2(tangents.opacities[shown, None])),
         "colour": (column("RED", "GREEN", "BLUE"), tangents.colors[shown]),
     }
-
-
-def _cropped(planes: Array, camera: Camera) -> Array:
-    """(H, W) or (H, W, fields) of planes with their padding."""
-    inside = planes[..., : camera.height, : camera.width]
-    return inside.transpose(1, 2, 0) if inside.ndim == 3 else inside
 
 
 PICTURES: dict[str, Callable[[Bench], Outcome]] = {

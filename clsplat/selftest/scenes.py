@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.device.layout import TILE
 from clsplat.gaussians import Gaussians
+from clsplat.stages.device_camera import padded_size
 
 STEPS = 1 << 12
 """Values between two ends."""
@@ -53,15 +53,11 @@ class Frozen:
     background: Float32
     photograph: Float32
 
-    def image_gradient(self) -> Float32:
-        """(3, rows, stride), zero in the padding."""
-        return padded(self.camera, 31, -0.5, 0.5)
-
 
 def padded(camera: Camera, seed: int, low: float, high: float) -> Float32:
     """Planes (3, rows, stride) of noise in the image and zeros beside it."""
     height, width = camera.height, camera.width
-    planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
+    planes = np.zeros((3, *padded_size(width, height)), np.float32)
     planes[:, :height, :width] = evenly(seed, (3, height, width), low, high)
     return planes
 

@@ -14,7 +14,7 @@ from clsplat.arrays import Float64
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.launch import launch_items
-from clsplat.device.layout import SLOT_PLAIN, SPLAT, TILE
+from clsplat.device.layout import SLOT, SLOT_PLAIN, SPLAT, TILE
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference import adam as reference_adam
 from clsplat.reference import blend as reference_blend
@@ -23,9 +23,9 @@ from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
 from clsplat.reference.tiles import touched_tiles
-from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, worst, wrong_counts
+from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, worst, wrong_counts
 from clsplat.selftest.picture_stages import PICTURES
-from clsplat.selftest.scenes import evenly, keys
+from clsplat.selftest.scenes import evenly, keys, padded
 from clsplat.stages.adam import adam
 from clsplat.stages.blend import blend, blend_grad
 from clsplat.stages.density import add_statistics, new_statistics
@@ -35,6 +35,10 @@ from clsplat.stages.loss import loss
 from clsplat.stages.project import Projected, Screen, Slots, project, project_grad
 from clsplat.stages.ranges import tile_lists
 from clsplat.stages.sort import bitonic_sort, radix_sort
+
+MOMENTS = slice(SLOT.index("G"), SLOT.index("GVV") + 1)
+COLOUR = slice(SLOT.index("RED"), SLOT.index("BLUE") + 1)
+"""Fields of a slot."""
 
 
 def _arithmetic(bench: Bench) -> Outcome:
@@ -91,7 +95,7 @@ def _project(bench: Bench) -> Outcome:
         }
     )
     touched = touched_tiles(wanted, camera.width, camera.height, TILE, reference_project.ALPHA_MIN * (1 + 1e-5))
-    too_few = sum(len(tiles) > found for tiles, found in zip(touched, arrays[1], strict=True))
+    too_few = sum(len(tiles) > listed for tiles, listed in zip(touched, arrays[1], strict=True))
     return Outcome(
         arrays,
         errors,
@@ -113,7 +117,7 @@ def _duplicate(bench: Bench) -> Outcome:
     device, work, projected = bench.device, bench.work, bench.projected
 
     def launch() -> Pairs:
-        bench.counted = count(device, work, projected.splats, projected.tile_counts)
+        bench.counted = count(device, work, projected)
         return duplicate(device, work, projected.splats, bench.counted, bench.tiles, bench.band)
 
     bench.pairs, arrays, ms, trouble = bench.twice(
@@ -148,14 +152,14 @@ def _sort(bench: Bench) -> Outcome:
     on_device = [upload(device, values) for values in given]
 
     def launch() -> list[DeviceArray]:
-        found: list[DeviceArray] = []
+        results: list[DeviceArray] = []
         for index, ((_, bits, radix), values) in enumerate(zip(sizes, on_device, strict=True)):
             name = f"sorted{index}"
             both = radix_sort(device, work, name, values, bits) if radix else bitonic_sort(device, work, name, values)
-            found += both
-        return found
+            results += both
+        return results
 
-    _, arrays, ms, trouble = bench.twice(launch, lambda found: [array.get() for array in found])
+    _, arrays, ms, trouble = bench.twice(launch, lambda results: [array.get() for array in results])
     wrong = 0
     for values, got, positions in zip(given, arrays[::2], arrays[1::2], strict=True):
         order = np.argsort(values, kind="stable")
@@ -165,7 +169,7 @@ def _sort(bench: Bench) -> Outcome:
 
 def _ranges(bench: Bench) -> Outcome:
     bench.lists, arrays, ms, trouble = bench.twice(
-        lambda: tile_lists(bench.device, bench.work, bench.pairs, bench.band.tiles),
+        lambda: tile_lists(bench.device, bench.work, bench.pairs, bench.band),
         lambda lists: [lists.ranges.get(), lists.gaussian_from_sorted.get(), lists.slot_from_sorted.get()],
     )
     tile_keys, ids = bench.pairs.tile_keys.get(), bench.pairs.pair_ids.get()
@@ -180,39 +184,29 @@ def _ranges(bench: Bench) -> Outcome:
 
 def _blend(bench: Bench) -> Outcome:
     device, camera = bench.device, bench.camera
+    arguments = (bench.lists, bench.projected.splats, bench.background, camera.width, camera.height)
     bench.blended, arrays, ms, trouble = bench.twice(
-        lambda: blend(
-            device,
-            bench.work,
-            bench.lists,
-            bench.projected.splats,
-            bench.background,
-            camera.width,
-            camera.height,
-        ),
+        lambda: blend(device, bench.work, *arguments),
         lambda blended: [blended.image.get(), blended.transmittance.get(), blended.stops.get()],
     )
     wanted = bench.blend_reference()
     assert wanted.margin is not None
     clear = wanted.margin > MARGIN
-    image = arrays[0][:, : camera.height, : camera.width].transpose(1, 2, 0)
-    left = arrays[1][: camera.height, : camera.width]
-    errors = worst(
-        {
-            "image": (image[clear], wanted.image[clear]),
-            "transmittance": (left[clear], wanted.transmittance[clear]),
-        }
-    )
-    return Outcome(arrays, errors, ms, trouble)
+    image, transmittance = (cropped(planes, camera)[clear] for planes in arrays[:2])
+    parts = {
+        "image": (image, wanted.image[clear]),
+        "transmittance": (transmittance, wanted.transmittance[clear]),
+    }
+    return Outcome(arrays, worst(parts), ms, trouble)
 
 
 def _loss(bench: Bench) -> Outcome:
     device, camera = bench.device, bench.camera
     image, photograph = bench.blended.image, upload(device, bench.frozen.photograph)
     sides = (camera.width, camera.height)
-    found, arrays, ms, trouble = bench.twice(
+    result, arrays, ms, trouble = bench.twice(
         lambda: loss(device, bench.work, image, photograph, *sides, 0.2),
-        lambda found: [found.gradient.get()[:, : camera.height]],  # the rows below are not written
+        lambda result: [result.gradient.get()[:, : camera.height]],  # the rows below are not written
     )
     x, y = (_pixels(bench, planes) for planes in (image.get(), bench.frozen.photograph))
     value, gradient = reference_loss.l1_dssim(x, y)
@@ -220,7 +214,7 @@ def _loss(bench: Bench) -> Outcome:
     errors = worst(
         {
             "gradient": (_pixels(bench, arrays[0]), gradient),
-            "loss and error": (np.array(found.read()), np.array([value, mean_square])),
+            "loss and error": (np.array(result.read()), np.array([value, mean_square])),
         }
     )
     return Outcome(arrays, errors, ms, trouble)
@@ -228,15 +222,14 @@ def _loss(bench: Bench) -> Outcome:
 
 def _pixels(bench: Bench, planes: Array) -> Float64:
     """(3, rows, stride) to (H, W, 3) in float64."""
-    height, width = bench.camera.height, bench.camera.width
-    return planes[:, :height, :width].transpose(1, 2, 0).astype(np.float64)
+    return cropped(planes, bench.camera).astype(np.float64)
 
 
 def _blend_grad(bench: Bench) -> Outcome:
     device, camera, splats = bench.device, bench.camera, bench.splats()
     margin = bench.blend_reference().margin
     assert margin is not None
-    planes = bench.frozen.image_gradient()
+    planes = padded(camera, 31, -0.5, 0.5)
     exact = planes.copy()
     exact[:, : camera.height, : camera.width] *= margin > MARGIN
     arguments = (bench.lists, bench.projected.splats, bench.background, bench.blended)
@@ -257,7 +250,7 @@ def _blend_grad(bench: Bench) -> Outcome:
             "sum of g": (got[shown, :1], moments[shown, :1]),
             "first moments": (got[shown, 1:3], moments[shown, 1:3]),
             "second moments": (got[shown, 3:6], moments[shown, 3:6]),
-            "colour": (got[shown, 6:9], wanted.colors[shown]),
+            "colour": (got[shown, COLOUR], wanted.colors[shown]),
         }
     )
     return Outcome(arrays, errors, ms, trouble)
@@ -299,42 +292,35 @@ def _project_grad(bench: Bench) -> Outcome:
         project_grad(device, bench.model, bench.camera_array, bench.projected, slots, gradients, screen)
         return gradients, screen
 
-    def take(found: tuple[DeviceGaussians, Screen]) -> list[Array]:
-        return [*(found[0][group].get() for group in GROUPS), found[1].gradients.get()[visible]]
+    def take(results: tuple[DeviceGaussians, Screen]) -> list[Array]:
+        return [*(results[0][group].get() for group in GROUPS), results[1].gradients.get()[visible]]
 
     _, arrays, ms, trouble = bench.twice(launch, take)
     sums = _slot_sums(bench, values)
     splats = bench.splats()
     l11, l12, l22 = (WHITEN * splats.whitening).T
-    _, u, v, uu, uv, vv = sums[:, :6].T
+    _, u, v, uu, uv, vv = sums[:, MOMENTS].T
     d_means = -np.stack([l11 * u, l12 * u + l22 * v], axis=1) / WHITEN**2
     half = 0.5 / WHITEN**4
-    d_covariances = half * np.stack(
-        [
-            l11 * l11 * uu,
-            l11 * (l12 * uu + l22 * uv),
-            l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv,
-        ],
-        axis=1,
-    )
+    entries = [l11 * l11 * uu, l11 * (l12 * uu + l22 * uv), l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv]
+    d_covariances = half * np.stack(entries, axis=1)
     model = parameters(bench.frozen.gaussians)
     true = reference_project.project(**model, camera=bench.camera, sh_degree=bench.frozen.gaussians.sh_degree)
-    # conic_grad takes the derivative by sxy as one entry of the symmetric matrix, and undoes what project_grad does
-    d_conics = np.zeros_like(d_covariances)
-    d_conics[visible] = reference_project.conic_grad(true.covariances[visible], d_covariances[visible])
     wanted = reference_project.project_grad(
         **model,
         camera=bench.camera,
         sh_degree=bench.frozen.gaussians.sh_degree,
+        projected=true,
         d_means2d=d_means,
-        d_conics=d_conics,
-        d_opacities=sums[:, 0] / np.where(visible, true.opacities, 1.0),
-        d_colors=sums[:, 6:9],
+        d_covariances=d_covariances,
+        d_opacities=sums[:, SLOT.index("G")] / np.where(visible, true.opacities, 1.0),
+        d_colors=sums[:, COLOUR],
     )
-    names = ("means", "quaternions", "log_scales", "opacity_logits")
-    parts = {name: (got[visible], wanted[name][visible]) for name, got in zip(names, arrays[:4], strict=True)}
-    parts["SH"] = (np.concatenate([arrays[4][:, None], arrays[5]], axis=1)[visible], wanted["sh"][visible])
-    parts["means on the image"] = (arrays[6], d_means[visible])
+    got = dict(zip(GROUPS, arrays[: len(GROUPS)], strict=True))
+    parts = {name: (got[name][visible], wanted[name][visible]) for name in got if name in wanted}
+    sh = np.concatenate([got["sh_dc"][:, None], got["sh_rest"]], axis=1)
+    parts["SH"] = (sh[visible], wanted["sh"][visible])
+    parts["means on the image"] = (arrays[-1], d_means[visible])
     return Outcome(arrays, worst(parts), ms, trouble)
 
 
@@ -403,8 +389,8 @@ def _statistics(bench: Bench) -> Outcome:
             add_statistics(device, statistics, camera, bench.projected, screen, 1.0)
         return statistics
 
-    found, arrays, ms, trouble = bench.twice(launch, lambda s: [array.get() for array in s.named().values()])
-    got = dict(zip(found.named(), arrays, strict=True))
+    statistics, arrays, ms, trouble = bench.twice(launch, lambda s: [array.get() for array in s.named().values()])
+    got = dict(zip(statistics.named(), arrays, strict=True))
     norms = np.hypot(*(0.5 * np.array([camera.width, camera.height]) * values.astype(np.float64)).T) * visible
     sxx, sxy, syy = bench.splats().covariances.T
     radii = np.ceil(3 * np.sqrt(0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy))) * visible

@@ -68,25 +68,20 @@ class Report:
         )
 
 
-def command(index: int, shape: Shape, stages: Sequence[str], *, quick: bool) -> list[str]:
-    """The child."""
-    words = [str(index), str(shape.lanes), str(shape.items), ",".join(stages), *(["quick"] if quick else [])]
-    return python_module("clsplat.selftest.child", *words)
-
-
 def examine(index: int, shape: Shape, stages: Sequence[str] = STAGES, *, quick: bool = False) -> Report:
     """Test the `index`-th device in a process of its own; stages: in the order of STAGES, FORWARD among them."""
     report = Report(wanted=tuple(stages))
     begun, seconds = "starting", patience()
-    with Child(command(index, shape, stages, quick=quick)) as child:
+    words = [str(index), str(shape.lanes), str(shape.items), ",".join(stages), *(["quick"] if quick else [])]
+    with Child(python_module("clsplat.selftest.child", *words)) as child:
         try:
-            while (told := child.receive(seconds)) is not None:
-                begun = told.get("begins", begun)
-                report.build_seconds = told.get("built", report.build_seconds)
-                if "result" in told:
-                    report.results.append(Result(**told["result"]))
-                if "done" in told or "failed" in told:
-                    report.kernels, report.end = told.get("done", {}), told.get("failed", "")
+            while (message := child.receive(seconds)) is not None:
+                begun = message.get("begins", begun)
+                report.build_seconds = message.get("built", report.build_seconds)
+                if "result" in message:
+                    report.results.append(Result(**message["result"]))
+                if "done" in message or "failed" in message:
+                    report.kernels, report.end = message.get("done", {}), message.get("failed", "")
                     report.crashed = bool(report.end)
                     return report
             report.end, report.crashed = f"the process {child.ending(begun)}", child.crashed
@@ -109,13 +104,13 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
     failed, wanted = failures(cl_device), wanted_shape(cl_device)
     shapes = [shape for shape in (given, *shapes_in_turn(cl_device)) if shape.label not in failed]
     # where all have failed, the reason may be gone: the one that is wanted is tried anew
-    told = False
+    announced = False
     for shape in dict.fromkeys(shapes or [given]):
         tried = device if shape == given else device.with_shape(lanes=shape.lanes, items=shape.items)
         if not _has_passed(tried, stages):
-            if not told:
+            if not announced:
                 print(f"{_name(device)}: used for the first time, a short test of its driver", file=sys.stderr)
-            told = True
+            announced = True
             if failure := _short_test(tried, stages):
                 known.remember(cl_device, shape.label, failed=failure)
                 failed[shape.label] = failure
@@ -151,23 +146,12 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
         return report.end
     if report.end:
         raise DriverError(f"{_name(device)}: its test could not be made: {report.end}; {_ADVICE}")
-    _check(report, _name(device), _ADVICE)
-    known.remember(
-        device.cl_device,
-        device.shape.label,
-        stages=wanted,
-        kernels=report.kernels,
-        failed="",
-    )
-    return ""
-
-
-def _check(report: Report, name: str, advice: str) -> None:
-    """Raise DeviceError where the driver computes wrongly; warn where its bits are others."""
     if report.failure:
-        raise DeviceError(f"{name}: the driver {report.verdict}; {advice}")
+        raise DeviceError(f"{_name(device)}: the driver {report.verdict}; {_ADVICE}")
     if report.other_bits:
-        warnings.warn(f"{name}: {report.verdict}", stacklevel=3)
+        warnings.warn(f"{_name(device)}: {report.verdict}", stacklevel=2)
+    known.remember(device.cl_device, device.shape.label, stages=wanted, kernels=report.kernels, failed="")
+    return ""
 
 
 def examine_device(index: int) -> Report:

@@ -25,8 +25,6 @@ from clsplat.sequence.task import RenderOptions, Task, camera_after, header, pic
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
 
-_FLAT = ("perspective", "orthographic")
-"""Projections with an image plane; others have kernels of their own."""
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
 
@@ -102,7 +100,7 @@ class FrameRenderer:
 
     def _trust(self, camera: Camera) -> None:
         """Self-test what panoramas and fisheyes need before the first of them."""
-        if camera.projection in _FLAT or self._rays_tested:
+        if camera.kind.flat or self._rays_tested:
             return
 
         device = self._renderer.device

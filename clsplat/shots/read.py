@@ -66,8 +66,10 @@ def choose_shot(
         raise InputError(f"--count {count}: expected 1 to {MOST_FRAMES:,} frames")
     shot = read_shot(cameras, size=size, usd_camera=usd_camera)
     if path is not None:
-        if (kind := shot.frames[0].camera.projection) not in ("perspective", "orthographic"):
-            raise InputError(f"{cameras}: its cameras are {kind}, --path needs perspective or orthographic ones")
+        if not (first := shot.frames[0].camera).kind.flat:
+            raise InputError(
+                f"{cameras}: its cameras are {first.projection}, --path needs perspective or orthographic ones"
+            )
         made = numbered(PATHS[path](shot.cameras, COUNT if count is None else count))
         shot = Shot(made, shot.warnings, unapplied=shot.unapplied)
     far = min(frame.camera.far for frame in shot.frames)

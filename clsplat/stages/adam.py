@@ -11,12 +11,10 @@ from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
+from clsplat.device.layout import READBACK
 from clsplat.device.profile import stage
 from clsplat.gaussians import GROUPS
 from clsplat.stages.device_gaussians import DeviceGaussians
-
-REFUSED = ("parameters", "gradients", "moments", "steps")
-"""Reasons that adam.cl counts for refused steps of elements."""
 
 
 def updates_sh_rest(config: OptimiserConfig, step: int) -> bool:
@@ -35,15 +33,15 @@ def adam(
     first: DeviceGaussians,
     second: DeviceGaussians,
     tile_counts: DeviceArray,
-    found: DeviceArray | None = None,
+    readback: DeviceArray | None = None,
 ) -> None:
     """Step number `step` (from 1) with the constants of `config` and a rate per group; leaves the gradients zero.
 
-    tile_counts (n,) uint32: 0 where the view does not show a Gaussian, for `config.sparse`; found (8,) uint32: in its
-    last four are counted the elements that got no step because it, or what it comes from, is not finite (`REFUSED`).
+    tile_counts (n,) uint32: 0 where the view does not show a Gaussian, for `config.sparse`; readback (READBACK_SIZE,)
+    uint32: its last four count the elements that got no step, by the reason (`layout.REFUSED`).
     """
-    found = found or allocate(device, (4 + len(REFUSED),), np.uint32)
-    counts = found.buffer  # no array that a step goes through: it is touched where something is wrong
+    readback = readback or allocate(device, (len(READBACK),), np.uint32)
+    counts = readback.buffer  # no array that a step goes through: it is touched where something is wrong
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     lanes = device.shape.lanes
     for group, about in GROUPS.items():

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +15,16 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 from clsplat.device.layout import PLAIN_SLOTS, TILE, SlotFields
 from clsplat.device.profile import stage
-from clsplat.stages.duplicate import Band
+from clsplat.stages.device_camera import padded_size
 from clsplat.stages.ranges import TileLists
+
+PIXEL_BYTES = 20
+"""Bytes of each pixel with its padding: image, transmittance, stop."""
+
+
+def gradient_pair_bytes(fields: SlotFields) -> int:
+    """Bytes of each pair that its gradient needs: cells and a slot."""
+    return 4 + 4 * fields.floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +41,8 @@ class Blended:
 
 
 def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Image, transmittance and stops of a frame: the workspace's, whoever asks; kept: as the last one left them."""
-    rows, stride = -(-height // TILE) * TILE, -(-width // TILE) * TILE
+    """Image, transmittance and stops of a frame, in the workspace. kept: as the last call left them."""
+    rows, stride = padded_size(width, height)
     return (
         work.array("image", (3, rows, stride), kept=kept),
         work.array("transmittance", (rows, stride), kept=kept),
@@ -45,6 +55,16 @@ def tile_items(device: Device) -> int:
     return min(device.shape.items, TILE * TILE // device.shape.lanes)
 
 
+def launch_tiles(
+    device: Device, stem: str, defines: Mapping[str, object], lists: TileLists, tiles_x: int, *arguments: Any
+) -> None:
+    """Launch the kernel that is named like its file, with a group for each of the lists' tiles. The kernel's arguments
+    are the first tile, the tiles in a row of the image, and `arguments`."""
+    items = tile_items(device)
+    kernel = getattr(device.kernels(stem, ITEMS=items, **defines), stem)
+    launch_groups(device, kernel, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)
+
+
 @stage("blend")
 def blend(
     device: Device,
@@ -54,42 +74,32 @@ def blend(
     background: DeviceArray,
     width: int,
     height: int,
-    band: Band | None = None,
     *,
     record: bool = True,
     camera_array: DeviceArray | None = None,
 ) -> Blended:
-    """Blend the Gaussians of each of the band's tiles, all tiles if none is given, front to back over the background
-    (3,). Pixels of other tiles are left as they are.
+    """Blend the Gaussians of each of the lists' tiles front to back over the background (3,). Pixels of other tiles are
+    left as they are.
 
     record: keep the cells that the gradient has to go through, where the kernels' shape has them; camera_array: for
     pixels that are rays, which have no gradient.
     """
-    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    planes = _planes(work, width, height, kept=band is not None and band.first > 0)
-    items = tile_items(device)
-    cells = None
-    if record and not device.switched("RAYS") and items == 1 and device.shape.lanes >= 8:
+    planes = _planes(work, width, height, kept=lists.band.first > 0)
+    cells, rays = None, device.switched("RAYS")
+    if record and not rays and tile_items(device) == 1 and device.shape.lanes >= 8:
         cells = work.array("cells_from_sorted", lists.gaussian_from_sorted.shape, np.uint32)
-    defines = {"RECORD_CELLS": True} if cells else {}
-    launch_groups(
-        device,
-        device.kernels("blend", ITEMS=items, **defines).blend,
-        band.tiles if band else tiles_x * tiles_y,
-        items,
-        band.first if band else 0,
-        tiles_x,
-        width,
-        height,
-        lists.ranges,
-        lists.gaussian_from_sorted,
-        splats,
-        background,
-        *planes,
-        *([cells] if cells else []),
-        *([camera_array] if device.switched("RAYS") else []),
+    extra = ([cells] if cells else []) + ([camera_array] if rays else [])
+    _launch_blend(
+        device, {"RECORD_CELLS": True} if cells else {}, lists, width, height, splats, background, *planes, *extra
     )
     return Blended(*planes, cells)
+
+
+def _launch_blend(
+    device: Device, defines: Mapping[str, object], lists: TileLists, width: int, height: int, *arrays: Any
+) -> None:
+    listed = (lists.ranges, lists.gaussian_from_sorted)
+    launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *listed, *arrays)
 
 
 def count_pairs(
@@ -99,33 +109,15 @@ def count_pairs(
     splats: DeviceArray,
     background: DeviceArray,
     camera: Camera,
-    band: Band | None = None,
 ) -> tuple[int, int]:
     """(contributing, evaluated) pairs of a Gaussian and a pixel, by a build of blend.cl that counts them.
 
     Contributing: added to the pixel's colour. Evaluated: alpha was worked out, in a lane of a vector that was visited.
     """
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    items = tile_items(device)
-    planes = _planes(work, camera.width, camera.height, kept=True)  # those of `blend`: it writes the same values again
-    tiles = band.tiles if band else tiles_x * tiles_y
-    counts = work.array("counts", (tiles * items, 2), np.uint32)
-    launch_groups(
-        device,
-        device.kernels("blend", ITEMS=items, COUNT_PAIRS=True).blend,
-        tiles,
-        items,
-        band.first if band else 0,
-        tiles_x,
-        camera.width,
-        camera.height,
-        lists.ranges,
-        lists.gaussian_from_sorted,
-        splats,
-        background,
-        *planes,
-        counts,
-    )
+    size = (camera.width, camera.height)
+    planes = _planes(work, *size, kept=True)  # those of `blend`: it writes the same values again
+    counts = work.array("counts", (lists.band.tiles * tile_items(device), 2), np.uint32)
+    _launch_blend(device, {"COUNT_PAIRS": True}, lists, *size, splats, background, *planes, counts)
     contributing, evaluated = counts.get().sum(axis=0, dtype=np.uint64)
     return int(contributing), int(evaluated)
 
@@ -139,35 +131,20 @@ def blend_grad(
     background: DeviceArray,
     blended: Blended,
     image_gradient: DeviceArray,
-    band: Band | None = None,
     *,
     fields: SlotFields = PLAIN_SLOTS,
 ) -> DeviceArray:
-    """Partial gradients of every pair of the band at its slot, (pairs, fields.floats), from image_gradient (3, rows,
+    """Partial gradients of every pair of the lists at its slot, (pairs, fields.floats), from image_gradient (3, rows,
     stride)."""
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]
     slots = work.array("slots", (pairs, fields.floats))
-    items = tile_items(device)
+    if pairs == 0:
+        return slots
     cells = blended.cells_from_sorted
     defines = {**fields.defines, **({"RECORD_CELLS": True} if cells else {})}
-    launch_groups(
-        device,
-        device.kernels("blend_grad", ITEMS=items, **defines).blend_grad,
-        (band.tiles if band else (rows // TILE) * (stride // TILE)) if pairs else 0,
-        items,
-        band.first if band else 0,
-        stride // TILE,
-        rows,
-        lists.ranges,
-        lists.gaussian_from_sorted,
-        lists.slot_from_sorted,
-        splats,
-        background,
-        image_gradient,
-        blended.transmittance,
-        blended.stops,
-        slots,
-        *([cells] if cells else []),
-    )
+    listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
+    planes = (image_gradient, blended.transmittance, blended.stops)
+    arrays = (*listed, splats, background, *planes, slots, *([cells] if cells else []))
+    launch_tiles(device, "blend_grad", defines, lists, stride // TILE, rows, *arrays)
     return slots

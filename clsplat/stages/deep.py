@@ -5,15 +5,13 @@ from __future__ import annotations
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
-from clsplat.device.launch import launch_groups
-from clsplat.device.layout import TILE
+from clsplat.device.layout import DEEP, TILE
 from clsplat.device.profile import stage
-from clsplat.stages.blend import Blended, tile_items
-from clsplat.stages.duplicate import Band
+from clsplat.stages.blend import Blended, launch_tiles
 from clsplat.stages.ranges import TileLists
 
-DEEP_FLOATS = 6
-"""Floats of a pixel and bin: red, green, blue, associated with alpha; alpha; least and largest depth."""
+DEEP_FLOATS = len(DEEP)
+"""Floats of a pixel and bin."""
 
 
 @stage("deep")
@@ -25,30 +23,14 @@ def deep(
     splats: DeviceArray,
     blended: Blended,
     height: int,
-    band: Band | None = None,
     camera_array: DeviceArray | None = None,
 ) -> DeviceArray:
-    """(bins, DEEP_FLOATS, rows, stride), from what `blended` is of; the band's tiles, or all. bounds (bins - 1,): the
-    depths at which the next bin begins, with one more of any value; camera_array: for pixels that are rays."""
+    """(bins, DEEP_FLOATS, rows, stride) of the lists' tiles, which `blended` is of too. bounds (bins - 1,): the depths
+    at which the next bin begins, with one more of any value; camera_array: for pixels that are rays."""
     plane_rows, stride = blended.stops.shape
     bins = bounds.shape[0]
     planes = work.array("deep", (bins, DEEP_FLOATS, plane_rows, stride))
-    items = tile_items(device)
-    launch_groups(
-        device,
-        device.kernels("deep", ITEMS=items, DEEP_SIZE=DEEP_FLOATS).deep,
-        band.tiles if band else (plane_rows // TILE) * (stride // TILE),
-        items,
-        band.first if band else 0,
-        stride // TILE,
-        height,
-        bins,
-        bounds,
-        lists.ranges,
-        lists.gaussian_from_sorted,
-        splats,
-        blended.stops,
-        planes,
-        *([camera_array] if device.switched("RAYS") else []),
-    )
+    arrays = (bounds, lists.ranges, lists.gaussian_from_sorted, splats, blended.stops, planes)
+    rays = (camera_array,) if device.switched("RAYS") else ()
+    launch_tiles(device, "deep", {}, lists, stride // TILE, height, bins, *arrays, *rays)
     return planes

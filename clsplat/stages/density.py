@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,11 @@ from clsplat.stages.project import Projected, Screen
 
 NO_ROW = np.uint32(0xFFFFFFFF)
 """Entry of a list of rows that stands for a row of zeros."""
+
+
+def gaussian_bytes(*, agreement: bool, contributions: bool) -> int:
+    """Bytes of each Gaussian's statistics: sums, views, radii; agreeing views; two epochs of two contributions."""
+    return 4 * (3 + agreement + 4 * contributions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,23 +59,18 @@ class DensityStatistics:
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
         """The statistics of the Gaussians from start to before stop."""
-        parts = {
-            each.name: array.rows(start, stop)
-            for each in fields(self)
-            if (array := getattr(self, each.name)) is not None
-        }
-        return DensityStatistics(**parts)
+        arrays = {name: array.rows(start, stop) for name, array in vars(self).items() if array is not None}
+        return DensityStatistics(**arrays)
 
     def named(self) -> dict[str, DeviceArray]:
         """Every array by its name in a checkpoint."""
-        found = {}
-        for each in fields(self):
-            value = getattr(self, each.name)
+        arrays: dict[str, DeviceArray] = {}
+        for name, value in vars(self).items():
             if isinstance(value, EpochContributions):
-                found.update({f"{each.name}_totals": value.totals, f"{each.name}_largest": value.largest})
+                arrays |= {f"{name}_totals": value.totals, f"{name}_largest": value.largest}
             elif value is not None:
-                found[each.name] = value
-        return found
+                arrays[name] = value
+        return arrays
 
     def moved(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_], *, densified: bool) -> dict[str, Float32]:
         """The arrays that are kept, on the host by `named`, when row j becomes what row rows[j] was: contributions,
@@ -79,8 +79,8 @@ class DensityStatistics:
         if densified:
             going_on = {name: array for name, array in going_on.items() if name.startswith(("current_", "whole_"))}
         values = {name: array.get()[rows] for name, array in going_on.items()}
-        for each in values.values():
-            each[fresh] = np.inf
+        for array in values.values():
+            array[fresh] = np.inf
         return values
 
     def load(self, values: Mapping[str, Float32]) -> None:
@@ -131,36 +131,15 @@ def add_statistics(
     screen: Screen,
     threshold: float = 0.0,
 ) -> None:
-    """Add one view: the norm of each visible mean's gradient, from pixels to NDC, as the paper's threshold wants; where
-    agreeing views are counted, whether that is at least the threshold."""
+    """Add one view: the norm of each visible mean's gradient, in NDC as the paper's threshold is. Where agreeing views
+    are counted, those with at least the threshold count."""
     n = projected.tile_counts.shape[0]
     kernels = device.kernels("density")
     to_ndc = (0.5 * camera.width, 0.5 * camera.height)
-    launch_items(
-        device,
-        kernels.density_statistics,
-        n,
-        n,
-        *to_ndc,
-        projected.tile_counts,
-        screen.gradients,
-        projected.splats,
-        statistics.gradient_sums,
-        statistics.seen,
-        statistics.radii,
-    )
+    view, sums = (projected.tile_counts, screen.gradients), (statistics.gradient_sums, statistics.seen)
+    launch_items(device, kernels.density_statistics, n, n, *to_ndc, *view, projected.splats, *sums, statistics.radii)
     if statistics.agreeing is not None:
-        launch_items(
-            device,
-            kernels.view_agreement,
-            n,
-            n,
-            *to_ndc,
-            threshold,
-            projected.tile_counts,
-            screen.gradients,
-            statistics.agreeing,
-        )
+        launch_items(device, kernels.view_agreement, n, n, *to_ndc, threshold, *view, statistics.agreeing)
 
 
 @stage("statistics")
@@ -170,26 +149,8 @@ def add_contributions(
     """Add what one view's Gaussians contributed, (n,), to the epoch under way. area: what a pixel counts, as with less
     than the full resolution it is several."""
     n = projected.tile_counts.shape[0]
-    launch_items(
-        device,
-        device.kernels("density").contribution_statistics,
-        n,
-        n,
-        area,
-        projected.tile_counts,
-        contributions,
-        epoch.totals,
-        epoch.largest,
-    )
-
-
-def _gather_on_host(rows: NDArray[np.uint32], source: HostGaussians) -> HostGaussians:
-    arrays = {}
-    for name, array in source.arrays.items():
-        values = array.values[np.where(rows == NO_ROW, 0, rows)]
-        values[rows == NO_ROW] = 0.0
-        arrays[name] = HostArray(values)
-    return replace(source, count=len(rows), arrays=arrays)
+    kernel, view = device.kernels("density").contribution_statistics, (projected.tile_counts, contributions)
+    launch_items(device, kernel, n, n, area, *view, epoch.totals, epoch.largest)
 
 
 def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
@@ -203,9 +164,12 @@ def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
 def gather(device: Device, rows: NDArray[np.uint32], source: AnyGaussians) -> AnyGaussians:
     """New arrays, where the source is, of which row j is row rows[j] of the source, or zeros at NO_ROW. Parameters and
     moments alike."""
-    if isinstance(source, HostGaussians):
-        return _gather_on_host(rows, source)
     count = len(rows)
+    if isinstance(source, HostGaussians):
+        host = {name: array.values[np.where(rows == NO_ROW, 0, rows)] for name, array in source.arrays.items()}
+        for values in host.values():
+            values[rows == NO_ROW] = 0.0
+        return replace(source, count=count, arrays={name: HostArray(values) for name, values in host.items()})
     rows_array = upload(device, rows)
     kernel = device.kernels("density").gather_rows
     arrays = {}
@@ -219,7 +183,7 @@ def gather(device: Device, rows: NDArray[np.uint32], source: AnyGaussians) -> An
 
 def widen(device: Device, source: AnyGaussians, coefficients: int) -> AnyGaussians:
     """The same, where it was, with room for more SH coefficients, the new ones 0."""
-    rest = np.zeros((source.count, coefficients - 1, 3), np.float32)
+    rest = np.zeros(group_shapes(source.count, coefficients)["sh_rest"], np.float32)
     rest[:, : source.coefficients - 1] = source["sh_rest"].get()
     if isinstance(source, HostGaussians):
         return replace(source, coefficients=coefficients, arrays={**source.arrays, "sh_rest": HostArray(rest)})

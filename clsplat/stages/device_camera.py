@@ -45,6 +45,11 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
     return np.array([rounded[name] for name in CAMERA], np.float32)
 
 
+def padded_size(width: int, height: int) -> tuple[int, int]:
+    """(rows, stride) of planes of an image in whole tiles."""
+    return -(-height // TILE) * TILE, -(-width // TILE) * TILE
+
+
 def tiles_of(camera: Camera) -> tuple[int, int]:
     """Tiles across and down."""
     return -(-camera.width // TILE), -(-camera.height // TILE)

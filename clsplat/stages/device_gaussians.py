@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,20 +35,25 @@ class ShStorage:
         return floats_of(self.coefficients) - rest + kept + (self.degrees is not None)
 
 
-@dataclass(frozen=True, eq=False)
-class DeviceGaussians:
-    """Parameters, or their gradients or moments: arrays by group name, the first axis of each being `count`.
+A = TypeVar("A")
 
-    Of a model that is held to be rendered (`ShStorage`) sh_rest may be float16, and there may be sh_degrees (count)
-    uint8.
-    """
+
+@dataclass(frozen=True, eq=False)
+class _ByGroup(Generic[A]):
+    """Parameters, or their gradients or moments: arrays by group name, the first axis of each being `count`."""
 
     count: int
     coefficients: int
-    arrays: dict[str, DeviceArray]
+    arrays: dict[str, A]
 
-    def __getitem__(self, group: str) -> DeviceArray:
+    def __getitem__(self, group: str) -> A:
         return self.arrays[group]
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceGaussians(_ByGroup[DeviceArray]):
+    """Gaussians on the device. Of a model that is held to be rendered (`ShStorage`) sh_rest may be float16, and there
+    may be sh_degrees (count) uint8."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,17 +80,10 @@ class HostArray:
 
 
 @dataclass(frozen=True, eq=False)
-class HostGaussians:
-    """Gaussians on the host, in the form of DeviceGaussians: for use they go to the device `rows` at a time
-    (`parts`)."""
+class HostGaussians(_ByGroup[HostArray]):
+    """Gaussians on the host: for use they go to the device `rows` at a time (`parts`)."""
 
-    count: int
-    coefficients: int
-    arrays: dict[str, HostArray]
     rows: int
-
-    def __getitem__(self, group: str) -> HostArray:
-        return self.arrays[group]
 
 
 AnyGaussians = DeviceGaussians | HostGaussians

@@ -3,22 +3,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups, launch_items
-from clsplat.device.layout import TILE
+from clsplat.device.layout import COUNTED, TILE
 from clsplat.device.profile import stage
 from clsplat.errors import CapacityError, amount
 from clsplat.stages.project import Projected
 from clsplat.stages.scan import chunking, scan
-from clsplat.stages.sort import sort
+from clsplat.stages.sort import SORT_BYTES, sort
 
 MAX_PAIRS = 2**31 - 1024
 """Most pairs in one band: what `stops` count is signed, and read a little ahead of."""
+
+
+GAUSSIAN_BYTES = 4 * 4 + SORT_BYTES + 3 * 4
+"""Bytes of each Gaussian: ranks, first slots, the visible with their keys; these sorted, with counts and offsets."""
+BAND_BYTES = 4
+"""Bytes of each Gaussian more where there are several bands: its tiles in one of them."""
+TILE_BYTES = 4
+"""Bytes of each tile where there are several bands: its pairs."""
+
+
+def pair_bytes(*, sorts_pairs: bool) -> int:
+    """Bytes of each pair: tile, slot, Gaussian; and these with the depth by slot, sorted, where pairs are sorted."""
+    return 12 + (12 + SORT_BYTES if sorts_pairs else 0)
 
 
 @dataclass(frozen=True)
@@ -38,7 +51,7 @@ class Band:
 class Counted:
     """tile_counts, first_slots (n): a Gaussian's tiles, and their scan; gaussian_from_visible, depth_keys (visible):
     in order of Gaussians; visible and pairs: the totals, pairs capped at 2^32 - 1; least_key and key_bits: what every
-    depth key has at least, and how many low bits of the rest can be set; beside: what else was in `found`."""
+    depth key has at least, and how many low bits of the rest can be set; refused: what `adam` had counted."""
 
     tile_counts: DeviceArray
     first_slots: DeviceArray
@@ -48,7 +61,7 @@ class Counted:
     pairs: int
     least_key: int
     key_bits: int
-    beside: tuple[int, ...] = ()
+    refused: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,21 +78,19 @@ class Pairs:
 def count(
     device: Device,
     work: Workspace,
-    splats: DeviceArray,
-    tile_counts: DeviceArray,
-    shown: DeviceArray | None = None,
+    projected: Projected,
     *,
     all_bits: bool = False,
-    found: DeviceArray | None = None,
+    readback: DeviceArray | None = None,
 ) -> Counted:
     """Find the visible Gaussians, the number of their pairs, and the bits by which their depths differ, or with
     `all_bits` 32; waits for the device.
 
-    shown (n,): not 0 where a Gaussian is visible; its tile_counts if not given, unless culling is switched off; found
-    (4 or more) uint32: the array that is read, if what is beyond its first four is to be read with them.
+    readback (READBACK_SIZE,) uint32: the array that is read, if what `adam` has counted there is to be read with it.
     """
+    tile_counts = projected.tile_counts
     (n,) = tile_counts.shape
-    shown = shown or tile_counts
+    shown = projected.shown or tile_counts
     ranks = work.array("visible_ranks", (n,), np.uint32)
     visible_total = work.array("visible_total", (1,), np.uint32)
     pairs_total = work.array("pairs_total", (1,), np.uint32)
@@ -88,27 +99,14 @@ def count(
     scan(device, work, tile_counts, first_slots, pairs_total)
     gaussian_from_visible = work.array("gaussian_from_visible", (n,), np.uint32)
     depth_keys = work.array("depth_keys", (n,), np.uint32)
-    found = found or work.array("found", (4,), np.uint32)
-    found.reshaped(4).fill(0)
+    readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
+    readback.reshaped(len(COUNTED)).fill(0)
     groups, chunk = chunking(device, n)
-    launch_groups(
-        device,
-        device.kernels("duplicate").compact_visible,
-        groups,
-        device.shape.items,
-        n,
-        chunk,
-        shown,
-        ranks,
-        splats,
-        visible_total,
-        pairs_total,
-        gaussian_from_visible,
-        depth_keys,
-        found,
-    )
-    visible, pairs, turned, largest, *beside = (int(value) for value in found.get())
-    least = 0 if all_bits else 2**32 - 1 - turned
+    arrays = (shown, ranks, projected.splats, visible_total, pairs_total, gaussian_from_visible, depth_keys, readback)
+    kernel = device.kernels("duplicate").compact_visible
+    launch_groups(device, kernel, groups, device.shape.items, n, chunk, *arrays)
+    visible, pairs, complement, largest, *refused = (int(value) for value in readback.get())
+    least = 0 if all_bits else 2**32 - 1 - complement
     return Counted(
         tile_counts,
         first_slots,
@@ -118,7 +116,7 @@ def count(
         pairs,
         least,
         32 if all_bits else max(largest - least, 1).bit_length(),
-        tuple(beside),
+        tuple(refused),
     )
 
 
@@ -135,39 +133,23 @@ def count_band(
     """`count` of the band's tiles alone. It replaces what an earlier count has left in the workspace."""
     n = projected.tile_counts.shape[0]
     band_counts = work.array("band_counts", (n,), np.uint32)
-    launch_items(
-        device,
-        device.kernels("duplicate").band_counts,
-        n,
-        n,
-        *tiles,
-        band.first,
-        band.end,
-        projected.tile_counts,
-        projected.splats,
-        band_counts,
-    )
-    return count(device, work, projected.splats, band_counts, projected.shown, all_bits=all_bits)
+    kernel, arrays = device.kernels("duplicate").band_counts, (projected.tile_counts, projected.splats, band_counts)
+    launch_items(device, kernel, n, n, *tiles, band.first, band.end, *arrays)
+    return count(device, work, replace(projected, tile_counts=band_counts), all_bits=all_bits)
 
 
 @stage("duplicate")
 def plan_bands(
-    device: Device, work: Workspace, projected: Projected, tiles: tuple[int, int], capacity: int
+    device: Device, work: Workspace, projected: Projected, counted: Counted, tiles: tuple[int, int], capacity: int
 ) -> tuple[Band, ...]:
     """The fewest bands of at most `capacity` pairs each. Raises CapacityError where one tile has more."""
+    if counted.pairs <= capacity:
+        return (Band(0, tiles[0] * tiles[1]),)
     n = projected.tile_counts.shape[0]
     counts = work.array("counts_by_tile", (tiles[0] * tiles[1],), np.uint32)
     counts.fill(0)
-    launch_items(
-        device,
-        device.kernels("duplicate").count_by_tile,
-        n,
-        n,
-        *tiles,
-        projected.tile_counts,
-        projected.splats,
-        counts,
-    )
+    kernel = device.kernels("duplicate").count_by_tile
+    launch_items(device, kernel, n, n, *tiles, projected.tile_counts, projected.splats, counts)
     by_tile = counts.get()
     if (most := int(by_tile.max(initial=0))) > capacity:
         raise CapacityError(
@@ -193,36 +175,14 @@ def duplicate(
     _, order = sort(device, work, "depth", counted.depth_keys, counted.key_bits, counted.least_key)
     gaussian_from_rank = work.array("gaussian_from_rank", (visible,), np.uint32)
     counts = work.array("rank_counts", (visible,), np.uint32)
-    launch_items(
-        device,
-        kernels.order_counts,
-        visible,
-        visible,
-        order,
-        counted.gaussian_from_visible,
-        counted.tile_counts,
-        gaussian_from_rank,
-        counts,
-    )
+    by_index = (counted.gaussian_from_visible, counted.tile_counts)
+    launch_items(device, kernels.order_counts, visible, visible, order, *by_index, gaussian_from_rank, counts)
     offsets = work.array("offsets", (visible,), np.uint32)
     scan(device, work, counts, offsets, work.array("pairs_total", (1,), np.uint32))
     tile_keys = work.array("tile_keys", (pairs,), np.uint32)
     pair_ids = work.array("pair_ids", (pairs, 2), np.uint32)
-    launch_items(
-        device,
-        kernels.duplicate,
-        visible,
-        visible,
-        *tiles,
-        band.first,
-        band.end,
-        gaussian_from_rank,
-        offsets,
-        first_slots,
-        splats,
-        tile_keys,
-        pair_ids,
-    )
+    extent, arrays = (*tiles, band.first, band.end), (gaussian_from_rank, offsets, first_slots, splats)
+    launch_items(device, kernels.duplicate, visible, visible, *extent, *arrays, tile_keys, pair_ids)
     return Pairs(tile_keys, pair_ids, first_slots)
 
 
@@ -237,24 +197,12 @@ def duplicate_and_sort(
     tile_from_slot = work.array("tile_from_slot", (pairs,), np.uint32)
     pair_depths = work.array("pair_depths", (pairs,), np.uint32)
     gaussian_from_slot = work.array("gaussian_from_slot", (pairs,), np.uint32)
-    launch_items(
-        device,
-        kernels.duplicate_slots,
-        visible,
-        visible,
-        *tiles,
-        band.first,
-        band.end,
-        counted.gaussian_from_visible,
-        counted.first_slots,
-        splats,
-        tile_from_slot,
-        pair_depths,
-        gaussian_from_slot,
-    )
+    extent, arrays = (*tiles, band.first, band.end), (counted.gaussian_from_visible, counted.first_slots, splats)
+    by_slot = (tile_from_slot, pair_depths, gaussian_from_slot)
+    launch_items(device, kernels.duplicate_slots, visible, visible, *extent, *arrays, *by_slot)
     _, slot_from_pair = sort(device, work, "pair_depth", pair_depths, counted.key_bits, counted.least_key)
     tile_keys = work.array("tile_keys", (pairs,), np.uint32)
     pair_ids = work.array("pair_ids", (pairs, 2), np.uint32)
-    by_slot = (tile_from_slot, gaussian_from_slot)
-    launch_items(device, kernels.order_pairs, pairs, pairs, slot_from_pair, *by_slot, tile_keys, pair_ids)
+    ordered = (slot_from_pair, tile_from_slot, gaussian_from_slot, tile_keys, pair_ids)
+    launch_items(device, kernels.order_pairs, pairs, pairs, *ordered)
     return Pairs(tile_keys, pair_ids, counted.first_slots)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,14 @@ def _splats() -> NDArray[np.float32]:
     return splats
 
 
+def _seconds(device: Device, launch: Callable[[], None]) -> float:
+    device.finish()
+    start = time.perf_counter()
+    launch()
+    device.finish()
+    return time.perf_counter() - start
+
+
 def _pairs_per_second(device: Device, name: str, items: int, seconds: float, repeat: int) -> float:
     kernel = getattr(device.kernels("limit", ITEMS=items), name)
     groups = _GROUPS[device.kind] * int(device.cl_device.max_compute_units)
@@ -65,11 +74,7 @@ def _pairs_per_second(device: Device, name: str, items: int, seconds: float, rep
     sums = allocate(device, (groups * items,), np.float32)
 
     def run(rounds: int) -> float:
-        device.finish()
-        start = time.perf_counter()
-        launch_groups(device, kernel, groups, items, rounds, splats, sums)
-        device.finish()
-        return time.perf_counter() - start
+        return _seconds(device, lambda: launch_groups(device, kernel, groups, items, rounds, splats, sums))
 
     run(64)
     rounds = 256
@@ -86,12 +91,7 @@ def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
     source.fill(1.0)
     copy.fill(0.0)  # so that its pages are there
     kernel = device.kernels("limit").limit_copy
-
-    def run() -> float:
-        device.finish()
-        start = time.perf_counter()
-        launch_items(device, kernel, n // lanes, n, source, copy)
-        device.finish()
-        return time.perf_counter() - start
-
-    return max(8 * n / run() for _ in range(repeat + 1))
+    return max(
+        8 * n / _seconds(device, lambda: launch_items(device, kernel, n // lanes, n, source, copy))
+        for _ in range(repeat + 1)
+    )

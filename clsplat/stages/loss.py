@@ -17,9 +17,23 @@ _STRIPS = 64
 """Strips of a row, on devices that are not CPUs."""
 
 
+PIXEL_BYTES = 12
+"""Bytes of the image's gradient, of each pixel with its padding."""
+
+
 def strips(device: Device) -> int:
     """Work-items a row."""
     return 1 if device.shape.items == 1 else _STRIPS
+
+
+def scratch_bytes(height: int, stride: int, channels: int = 3) -> int:
+    """Bytes of the moments and partial derivatives."""
+    return 4 * channels * height * (5 * (stride + 2 * PAD) + 3 * stride)
+
+
+def sums_bytes(device: Device, height: int) -> int:
+    """Bytes of the partial sums."""
+    return 4 * 3 * 3 * height * strips(device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,26 +76,13 @@ def loss(
     gradient = work.array("image_gradient", (3, rows, stride))
     sums = work.array("loss_sums", (3, 3 * height * across))
     kernels = device.kernels("loss")
+    pictures, rows_of = (image, target), (height, stride, plane)
+    weights = ((1 - weight) / samples, weight / samples)
     for first in range(0, 3, channels):
-        launch_grid(device, kernels.loss_vertical, grid, first, height, stride, plane, image, target, moments)
-        pictures, rows_of = (image, target), (height, stride, plane)
+        launch_grid(device, kernels.loss_vertical, grid, first, *rows_of, *pictures, moments)
         launch_grid(device, kernels.loss_ssim, grid, first, width, *rows_of, *pictures, moments, partials, sums)
         launch_grid(device, kernels.loss_vertical_grad, grid, first, *rows_of, *pictures, partials, moments)
         launch_grid(
-            device,
-            kernels.loss_grad,
-            grid,
-            first,
-            width,
-            height,
-            stride,
-            plane,
-            (1 - weight) / samples,
-            weight / samples,
-            moments,
-            image,
-            target,
-            gradient,
-            sums,
+            device, kernels.loss_grad, grid, first, width, *rows_of, *weights, moments, *pictures, gradient, sums
         )
     return Loss(gradient, sums, samples, weight)

@@ -17,6 +17,14 @@ from clsplat.gaussians import GROUPS
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 
+SCREEN_BYTES = 8
+"""Bytes of each Gaussian's gradient on the image; 4 more where contributions are kept."""
+
+
+def gaussian_bytes(*, keeps_culled: bool) -> int:
+    """Bytes of each Gaussian: splat and count of tiles; where culling is switched off also `shown`."""
+    return 4 * (len(SPLAT) + 1 + keeps_culled)
+
 
 @dataclass(frozen=True, eq=False)
 class Projected:
@@ -41,59 +49,33 @@ def project(
     n = gaussians.count
     splats = work.array("splats", (n, len(SPLAT)))
     tile_counts = work.array("tile_counts", (n,), np.uint32)
-    tiles_x, tiles_y = tiles_of(camera)
-    keeps_culled = device.switched("NO_FRUSTUM_CULL", "NO_OPACITY_CULL")
     rays = device.switched("RAYS")
-    if rays:
-        keeps_culled = False  # project_rays has no such switches
+    keeps_culled = not rays and device.switched("NO_FRUSTUM_CULL", "NO_OPACITY_CULL")
     projected = Projected(splats, tile_counts, work.array("shown", (n,), np.uint32) if keeps_culled else None)
     for start, stop, (part,) in parts(work, gaussians):
         out = projected.rows(start, stop)
-        if rays:
-            _project_rays(device, part, camera, camera_array, out)
-            continue
-        extras = ["sh_degrees"] if "sh_degrees" in part.arrays else []
-        defines = {name.upper(): True for name in extras}
+        defines: dict[str, object] = {"SH_DEGREES": True} if "sh_degrees" in part.arrays else {}
         if part["sh_rest"].dtype == np.float16:
             defines["SH_HALF"] = True
+        if rays:
+            kernel, lanes = device.kernels("project_rays", LANES=1, **defines).project_rays, 1
+        else:
+            kernel, lanes = device.kernels("project", **defines).project, device.shape.lanes
         launch_items(
             device,
-            device.kernels("project", **defines).project,
-            -(-part.count // device.shape.lanes),
+            kernel,
+            -(-part.count // lanes),
             part.count,
             part.coefficients,
-            tiles_x,
-            tiles_y,
+            *((camera.width, camera.height) if rays else tiles_of(camera)),
             camera_array,
             *(part[group] for group in GROUPS),
             out.splats,
             out.tile_counts,
             *(() if out.shown is None else (out.shown,)),
-            *(part[name] for name in extras),
+            *([part["sh_degrees"]] if "sh_degrees" in part.arrays else []),
         )
     return projected
-
-
-def _project_rays(
-    device: Device, part: DeviceGaussians, camera: Camera, camera_array: DeviceArray, out: Projected
-) -> None:
-    defines: dict[str, object] = {"SH_DEGREES": True} if "sh_degrees" in part.arrays else {}
-    if part["sh_rest"].dtype == np.float16:
-        defines["SH_HALF"] = True
-    launch_items(
-        device,
-        device.kernels("project_rays", LANES=1, **defines).project_rays,
-        part.count,
-        part.count,
-        part.coefficients,
-        camera.width,
-        camera.height,
-        camera_array,
-        *(part[group] for group in GROUPS),
-        out.splats,
-        out.tile_counts,
-        *([part["sh_degrees"]] if "sh_degrees" in part.arrays else []),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,16 +117,8 @@ def add_slots(
     if sums is None:
         sums = work.array("slot_sums", (n, slots.values.shape[1]))
         sums.fill(0.0)
-    launch_items(
-        device,
-        device.kernels("project_grad", **fields.defines).add_slots,
-        n if slots.values.shape[0] else 0,
-        n,
-        tile_counts,
-        slots.first_slots,
-        slots.values,
-        sums,
-    )
+    kernel, items = device.kernels("project_grad", **fields.defines).add_slots, n if slots.values.shape[0] else 0
+    launch_items(device, kernel, items, n, tile_counts, slots.first_slots, slots.values, sums)
     return sums
 
 
@@ -166,6 +140,7 @@ def project_grad(
     wanted = {"ADDED_UP": slots.first_slots is None, "NO_SH_REST": not sh_rest and gaussians.coefficients > 1}
     defines = {**fields.defines, **{name: True for name, needed in wanted.items() if needed}}
     n = gaussians.count
+    first_slots = slots.first_slots or projected.tile_counts  # not looked at where they are added up
     launch_items(
         device,
         device.kernels("project_grad", **defines).project_grad,
@@ -174,11 +149,10 @@ def project_grad(
         gaussians.coefficients,
         camera_array,
         projected.tile_counts,
-        slots.first_slots or projected.tile_counts,  # not looked at where they are added up
+        first_slots,
         slots.values,
         projected.splats,
-        *(gaussians[group] for group in GROUPS),
-        *(gradients[group] for group in GROUPS),
+        *(model[group] for model in (gaussians, gradients) for group in GROUPS),
         screen.gradients,
         *([screen.contributions] if fields.contributions else []),
     )

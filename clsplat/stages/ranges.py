@@ -11,40 +11,37 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.stages.duplicate import Pairs
-from clsplat.stages.sort import sort
+from clsplat.stages.duplicate import Band, Pairs
+from clsplat.stages.sort import SORT_BYTES, sort
+
+PAIR_BYTES = SORT_BYTES + 8
+"""Bytes of each pair: its sort by tile, and the two lists."""
+TILE_BYTES = 8
+"""Bytes of each tile: where its list begins and ends."""
 
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """ranges (tiles, 2): begin and end in the lists; gaussian_from_sorted, slot_from_sorted (pairs)."""
+    """The lists of a band's tiles: ranges (tiles, 2), begin and end in gaussian_from_sorted and slot_from_sorted
+    (pairs)."""
 
+    band: Band
     ranges: DeviceArray
     gaussian_from_sorted: DeviceArray
     slot_from_sorted: DeviceArray
 
 
 @stage("ranges")
-def tile_lists(device: Device, work: Workspace, pairs: Pairs, tiles: int, *, all_bits: bool = False) -> TileLists:
+def tile_lists(device: Device, work: Workspace, pairs: Pairs, band: Band, *, all_bits: bool = False) -> TileLists:
     """A stable sort by tile of pairs that are in order of depth: each tile's Gaussians front to back. By as many bits
     as the tiles need, or with `all_bits` by 32."""
     count = pairs.tile_keys.shape[0]
-    bits = 32 if all_bits else max(tiles - 1, 1).bit_length()
+    bits = 32 if all_bits else max(band.tiles - 1, 1).bit_length()
     keys, pair_from_sorted = sort(device, work, "tile", pairs.tile_keys, bits)
-    ranges = work.array("ranges", (tiles, 2), np.uint32)
+    ranges = work.array("ranges", (band.tiles, 2), np.uint32)
     ranges.fill(0)
     slot_from_sorted = work.array("slot_from_sorted", (count,), np.uint32)
     gaussian_from_sorted = work.array("gaussian_from_sorted", (count,), np.uint32)
-    launch_items(
-        device,
-        device.kernels("ranges").ranges,
-        count,
-        count,
-        keys,
-        pair_from_sorted,
-        pairs.pair_ids,
-        ranges,
-        slot_from_sorted,
-        gaussian_from_sorted,
-    )
-    return TileLists(ranges, gaussian_from_sorted, slot_from_sorted)
+    arrays = (keys, pair_from_sorted, pairs.pair_ids, ranges, slot_from_sorted, gaussian_from_sorted)
+    launch_items(device, device.kernels("ranges").ranges, count, count, *arrays)
+    return TileLists(band, ranges, gaussian_from_sorted, slot_from_sorted)

@@ -18,6 +18,9 @@ BITONIC_WINS = {"cpu": 512, "gpu": BITONIC_MAX, "other": BITONIC_MAX}
 """Up to this many keys one launch of bitonic sort beats the radix sort's dozen."""
 
 
+SORT_BYTES = 16
+"""Bytes of each key that is sorted: keys and positions, each in two arrays that take turns."""
+
 WIDE_DIGIT, WIDE_FROM = 13, 1 << 17
 """Bits of a wide digit, and the number of keys from which it is used, where a group is one item. Its counters fill the
 32 KiB of local memory, and fewer passes save more than the larger histograms cost."""
@@ -31,9 +34,8 @@ def scratch_bytes(device: Device, n: int) -> int:
     """Upper bound of the bytes that sorts and scans of up to `n` elements need, beside the arrays under their names."""
     shape = device.shape
     groups = min(shape.chunks, -(-n // 1024)) if shape.items == 1 else -(-n // (16 * shape.items))
-    return 4 * (1 << _widest_digit(device, n)) * max(groups, 1) + 8 * max(
-        groups, shape.chunks
-    )  # histograms, sums of scans
+    histograms = 4 * (1 << _widest_digit(device, n)) * max(groups, 1)
+    return histograms + 8 * max(groups, shape.chunks)  # and sums of scans
 
 
 def radix_sort(
@@ -55,31 +57,13 @@ def radix_sort(
     counters = cl.LocalMemory(4 * digits * items)
     positions = keys
     for index in range(passes):
-        shift = index * digit_bits
+        chunks = (groups, items, n, chunk, base, index * digit_bits, digits)
         keys_out = work.array(f"{name}_keys{index % 2}", (n,), np.uint32)
         positions_out = work.array(f"{name}_positions{index % 2}", (n,), np.uint32)
-        launch_groups(
-            device, kernels.radix_histogram, groups, items, n, chunk, base, shift, digits, keys, histograms, counters
-        )
+        launch_groups(device, kernels.radix_histogram, *chunks, keys, histograms, counters)
         scan(device, work, histograms, histograms, total)
-        launch_groups(
-            device,
-            kernels.radix_scatter,
-            groups,
-            items,
-            n,
-            chunk,
-            base,
-            shift,
-            digits,
-            index == 0,
-            keys,
-            positions,
-            histograms,
-            keys_out,
-            positions_out,
-            counters,
-        )
+        arrays = (keys, positions, histograms, keys_out, positions_out)
+        launch_groups(device, kernels.radix_scatter, *chunks, index == 0, *arrays, counters)
         keys, positions = keys_out, positions_out
     return keys, positions
 
@@ -93,19 +77,8 @@ def bitonic_sort(device: Device, work: Workspace, name: str, keys: DeviceArray) 
     keys_out = work.array(f"{name}_keys0", (n,), np.uint32)
     positions_out = work.array(f"{name}_positions0", (n,), np.uint32)
     local = cl.LocalMemory(4 * padded)
-    launch_groups(
-        device,
-        device.kernels("sort_bitonic").bitonic_sort,
-        1,
-        device.shape.items,
-        n,
-        padded,
-        keys,
-        keys_out,
-        positions_out,
-        local,
-        local,
-    )
+    kernel, arrays = device.kernels("sort_bitonic").bitonic_sort, (keys, keys_out, positions_out)
+    launch_groups(device, kernel, 1, device.shape.items, n, padded, *arrays, local, local)
     return keys_out, positions_out
 
 

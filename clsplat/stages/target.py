@@ -11,30 +11,22 @@ from numpy.typing import NDArray
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
-from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
+from clsplat.stages.device_camera import padded_size
+
+PIXEL_BYTES = 12 + 16
+"""Bytes of each pixel with its padding: three planes, and the photograph, at most RGBA in floats."""
 
 
 @stage("target")
 def target(device: Device, work: Workspace, image: NDArray[Any], background: DeviceArray) -> DeviceArray:
     """image (H, W, 3 or 4), uint8 or float32, straight alpha -> planes (3, rows, stride) over the background."""
     height, width, channels = image.shape
-    rows, stride = -(-height // TILE) * TILE, -(-width // TILE) * TILE
+    rows, stride = padded_size(width, height)
     source = work.array("target_source", image.shape, image.dtype)
     source.set(image)
     planes = work.array("target", (3, rows, stride))
     kernels = device.kernels("target", **({"BYTES": True} if image.dtype == np.uint8 else {}))
-    launch_grid(
-        device,
-        kernels.target,
-        (stride, rows),
-        width,
-        height,
-        channels,
-        stride,
-        rows * stride,
-        source,
-        background,
-        planes,
-    )
+    sizes = (width, height, channels, stride, rows * stride)
+    launch_grid(device, kernels.target, (stride, rows), *sizes, source, background, planes)
     return planes

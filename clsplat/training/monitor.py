@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray
+from clsplat.device.layout import REFUSED
 from clsplat.gaussians import GROUPS
-from clsplat.stages.adam import REFUSED
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training import health
 from clsplat.training.health import Incident, Patience
@@ -38,7 +38,8 @@ class Remedy:
 
 
 class Watch:
-    """readback: what a pass reads back, in the last four what `adam` counts (`Rasterizer.found`); names: of the views.
+    """readback: what a pass reads back, in the last four what `adam` counts (`Rasterizer.readback`); names: of the
+    views.
 
     incidents: those not told yet; patience: the count of trouble.
     """

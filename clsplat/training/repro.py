@@ -28,14 +28,13 @@ from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
-from clsplat.device.layout import SPLAT
+from clsplat.device.layout import REFUSED, SPLAT
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import atomic_writer, parse_json
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.runs.checkpoints import read_arrays
 from clsplat.runs.settings import config_text, parse_config
-from clsplat.stages.adam import REFUSED
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.stages.project import Slots
@@ -199,7 +198,7 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
     background = upload(device, bundle.background)
     step.run((parameters, first, second), gradients, bundle.photograph, bundle.camera, background, probe)
-    return {**probe.counts, "adam": int(rasterizer.found.get()[-len(REFUSED) :].sum())}
+    return {**probe.counts, "adam": int(rasterizer.readback.get()[-len(REFUSED) :].sum())}
 
 
 def first_trouble(counts: dict[str, int]) -> str | None:

@@ -104,7 +104,7 @@ class GradientStep:
     def update(self, rows: StepRows) -> None:
         """Adam's step of some rows."""
         models = (rows.parameters, rows.gradients, rows.first, rows.second)
-        shown, readback = rows.projected.tile_counts, self.rasterizer.found
+        shown, readback = rows.projected.tile_counts, self.rasterizer.readback
         adam(self.device, self.step, self.rates, self.config.optimiser, *models, shown, readback)
 
 

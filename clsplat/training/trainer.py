@@ -139,7 +139,7 @@ class Trainer:
         )
         self.background = allocate(device, (3,), np.float32)
         self.given = initial
-        self.watch = Watch(self.rasterizer.found, [view.name for view in self.views])
+        self.watch = Watch(self.rasterizer.readback, [view.name for view in self.views])
         self._start()
 
     def _start(self) -> None:

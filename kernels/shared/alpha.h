@@ -1,7 +1,7 @@
 // The alpha of a Gaussian in a tile's pixels: blend and blend_grad must agree to the last bit, or the transmittance
 // that the gradient recovers by division is another one.
 
-// Whether a vector has a pixel that takes the Gaussian (RasterizerConfig.vector_skip).
+// True if a vector has a pixel that takes the Gaussian (RasterizerConfig.vector_skip).
 #ifdef NO_VECTOR_SKIP
 #define REACHES(mask) 1
 #else

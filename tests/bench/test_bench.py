@@ -59,7 +59,7 @@ def profiled(default_device: Device) -> Device:
 def counted(pipeline: Pipeline) -> tuple[int, int]:
     frame, rasterizer = pipeline.frame, pipeline.rasterizer
     return count_pairs(
-        rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background, pipeline.camera
+        rasterizer.device, rasterizer.work, frame.part.lists, frame.projected.splats, frame.background, pipeline.camera
     )
 
 
@@ -106,7 +106,7 @@ def brute_force_evaluated(pipeline: Pipeline, lanes: int, items: int, reached: C
     """Lanes of the cells that each Gaussian reaches, up to where the last of the cell's pixels has ended, or, where a
     work-item has no bits for its cells, of the item's pixels."""
     frame = pipeline.frame
-    ranges, listed = frame.lists.ranges.get().astype(int), frame.lists.gaussian_from_sorted.get()
+    ranges, listed = frame.part.lists.ranges.get().astype(int), frame.part.lists.gaussian_from_sorted.get()
     splats, stops = frame.projected.splats.get(), frame.blended.stops.get()
     tiles_x = -(-pipeline.camera.width // TILE)
     cells = TILE * TILE // lanes

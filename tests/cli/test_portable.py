@@ -20,8 +20,8 @@ from packaging.requirements import Requirement
 
 from clsplat import files, process
 from clsplat.cli.parsing import _unboxed
-from clsplat.device import packaged
-from clsplat.device.advice import driver_advice
+from clsplat.device import quirks
+from clsplat.device.quirks import driver_advice
 from clsplat.errors import InputError
 from clsplat.evaluation.held_out import picture_names
 from clsplat.files import identity, name_trouble
@@ -229,7 +229,7 @@ def test_advice_is_of_this_system_unless_told(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_the_loader_is_told_of_intels_driver(tmp_path: Path) -> None:
-    offer: Callable[[dict[str, str]], None] = lambda given: packaged.offer(  # noqa: E731
+    offer: Callable[[dict[str, str]], None] = lambda given: quirks.offer_packaged(  # noqa: E731
         windows=True, prefix=str(tmp_path), environment=given
     )
     found: dict[str, str] = {}
@@ -243,7 +243,7 @@ def test_the_loader_is_told_of_intels_driver(tmp_path: Path) -> None:
     mine = {"OCL_ICD_FILENAMES": ""}
     offer(mine)
     assert mine == {"OCL_ICD_FILENAMES": ""}
-    packaged.offer(windows=False, prefix=str(tmp_path), environment=(elsewhere := {}))
+    quirks.offer_packaged(windows=False, prefix=str(tmp_path), environment=(elsewhere := {}))
     assert elsewhere == {}
 
 

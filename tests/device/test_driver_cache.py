@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.device.driver_cache import make_room
+from clsplat.device.quirks import make_cache_folder
 
 
 def test_a_home_below_a_file_gets_a_folder_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     environment = {"HOME": str(tmp_path / "file" / "home")}
-    folder = make_room(environment)
+    folder = make_cache_folder(environment)
     assert folder is not None
     assert folder.is_dir()
     assert environment["POCL_CACHE_DIR"] == str(folder)
@@ -30,7 +30,7 @@ def test_nothing_is_done_where_the_cache_can_be_made(tmp_path: Path) -> None:
         {},
     ):
         before = dict(environment)
-        assert make_room(environment) is None
+        assert make_cache_folder(environment) is None
         assert environment == before
 
 
@@ -40,7 +40,7 @@ def test_no_place_at_all_leaves_it_to_the_driver(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr("tempfile.mkdtemp", full)
     environment = {"HOME": "/dev/null/home"}
-    assert make_room(environment) is None
+    assert make_cache_folder(environment) is None
     assert "POCL_CACHE_DIR" not in environment
 
 

@@ -18,7 +18,6 @@ from clsplat.reference.cameras import (
     pixel_from_cam,
     pixel_from_world,
     pixel_grid,
-    world_from_pixel,
 )
 
 ROTATION = Rotation.from_euler("xyz", [0.3, -1.1, 2.0]).as_matrix()
@@ -40,7 +39,8 @@ def camera(projection: Projection, width: int = 36, height: int = 18) -> Camera:
 def test_pixel_to_ray_to_pixel(projection: Projection) -> None:
     view = camera(projection)
     pixels = np.concatenate([pixel_grid(view), np.random.default_rng(0).uniform(0, 1, (200, 2)) * [36, 18]])
-    origins, directions = world_from_pixel(view, pixels)
+    origins, directions = cam_from_pixel(view, pixels)
+    origins, directions = (origins - view.translation) @ view.rotation, directions @ view.rotation
     assert np.isfinite(directions).all()
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, rtol=1e-14)
     for distance in (0.02, 3.0, 1000.0):

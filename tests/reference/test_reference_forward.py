@@ -17,7 +17,7 @@ from clsplat.reference.loss import l1_dssim, ssim
 from clsplat.reference.project import ALPHA_MIN, frustum_limits, project, rotation_matrices
 from clsplat.reference.render import forward, parameters, render
 from clsplat.reference.sort import depth_order
-from clsplat.reference.tiles import tile_counts, touched_tiles
+from clsplat.reference.tiles import touched_tiles
 
 
 def gray(gaussians: Gaussians, value: float) -> Gaussians:
@@ -185,7 +185,6 @@ def test_tiles_hold_what_the_image_shows() -> None:
     gaussians, camera = scenes.random_cloud(50, 4, 45, 35)
     projected = forward(gaussians, camera).projected
     tiles = touched_tiles(projected, 45, 35)
-    assert tile_counts(projected, 45, 35).tolist() == [len(t) for t in tiles]
     for n in range(50):
         dx = np.arange(45) + 0.5 - projected.means2d[n, 0]
         dy = np.arange(35)[:, None] + 0.5 - projected.means2d[n, 1]

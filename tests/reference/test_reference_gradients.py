@@ -19,7 +19,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference.adam import adam
 from clsplat.reference.blend import ALPHA_MAX, blend, blend_grad, footprint
 from clsplat.reference.loss import l1_dssim
-from clsplat.reference.project import ALPHA_MIN, conic_grad, covariance_grad, frustum_limits, project, project_grad
+from clsplat.reference.project import ALPHA_MIN, covariance_grad, frustum_limits, project, project_grad
 from clsplat.reference.render import forward, parameters, render_grad
 from clsplat.reference.sh import sh_basis_grad
 from clsplat.reference.sort import depth_order
@@ -66,8 +66,9 @@ class Objective:
             **self.arrays,
             camera=self.camera,
             sh_degree=3,
+            projected=projected,
             d_means2d=screen.means2d,
-            d_conics=screen.conics,
+            d_covariances=covariance_grad(projected.conics, screen.conics),
             d_opacities=screen.opacities,
             d_colors=screen.colors,
         )
@@ -188,7 +189,8 @@ def test_conic_and_covariance_gradients_are_inverse() -> None:
     gaussians, camera = scenes.overlap()
     projected = project(**parameters(gaussians), camera=camera, sh_degree=3)
     d_conics = np.random.default_rng(3).normal(size=projected.conics.shape)
-    back = conic_grad(projected.covariances, covariance_grad(projected.conics, d_conics))
+    twice = np.array([1.0, 2.0, 1.0])  # the off-diagonal entry of a symmetric matrix
+    back = covariance_grad(projected.covariances, covariance_grad(projected.conics, d_conics) * twice) * twice
     assert_close(back, d_conics, relative=1e-9, absolute=1e-9)
 
 

@@ -7,6 +7,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from compare import assert_same_bits
 from quick import quick
@@ -16,15 +17,22 @@ from tiny import CONFIG, short, write_scene
 import clsplat
 from clsplat.api import train
 from clsplat.cli.main import main
-from clsplat.config.rasterizer import BenchSwitches
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import upload
 from clsplat.device.context import Device
+from clsplat.device.layout import SlotFields
 from clsplat.errors import CapacityError
+from clsplat.rendering.memory_needs import plan_frame, plan_step
 from clsplat.rendering.memory_plan import Need, plan
+from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.stages.device_gaussians import HostGaussians
+from clsplat.stages.density import new_statistics
+from clsplat.stages.device_gaussians import HostGaussians, upload_gaussians
+from clsplat.stages.loss import loss
+from clsplat.stages.target import target
 from clsplat.training.trainer import Trainer
 
 KIB = 1024
@@ -177,9 +185,51 @@ def test_no_buffer_is_over_the_devices_limit_of_one(
     assert trained(scene, device, tmp_path / "run") == unlimited[0]
 
 
+# The needs
+
+
+@pytest.mark.parametrize("capacity", [None, 3000])
+def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int | None) -> None:
+    """What a step took, at once and in bands, against what the stages say. They may say more: of the photograph, and
+    of Gaussians that are not visible."""
+    device = with_limit(default_device, 2**40)  # a limit, so that no array has room to spare
+    gaussians, camera = random_cloud(6000, 11, 100, 80)
+    fields = SlotFields(absolute=True, contributions=True)
+    config = RasterizerConfig()
+    need = plan_step(device, 6000, 16, [camera], config, fields=fields, agreement=True).need
+    rasterizer = Rasterizer(device, config)
+    rasterizer.capacity = capacity or rasterizer.capacity
+    model, gradients, *moments = (upload_gaussians(device, gaussians) for _ in range(4))
+    background = upload(device, np.zeros(3, np.float32))
+    statistics = new_statistics(device, 6000, agreement=True, contributions=True)
+    frame = rasterizer.forward(model, camera, background)
+    photograph = target(device, rasterizer.work, np.zeros((80, 100, 4), np.float32), background)
+    result = loss(device, rasterizer.work, frame.blended.image, photograph, 100, 80, 0.2)
+    screen = rasterizer.backward(model, frame, result.gradient, gradients, fields=fields)
+    assert screen.contributions is not None
+    assert len(frame.bands) == 1 if capacity is None else len(frame.bands) > 2
+    pairs = frame.part.pairs.tile_keys.shape[0] if capacity is None else capacity
+    rows = need.row + need.model + (need.banded if capacity else 0)
+    estimate = need.planes + need.scratch + need.gaussians * rows + pairs * need.pair
+    assert 0.8 * estimate < device.memory.peak <= estimate
+    del moments, statistics
+
+
+def test_the_needs_of_a_frame_are_those_of_its_arrays(default_device: Device) -> None:
+    device = with_limit(default_device, 2**40)
+    gaussians, camera = random_cloud(6000, 11, 100, 80)
+    need = plan_frame(device, 6000, 59, camera, RasterizerConfig()).need
+    rasterizer = Rasterizer(device)
+    background = upload(device, np.zeros(3, np.float32))
+    frame = rasterizer.forward(upload_gaussians(device, gaussians), camera, background, backward=False)
+    estimate = need.total + (frame.part.pairs.tile_keys.shape[0] - need.pairs) * need.pair
+    assert 0.8 * estimate < device.memory.peak <= estimate
+
+
 # The plan
 
-STEP = Need(gaussians=100_000, floats=59, models=4, slot=9, planes=50 * 2**20, loss=30 * 2**20, scratch=2**20)
+ROW = {"model": 4 * 4 * 59, "widest": 4 * 45, "row": 132, "banded": 40, "pair": 76, "most_pairs": 2**31 // 36}
+STEP = Need(gaussians=100_000, **ROW, planes=50 * 2**20, loss=30 * 2**20, scratch=2**20)
 
 
 def planned(mebibytes: float, need: Need = STEP, largest: int = 2**31) -> str:
@@ -192,7 +242,7 @@ def test_the_plan_in_words() -> None:
     assert "allowed: parameters are streamed, 20,128 Gaussians at a time, the image" in planned(120)
     with pytest.raises(CapacityError, match=r"need at least about 48.3 MiB of device memory, 211.6 MiB to be done"):
         planned(45)
-    small = Need(gaussians=40, floats=59, models=4, slot=9, planes=50_000, loss=30_000, scratch=1024)
+    small = Need(gaussians=40, **ROW, planes=50_000, loss=30_000, scratch=1024)
     with pytest.raises(CapacityError, match=r"about [0-9]+ KiB .* [0-9]+ KiB to be done at once, and 4,000 bytes are"):
         plan(small, 4000, 2**31, 32)
 
@@ -201,7 +251,7 @@ def test_pieces_are_no_smaller_than_need_be() -> None:
     for mebibytes in range(60, 400, 5):
         made = plan(STEP, mebibytes * 2**20, 2**31, 32)
         parameters = made.rows * STEP.model
-        rest = STEP.planes + STEP.scratch + STEP.gaussians * STEP.banded_row + made.pairs * STEP.pair
+        rest = STEP.planes + STEP.scratch + STEP.gaussians * (STEP.row + STEP.banded) + made.pairs * STEP.pair
         rest -= 0 if made.channels == 3 else STEP.loss * 2 // 3
         assert parameters + rest <= mebibytes * 2**20
         assert made.streamed == (made.rows < STEP.gaussians)

@@ -139,7 +139,7 @@ def test_last_contributor_is_where_the_gradient_begins(default_device: Device, o
     frame = pipeline.frame
     rows, stride = frame.blended.stops.shape
     stops = frame.blended.stops.get().reshape(rows // TILE, TILE, stride // TILE, TILE).max(axis=(1, 3)).ravel()
-    listed, ranges = frame.lists.gaussian_from_sorted.get(), frame.lists.ranges.get()
+    listed, ranges = frame.part.lists.gaussian_from_sorted.get(), frame.part.lists.ranges.get()
     read = {i for (begin, _), stop in zip(ranges, stops, strict=True) for i in listed[begin : stop + 1]}
     behind = sorted(set(listed) - read)
     assert behind
@@ -224,7 +224,7 @@ def test_exact_switches_in_every_shape(default_device: Device, shape: tuple[int,
 def test_switches_that_are_off_do_more_work(default_device: Device) -> None:
     device = shaped(default_device, 8, 1)
     pairs = {
-        name: run(device, "cloud", config).frame.lists.gaussian_from_sorted.shape[0]
+        name: run(device, "cloud", config).frame.part.lists.gaussian_from_sorted.shape[0]
         for name, config in {"default": RasterizerConfig(), **EXACT_OFF}.items()
     }
     assert pairs["constant extent"] > pairs["default"]

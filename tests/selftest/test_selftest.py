@@ -240,7 +240,7 @@ def test_no_such_device(capsys: Capture) -> None:
 
 
 def child(monkeypatch: pytest.MonkeyPatch, code: str) -> Report:
-    monkeypatch.setattr(trust, "command", lambda *_, **__: [sys.executable, "-c", code])
+    monkeypatch.setattr(trust, "python_module", lambda *_, **__: [sys.executable, "-c", code])
     monkeypatch.setenv(TIMEOUT, "2")
     return examine(0, shape_of(all_devices()[0]))
 

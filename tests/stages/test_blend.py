@@ -144,11 +144,11 @@ def check_record(device: Device, name: str) -> None:
     assert blended.cells_from_sorted is not None
     values = np.random.default_rng(0).standard_normal(blended.image.shape).astype(np.float32)
     gradient = upload(rasterizer.device, values)
-    of = (rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background)
+    of = (rasterizer.device, rasterizer.work, frame.part.lists, frame.projected.splats, frame.background)
     recorded = blend_grad(*of, blended, gradient).get()
     assert_same_bits(recorded, blend_grad(*of, replace(blended, cells_from_sorted=None), gradient).get())
     empty = blended.cells_from_sorted.get() == 0
-    assert not recorded[frame.lists.slot_from_sorted.get()[empty]].any()
+    assert not recorded[frame.part.lists.slot_from_sorted.get()[empty]].any()
     assert recorded.any()
 
 
@@ -173,7 +173,7 @@ def check_skip(device: Device, name: str) -> None:
     slots = []
     for run in runs:
         frame, device_of = run.frame, run.rasterizer.device
-        of = (device_of, run.rasterizer.work, frame.lists, frame.projected.splats, frame.background, frame.blended)
+        of = (device_of, run.rasterizer.work, frame.part.lists, frame.projected.splats, frame.background, frame.blended)
         slots.append(blend_grad(*of, upload(device_of, values)).get() + np.float32(0))
     assert_same_bits(slots[0], slots[1])
     assert slots[0].any()
@@ -185,7 +185,7 @@ def test_gradients_in_padding_are_not_looked_at(shaped_device: Device, rubbish: 
     run = Pipeline.run(shaped_device, scenes.random_cloud(200, 3, 33, 19))
     frame, rasterizer = run.frame, run.rasterizer
     values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
-    of = (rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background, frame.blended)
+    of = (rasterizer.device, rasterizer.work, frame.part.lists, frame.projected.splats, frame.background, frame.blended)
     slots = []
     for padding in (0.0, rubbish):
         values[:, 19:], values[:, :, 33:] = padding, padding

@@ -41,7 +41,7 @@ def run(device: Device, scene: tuple[Gaussians, Camera], wanted: Features = ALL)
     device, work = rasterizer.device, rasterizer.work
     after = upload(device, pack_camera(moved(camera)))
     rows = features(device, work, wanted, pipeline.gaussians, frame.camera_array, after, frame.projected)
-    found = channels(device, work, wanted, rows, frame.lists, frame.projected, frame.blended, camera.height)
+    found = channels(device, work, wanted, rows, frame.part.lists, frame.projected, frame.blended, camera.height)
     means, whole = pipeline.crop(found.means.get()), pipeline.crop(found.whole.get())
     result = {name: means[:, :, at : at + width] for name, at, width in fields(wanted)}
     result.update(median=means[:, :, -2], first=means[:, :, -1], count=whole[:, :, 0], index=whole[:, :, 1])

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scenes
+from numpy.typing import NDArray
 from pipeline import Pipeline
 from quick import quick
 
@@ -13,9 +14,11 @@ from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
+from clsplat.reference import project as reference_project
 from clsplat.reference import render as reference
-from clsplat.reference.tiles import square_tiles, touched_tiles
+from clsplat.reference.tiles import touched_tiles
 from clsplat.stages.duplicate import count
+from clsplat.stages.project import Projected
 from clsplat.stages.sort import BITONIC_WINS
 
 NAMES = [*scenes.NAMED, "cloud"]
@@ -68,7 +71,7 @@ def test_few_tiles_are_listed_in_vain(device: Device, name: str, monkeypatch: py
 def test_lists_are_front_to_back(shaped_device: Device, name: str) -> None:
     run = Pipeline.run(shaped_device, make(name))
     depths = run.splat("DEPTH")[:, 0]
-    lists = run.frame.lists
+    lists = run.frame.part.lists
     gaussians = lists.gaussian_from_sorted.get()
     for begin, end in lists.ranges.get():
         listed = gaussians[begin:end]
@@ -78,10 +81,38 @@ def test_lists_are_front_to_back(shaped_device: Device, name: str) -> None:
 
 def test_equal_depths_go_by_index(device: Device) -> None:
     run = Pipeline.run(device, scenes.equal_depth())
-    pairs = run.frame.pairs
+    pairs = run.frame.part.pairs
     gaussians = pairs.pair_ids.get()[:, 1]
     assert len(np.unique(gaussians)) > 1
     np.testing.assert_array_equal(gaussians, np.sort(gaussians))
+
+
+def square_tiles(
+    projected: reference_project.Projected, width: int, height: int, *, slack: float = 0.0, threshold: float
+) -> list[NDArray[np.int64]]:
+    """Tiles that have a pixel centre in a square around each Gaussian, like `touched_tiles`.
+
+    The square is that of the longest half axis of the ellipse where alpha is `threshold`, made wider by `slack` pixels:
+    what Kerbl et al.'s code lists, but for its extent of 3 sigma. The kernels' set with tile_test "square" lies between
+    those of slack 0 and of a little more.
+    """
+    tile = 16
+    tiles_x, tiles_y = -(-width // tile), -(-height // tile)
+    result = []
+    for gaussian, visible in enumerate(projected.visible):
+        if not visible:
+            result.append(np.zeros(0, np.int64))
+            continue
+        sxx, sxy, syy = projected.covariances[gaussian]
+        larger = 0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy)
+        budget = max(2 * np.log(projected.opacities[gaussian] / threshold), 0.0)
+        reach = np.sqrt(budget * larger) + slack
+        low, high = projected.means2d[gaussian] - reach, projected.means2d[gaussian] + reach
+        first = np.clip(np.ceil((low - (tile - 0.5)) / tile), 0, (tiles_x, tiles_y)).astype(np.int64)
+        end = np.clip(np.floor((high - 0.5) / tile) + 1, 0, (tiles_x, tiles_y)).astype(np.int64)
+        columns, rows = np.arange(first[0], max(end[0], first[0])), np.arange(first[1], max(end[1], first[1]))
+        result.append((rows[:, None] * tiles_x + columns).ravel())
+    return result
 
 
 @pytest.mark.parametrize("name", quick(NAMES, *IN_EVERY_SHAPE))
@@ -106,14 +137,15 @@ def test_sorting_all_pairs_makes_the_same_lists(shaped_device: Device, key_bits:
     config = BenchSwitches(depth_sort="pairs", key_bits=key_bits)  # type: ignore[arg-type]  # one of them
     got = Pipeline.run(shaped_device, make(name), config=config).frame
     for array in ("ranges", "gaussian_from_sorted", "slot_from_sorted"):
-        np.testing.assert_array_equal(getattr(got.lists, array).get(), getattr(wanted.lists, array).get(), array)
+        arrays = [getattr(frame.part.lists, array).get() for frame in (got, wanted)]
+        np.testing.assert_array_equal(*arrays, array)
 
 
 def counted(device: Device, depths: np.ndarray, visible: np.ndarray, **options: bool):  # type: ignore[no-untyped-def]
     splats = np.zeros((len(depths), len(SPLAT)), np.float32)
     splats[:, SPLAT.index("DEPTH")] = depths
     tiles = np.where(visible, 3, 0).astype(np.uint32)
-    return count(device, Workspace(device), upload(device, splats), upload(device, tiles), **options)
+    return count(device, Workspace(device), Projected(upload(device, splats), upload(device, tiles)), **options)
 
 
 @pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 1025, 9000])
