@@ -21,8 +21,8 @@ from clsplat.files import check_new, is_file, read_document
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images import colour
 from clsplat.models import difference, edit
-from clsplat.models.formats import format_of, format_of_name, load, model_path, save, sog
-from clsplat.models.info import beside, model_info, size, text
+from clsplat.models.formats import Format, format_of, format_of_name, load, model_path, save
+from clsplat.models.info import model_info, size, text
 from clsplat.progress import StageProgress
 from clsplat.runs.run import is_run, model_file
 
@@ -52,9 +52,8 @@ def convert(verb: Convert) -> int:
     matrix = similarity(verb)
     written_by = format_of_name(verb.target, writable=True)
     check_new(verb.target, overwrite=verb.overwrite, sources=[source, *map(_file, verb.merge)])
-    for each in beside(verb.target):
-        if each.suffix == ".bin" or each.stem.partition("_")[0] in sog.PICTURES:
-            check_new(each, overwrite=verb.overwrite)
+    for companion in written_by.beside(verb.target):
+        check_new(companion, overwrite=verb.overwrite)
     original, space = load(source), colour.recorded_space(source)
     edited = original
     if verb.merge:
@@ -70,18 +69,18 @@ def convert(verb: Convert) -> int:
     comments = () if space == colour.SRGB else (colour.comment(space),)
     save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK))
     if space != colour.recorded_space(verb.target):
-        _warn(f"{verb.target}: {written_by.NAME} has no place for the colour space, which is {space}")
+        _warn(f"{verb.target}: {written_by.name} has no place for the colour space, which is {space}")
     read = load(verb.target)
     if not isclose(read.near, edited.near, rel_tol=NEAR_SLACK):
         _warn(
-            f"{verb.target}: {written_by.NAME} has no place for the near plane, which is {edited.near:.4g}; readers "
+            f"{verb.target}: {written_by.name} has no place for the near plane, which is {edited.near:.4g}; readers "
             f"will take {read.near:.4g}"
         )
-    written = edit.take(edited, written_by.order(edited)) if hasattr(written_by, "order") else edited
+    written = edit.take(edited, written_by.order(edited)) if written_by.order else edited
     found = difference.errors(written, read)
     result: dict[str, Any] = {
-        "source": _described(source, format_of(source).NAME, original),
-        "target": _described(verb.target, written_by.NAME, read),
+        "source": _described(source, format_of(source), original),
+        "target": _described(verb.target, written_by, read),
         "errors": found,
     }
     if verb.scene is not None:
@@ -212,8 +211,8 @@ def _contributions(verb: Convert, gaussians: Gaussians) -> Float32:
     return largest_contributions(gaussians, shot.cameras, device)
 
 
-def _described(path: Path, name: str, gaussians: Gaussians) -> dict[str, Any]:
-    size_of = {"path": str(path), "format": name, "bytes": size(path)}
+def _described(path: Path, form: Format, gaussians: Gaussians) -> dict[str, Any]:
+    size_of = {"path": str(path), "format": form.name, "bytes": size(path, form)}
     return size_of | {"gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}
 
 

@@ -31,15 +31,7 @@ _SIMILAR = 1e-6
 
 def take(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
     """The Gaussians of those rows, (n,) booleans or indices."""
-    return Gaussians(
-        gaussians.means[rows],
-        gaussians.quaternions[rows],
-        gaussians.log_scales[rows],
-        gaussians.opacity_logits[rows],
-        gaussians.sh[rows],
-        gaussians.origin,
-        gaussians.near,
-    )
+    return replace(gaussians, **{name: array[rows] for name, array in gaussians.arrays().items()})
 
 
 def in_box(gaussians: Gaussians, low: Sequence[float], high: Sequence[float]) -> NDArray[np.bool_]:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import NEAR
-from clsplat.files import is_file, open_input
+from clsplat.files import is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import recorded_space
 from clsplat.models.codec import values as packing
-from clsplat.models.formats import format_of, model_path, ply, tell_kind
+from clsplat.models.formats import Format, resolve
 
 PERCENTILES = (0, 1, 50, 99, 100)
 _BLOCK = 1 << 16
@@ -24,39 +24,23 @@ _BLOCK = 1 << 16
 
 def model_info(path: Path) -> dict[str, Any]:
     """Figures that `clsplat info --json` prints. Raises InputError for a file that no format reads."""
-    path = model_path(path)
-    module = format_of(path)
-    tell_kind(path, module)
-    result: dict[str, Any] = {"path": str(path), "format": module.NAME, "bytes": size(path)}
-    if module is ply:
-        origin, blocks = _ply_blocks(path)
+    path, form = resolve(path)
+    result: dict[str, Any] = {"path": str(path), "format": form.name, "bytes": size(path, form)}
+    if form.blocks:
+        origin, blocks = form.blocks(path)
     else:
-        model: Gaussians = module.read(path)
+        model = form.read(path)
         origin, blocks = model.origin, _blocks(model)
-    result |= module.describe(path) if hasattr(module, "describe") else {}
+    result |= form.describe(path)
     result |= _summary(blocks, origin)
     result["colorspace"] = recorded_space(path)
-    result["loses"] = getattr(module, "LOSES", "")
+    result["loses"] = form.loses
     return result
 
 
-def size(path: Path) -> int:
-    """Bytes of the file, with the pictures beside a meta.json and the .bin beside a .gltf."""
-    return sum(each.stat().st_size for each in (path, *beside(path)) if is_file(each))
-
-
-def beside(path: Path) -> list[Path]:
-    """The other files of a model: the pictures of a meta.json, the .bin of a .gltf."""
-    if path.name == "meta.json":
-        return sorted(path.parent.glob("*.webp"))
-    return [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
-
-
-def _ply_blocks(path: Path) -> tuple[NDArray[np.float64], Iterator[Gaussians]]:
-    with open_input(path, "a 3DGS PLY") as file:
-        header = ply.read_header(file, path)
-    origin = np.zeros(3) if header.origin is None else header.origin
-    return origin, ply.read_blocks(path)
+def size(path: Path, form: Format) -> int:
+    """Bytes of the model's files."""
+    return sum(file.stat().st_size for file in (path, *form.beside(path)) if is_file(file))
 
 
 def _blocks(model: Gaussians) -> Iterator[Gaussians]:

@@ -449,7 +449,7 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
         coloured = all(name in kinds for name in RGB)
         parts: list[tuple[Float64, Float32]] = [(np.empty((0, 3)), np.empty((0, 3), np.float32))]
-        for block in ply.read_vertices(file, header, path, "point"):
+        for block in ply.read_vertices(file, header, "point"):
             points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
             colors: Float32 = np.full(points.shape, 0.5, np.float32)
             if coloured:

@@ -23,7 +23,7 @@ from __future__ import annotations
 import io
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -51,11 +51,6 @@ from clsplat.models.edit import merge
 from clsplat.models.formats import spz
 from clsplat.spherical_harmonics import C0
 
-NAME = "glTF"
-SUFFIXES = (".gltf", ".glb")
-LOSES = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
-FLOAT = True
-
 GLB_MAGIC = 0x46546C67
 FLOAT32, UINT16 = 5126, 5123
 LARGEST_GLB = (1 << 32) - 1
@@ -74,6 +69,11 @@ def describe(path: Path) -> dict[str, Any]:
         compression = next((name for name in SPZ_EXTENSIONS if name in as_object(said.get("extensions"))), "none")
         return {"color_space": str(said.get("colorSpace", "")), "compression": compression}
     return {}
+
+
+def beside(path: Path) -> list[Path]:
+    """The .bin of a .gltf."""
+    return [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
 
 
 def read(path: Path) -> Gaussians:
@@ -102,10 +102,7 @@ def write(
     """
     if color_space not in COLOR_SPACES:
         raise ValueError(f"color_space {color_space!r}: expected {' or '.join(COLOR_SPACES)}")
-    gaussians.check()
-    values.require_finite(path, gaussians, writing=True)
-    if not len(gaussians):
-        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    values.check_writable(path, gaussians, least=1)
     document, buffer = _document(path, gaussians, spz_compression, color_space)
     if path.suffix.lower() == ".gltf":
         binary = path.with_suffix(".bin")
@@ -245,9 +242,7 @@ def _document(
 
 def _spz_blob(path: Path, gaussians: Gaussians) -> bytes:
     """Its means count from the node."""
-    local = Gaussians(
-        gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh
-    )
+    local = replace(gaussians, origin=np.zeros(3))
     blob = io.BytesIO()
     spz.write_to(blob, local, spz.header_for(path, local, 2))
     return blob.getvalue()

@@ -25,11 +25,6 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.codec import values as packing
 from clsplat.models.codec.values import BLOCK_ROWS
 
-NAME = "ksplat"
-SUFFIXES = (".ksplat",)
-FLOAT = False
-LOSES = "not written here"
-
 HEADER = np.dtype(
     {
         "names": ["major", "minor", "sections", "count", "level", "least_sh", "largest_sh"],

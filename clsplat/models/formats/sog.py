@@ -50,18 +50,13 @@ from clsplat.images.reading import error_of, open_image
 from clsplat.models.codec import values as packing
 from clsplat.models.codec.palette import codebook, nearest, palette
 
-NAME = "SOG"
-SUFFIXES = ("meta.json", ".sog")
-LOSES = "positions to 16 bits, the rest to 8, spherical harmonics to a palette"
-FLOAT = False
-
 Bytes = NDArray[np.uint8]
 
 Progress = Callable[[str, float | None], None]
 
 META = "meta.json"
 PICTURES = ("means", "quats", "scales", "sh0", "shN")
-"""Beginnings of the pictures' names that are written."""
+"""Beginnings of the pictures' names."""
 SH_PICTURES = ("shN_centroids.webp", "shN_labels.webp")
 MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
@@ -81,6 +76,12 @@ def describe(path: Path) -> dict[str, Any]:
     with _opened(path) as files:
         meta = files.meta()
     return {"version": meta.get("version", 1), "antialiased": bool(meta.get("antialias", False))}
+
+
+def beside(path: Path) -> list[Path]:
+    """The pictures of a meta.json."""
+    pictures = sorted(path.parent.glob("*.webp")) if path.name == META else []
+    return [picture for picture in pictures if picture.stem.partition("_")[0] in PICTURES]
 
 
 def read(path: Path) -> Gaussians:
@@ -296,13 +297,8 @@ class _Meta:
 def _unpacked_quaternions(pixels: Bytes) -> Float32:
     tag = pixels[:, 3].astype(np.int64) - LARGEST_TAG
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
-    largest = np.sqrt(np.maximum(0, 1 - np.square(three).sum(axis=1)))
-    result = np.zeros((len(pixels), 4), np.float32)
-    result[tag < 0, 0] = 1  # no rotation, like the other reader
-    for index in range(4):
-        chosen = tag == index
-        result[np.ix_(chosen, [each for each in range(4) if each != index])] = three[chosen]
-        result[chosen, index] = largest[chosen]
+    result = packing.restore_largest(np.maximum(tag, 0), three)
+    result[tag < 0] = (1, 0, 0, 0)  # no rotation, like the other reader
     return result
 
 
@@ -320,10 +316,7 @@ def write(
     world's origin: far from it they lose more. The same Gaussians give the same values. Raises InputError for values
     that are not finite.
     """
-    gaussians.check()
-    packing.require_finite(path, gaussians, writing=True)
-    if not len(gaussians):
-        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    packing.check_writable(path, gaussians, least=1)
     with scratch_folder(_room(len(gaussians))) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)
         meta = _pictures(folder, gaussians, order, iterations, progress)
@@ -418,10 +411,7 @@ def _indices(entries: Float32, values: Float32) -> Bytes:
 
 
 def _packed_quaternions(unit: Float64) -> Bytes:
-    largest = np.abs(unit).argmax(axis=1)
-    sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1, 1)
-    others = np.array([[each for each in range(4) if each != index] for index in range(4)])[largest]
-    three = np.take_along_axis(unit, others, axis=1) * sign
+    largest, three = packing.leave_out_largest(unit)
     steps = np.rint(np.clip(three * 2**0.5 * 0.5 + 0.5, 0, 1) * 255)
     return np.column_stack([steps, largest + LARGEST_TAG]).astype(np.uint8)
 

@@ -21,11 +21,6 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.codec import values
 from clsplat.models.codec.values import BLOCK_ROWS
 
-NAME = "splat"
-SUFFIXES = (".splat",)
-FLOAT = False
-LOSES = "SH beyond degree 0; colour, opacity and rotation to 8 bits, colour beyond 0 to 1"
-MAX_SH_DEGREE = 0
 UNIT_SLACK = 0.1
 """Bytes make unit quaternions longer by 0.02 at most."""
 
@@ -63,8 +58,7 @@ def _check_first(block: Any, path: Path) -> None:
 
 def write(path: Path, gaussians: Gaussians) -> None:
     """Write it, atomically."""
-    gaussians.check()
-    values.require_finite(path, gaussians, writing=True)
+    values.check_writable(path, gaussians)
     with atomic_writer(path, ROW.itemsize * len(gaussians)) as file:
         for start in range(0, len(gaussians), BLOCK_ROWS):
             rows = slice(start, start + BLOCK_ROWS)

@@ -38,11 +38,6 @@ from clsplat.models.codec import spz_bytes, values
 from clsplat.models.codec.axes import UP_BACK, Signs, flip, quaternion_signs, sh_signs
 from clsplat.models.codec.values import BLOCK_ROWS
 
-NAME = "SPZ"
-SUFFIXES = (".spz",)
-LOSES = "positions to 24 bits fixed point, the rest to 8 or 10 bits, spherical harmonics to 6"
-FLOAT = False
-
 MAGIC = b"NGSP"
 VERSIONS = (2, 3, 4)
 DEFAULT_VERSION = 4
@@ -313,8 +308,7 @@ def write(
     """
     if version not in VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
-    gaussians.check()
-    values.require_finite(path, gaussians, writing=True)
+    values.check_writable(path, gaussians, least=1)
     header = header_for(path, gaussians, version, fractional_bits, ANTIALIASED if antialiased else 0)
     with atomic_writer(path) as file:
         write_to(file, gaussians, header, sh_bits)
@@ -323,9 +317,7 @@ def write(
 def header_for(
     path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None, flags: int = 0
 ) -> Header:
-    """The header for `write_to`. Raises InputError for positions that do not fit, and for no Gaussians."""
-    if not len(gaussians):
-        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    """The header for `write_to`, of at least one Gaussian. Raises InputError for positions that do not fit."""
     bits = _fractional_bits(path, gaussians, fractional_bits)
     return Header(version, len(gaussians), gaussians.sh_degree, bits, flags)
 

@@ -36,11 +36,6 @@ from clsplat.models.codec import axes
 from clsplat.models.codec import values as packing
 from clsplat.models.edit import merge
 
-NAME = "OpenUSD"
-SUFFIXES = (".usda", ".usdc", ".usdz", ".usd")
-LOSES = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
-FLOAT = True
-
 TYPE = "ParticleField3DGaussianSplat"
 TYPES = (TYPE, "ParticleField_3DGaussianSplat")
 """The second is what a draft, and Nuke 17.0, called it."""
@@ -227,15 +222,12 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     """
     if up_axis not in ("Y", "Z") or not meters_per_unit > 0:
         raise ValueError(f"up_axis {up_axis!r}, meters_per_unit {meters_per_unit}: expected Y or Z, and more than 0")
-    gaussians.check()
-    packing.require_finite(path, gaussians, writing=True)
-    if not len(gaussians):
-        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    packing.check_writable(path, gaussians, least=1)
     _pxr(path)
     from pxr import Usd, UsdUtils
 
     suffix = path.suffix.lower()
-    with scratch_folder(4 * sum(array.size for array in _arrays(gaussians))) as folder:
+    with scratch_folder(4 * sum(array.size for array in gaussians.arrays().values())) as folder:
         made = folder / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
         stage = Usd.Stage.CreateNew(native_name(made))
         _author(stage, gaussians, up_axis, meters_per_unit)
@@ -248,16 +240,6 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
             made = package
         with atomic_writer(path, made.stat().st_size) as file, made.open("rb") as source:
             shutil.copyfileobj(source, file, 1 << 20)
-
-
-def _arrays(gaussians: Gaussians) -> tuple[Float32, ...]:
-    return (
-        gaussians.means,
-        gaussians.quaternions,
-        gaussians.log_scales,
-        gaussians.opacity_logits,
-        gaussians.sh,
-    )
 
 
 def _author(stage: Any, gaussians: Gaussians, up_axis: str, meters_per_unit: float) -> None:
