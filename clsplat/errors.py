@@ -5,7 +5,12 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
+import warnings
 from collections.abc import Iterable
+from pathlib import Path
+
+_PACKAGE = str(Path(__file__).parent)
 
 
 class ClsplatError(Exception):
@@ -17,6 +22,14 @@ class ClsplatError(Exception):
 def plain(text: str) -> str:
     """`text` as one line that any terminal shows as it is: names in hostile files may hold anything."""
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+
+
+def warn(text: str) -> None:
+    """Warn in one line, as of the line outside of the package that led here."""
+    frame, level = sys._getframe(1), 2  # noqa: SLF001
+    while frame.f_back and frame.f_code.co_filename.startswith(_PACKAGE):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(plain(text), stacklevel=level)
 
 
 def examples(names: Iterable[object], most: int = 3) -> str:

@@ -11,10 +11,16 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, Literal, Protocol, TextIO
 
+Progress = Callable[[str, float | None], None]
+"""A listener: the text of a stage, and the part of it that is done, None where that is not known."""
 PLAIN_INTERVAL = 10.0
 """Seconds between plain lines."""
 SMOOTHING = 0.1
 """Weight of the newest report in the shown PSNR and loss, which jump from view to view."""
+
+
+def no_progress(text: str, fraction: float | None = None) -> None:
+    """A listener that passes over everything."""
 
 
 class StepReport(Protocol):

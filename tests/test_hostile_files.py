@@ -308,19 +308,6 @@ def test_far_cameras_are_refused(tmp_path: Path) -> None:
     assert "has the pose" in refusal(lambda: colmap.read_model(path.parent))
 
 
-@pytest.mark.parametrize("window", [1, 30, 100])
-def test_binary_models_are_read_a_window_at_a_time(
-    window: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    make_colmap_binary(tmp_path)
-    whole = colmap.read_model(tmp_path / "sparse/0")
-    monkeypatch.setattr(colmap, "WINDOW", window)
-    parts = colmap.read_model(tmp_path / "sparse/0")
-    assert [image.name for image in parts.images] == [image.name for image in whole.images]
-    np.testing.assert_array_equal(parts.points, whole.points)
-    np.testing.assert_array_equal(parts.images[2].translation, whole.images[2].translation)
-
-
 @pytest.mark.parametrize(
     "name", ["..\\..\\x.png", "C:\\x.png", "C:x.png", "\\\\host\\x.png", "/x.png", "a/../../x.png", "a\nb", ""]
 )

@@ -12,13 +12,13 @@ from typing import Any
 from clsplat.api import train
 from clsplat.config.training import TrainConfig
 from clsplat.config.verbs import DEMO_ITERATIONS
-from clsplat.demo.ray_caster import Progress, ignore_progress, write_photos
+from clsplat.demo.ray_caster import write_photos
 from clsplat.device.context import open_device
 from clsplat.errors import InputError, examples
 from clsplat.files import atomic_write, is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
-from clsplat.progress import StageProgress, TrainProgress
+from clsplat.progress import Progress, StageProgress, TrainProgress
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
@@ -96,7 +96,7 @@ def make_scene(output: Path, progress: Progress | None = None) -> Path:
     if not set(existing).issubset(expected):
         raise InputError(f"{photos}: holds files that are not the demo's, expected a new folder")
     if existing != expected:
-        write_photos(photos, count=PHOTOS, width=WIDTH, height=HEIGHT, progress=progress or ignore_progress)
+        write_photos(photos, count=PHOTOS, width=WIDTH, height=HEIGHT, progress=progress)
     # the ray caster's lens has no distortion, as ours is known to have none: photos need no resampling
     return sfm.reconstruct(photos, scene, camera_model="SIMPLE_PINHOLE", overwrite=True, progress=progress)
 

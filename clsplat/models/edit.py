@@ -145,8 +145,7 @@ def _turned(quaternions: Float32, turn: Float64) -> Float32:
     x, y, z, w = Rotation.from_matrix(proper).as_quat()
     # Hamilton's product of (w, x, y, z) and each quaternion
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    turned: Float32 = (quaternions.astype(np.float64) @ product.T).astype(np.float32)
-    return turned
+    return np.asarray((quaternions.astype(np.float64) @ product.T).astype(np.float32))
 
 
 def rotate_sh(sh: Float32, turn: Float64) -> Float32:

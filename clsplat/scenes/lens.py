@@ -100,13 +100,11 @@ class Lens:
 
     def img_from_cam(self, points: Float64) -> Float64:
         """Project points (N, 3) in camera space to pixels (N, 2); NaN where the model has no image of them."""
-        pixels: Float64 = self._camera().img_from_cam(np.ascontiguousarray(points, np.float64))
-        return pixels
+        return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))
 
     def cam_from_img(self, pixels: Float64) -> Float64:
         """Rays of pixels (N, 2) as (N, 2), x / z and y / z."""
-        rays: Float64 = self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64))
-        return rays
+        return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
 
     def _camera(self) -> pycolmap.Camera:
         camera = pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))

@@ -14,17 +14,15 @@ import sys
 import tempfile
 import threading
 import time
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, Literal
 
-from clsplat.errors import ClsplatError, InputError, examples
+from clsplat.errors import ClsplatError, InputError, examples, warn
 from clsplat.files import is_file, parse_json, read_document, replace
 from clsplat.process import apart
+from clsplat.progress import Progress, no_progress
 from clsplat.scenes import sfm_photos
 
-Progress = Callable[[str, float | None], None]
 Matching = Literal["auto", "exhaustive", "sequential"]
 
 RECORD = "sfm.json"
@@ -83,7 +81,7 @@ def reconstruct(
     for a folder without photos, a photo that does not decode, an output that is something else, and photos that no
     cameras can be recovered from; ClsplatError where pycolmap itself fails. KeyboardInterrupt leaves nothing behind.
     """
-    report = progress or _ignore
+    report = progress or no_progress
     if matching not in ("auto", "exhaustive", "sequential"):
         raise InputError(f"matching {matching!r}: expected auto, exhaustive or sequential")
     if camera_model not in CAMERA_MODELS:
@@ -103,7 +101,7 @@ def reconstruct(
         (found.companions, "by their names masks, depths or the like of other photos"),
     ):
         if left_out:
-            warnings.warn(f"{images}: {_listed(left_out, images)} left out: {why}", stacklevel=2)
+            warn(f"{images}: {_listed(left_out, images)} left out: {why}")
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -134,11 +132,11 @@ def reconstruct(
         (work / "result" / RECORD).write_bytes((json.dumps(record, indent=2) + "\n").encode())
         if missing:
             lost = _listed([images / name for name in missing], images)
-            warnings.warn(f"{images}: {lost} could not be placed and will not be used", stacklevel=2)
+            warn(f"{images}: {lost} could not be placed and will not be used")
         if cut := _without_their_alpha(photos, result["registered"], work / "result" / "images"):
             which = _listed([images / name for name in cut], images)
             message = f"{which} lost their alpha when their lens was undone: the scene's images are opaque there"
-            warnings.warn(f"{images}: {message}", stacklevel=2)
+            warn(f"{images}: {message}")
         _move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -150,10 +148,6 @@ def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], 
     lens model has no distortion, and the file is copied."""
     transparent = {photo.name for photo in photos if photo.transparent}
     return [name for name in registered if name in transparent and not sfm_photos.has_alpha(result / name)]
-
-
-def _ignore(text: str, fraction: float | None) -> None:
-    """Do nothing: progress that nobody reads."""
 
 
 def unregistered(output: Path) -> list[str]:

@@ -123,5 +123,4 @@ def _shaded(shade: NDArray[np.float64], alpha: Float32 | None) -> Image:
     colours = table[np.rint(255 * at).astype(np.intp)]
     if alpha is not None:
         colours = colours * np.clip(alpha, 0, 1)[:, :, None]
-    shaded: Image = np.rint(colours).astype(np.uint8)
-    return shaded
+    return np.asarray(np.rint(colours).astype(np.uint8))

@@ -276,8 +276,7 @@ def png(image: Image) -> bytes:
     """The file."""
     import imageio.v3 as iio
 
-    data: bytes = iio.imwrite("<bytes>", image, extension=".png")
-    return data
+    return iio.imwrite("<bytes>", image, extension=".png")
 
 
 @cache

@@ -12,7 +12,6 @@ import binascii
 import io
 import os
 import struct
-import warnings
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, warn
 from clsplat.files import MAX_DOCUMENT, open_input, parse_json, read_document
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import values as packing
@@ -166,7 +165,7 @@ class Asset:
         if kernel != "ellipse":
             raise InputError(f"{self.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse")
         if space != COLOR_SPACES[0]:
-            warnings.warn(plain(f"{self.path}: the colours are in {str(space)[:40]}, kept as they are"), stacklevel=3)
+            warn(f"{self.path}: the colours are in {str(space)[:40]}, kept as they are")
         nested = as_object(said.get("extensions", {}))
         for extension in SPZ_EXTENSIONS:
             if extension in nested:

@@ -29,8 +29,7 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
     ordered = np.sort(values.ravel())
     distinct = np.unique(ordered) if len(ordered) <= SAMPLES else _thinned(ordered)
     if len(distinct) <= size:
-        padded: Float32 = np.pad(distinct, (0, size - len(distinct)), mode="edge").astype(np.float32)
-        return padded
+        return np.pad(distinct, (0, size - len(distinct)), mode="edge").astype(np.float32)
     samples = _thinned(ordered).astype(np.float64)
     wanted = np.cumsum(np.concatenate([[0.0], np.diff(samples) ** (2 / 3)]))
     entries = np.interp((np.arange(size) + 0.5) / size * wanted[-1], wanted, samples)
@@ -39,8 +38,7 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
         count = np.bincount(index, minlength=size)
         total = np.bincount(index, samples, minlength=size)
         entries = np.where(count > 0, total / np.maximum(count, 1), entries)
-    result: Float32 = entries.astype(np.float32)
-    return result
+    return np.asarray(entries.astype(np.float32))
 
 
 def _thinned(ordered: Float32) -> Float32:

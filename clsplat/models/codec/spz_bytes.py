@@ -41,14 +41,12 @@ def smallest_three(block: Bytes) -> NDArray[np.float32]:
 
 def to_byte(values: NDArray[np.float32]) -> Bytes:
     """To the nearest from 0 to 255."""
-    rounded: Bytes = np.clip(np.floor(values + np.float32(0.5)), 0, 255).astype(np.uint8)
-    return rounded
+    return np.asarray(np.clip(np.floor(values + np.float32(0.5)), 0, 255).astype(np.uint8))
 
 
 def to_fixed(values: NDArray[np.float64]) -> Bytes:
     """(n, 3) that fit into 24 bits -> (n, 3, 3), the low bytes first."""
-    fixed: Bytes = np.rint(values).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
-    return fixed
+    return np.rint(values).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
 
 
 def to_first_three(unit: NDArray[np.float32]) -> Bytes:
@@ -66,8 +64,7 @@ def to_smallest_three(unit: NDArray[np.float32]) -> Bytes:
     fields = magnitude | (((q < 0) ^ negate).astype(np.uint32) << 9)
     three = np.take_along_axis(fields, OTHERS[largest], axis=1)
     packed = largest.astype(np.uint32) << 30 | three[:, 0] << 20 | three[:, 1] << 10 | three[:, 2]
-    as_bytes: Bytes = packed.astype("<u4").view(np.uint8)
-    return as_bytes
+    return np.asarray(packed.astype("<u4").view(np.uint8))
 
 
 def to_sh(rest: NDArray[np.float32], sh_bits: tuple[int, int]) -> Bytes:
@@ -76,5 +73,4 @@ def to_sh(rest: NDArray[np.float32], sh_bits: tuple[int, int]) -> Bytes:
     steps = np.array([1 << (8 - sh_bits[0 if index < 3 else 1]) for index in range(coefficients)], np.int16)[:, None]
     signs = sh_signs(UP_BACK)[1 : coefficients + 1, None]
     values = np.clip(rest * (signs * np.float32(128)) + np.float32(128.5), 0, 256).astype(np.int16)
-    rounded: Bytes = np.minimum((values + steps // 2) & -steps, 255).astype(np.uint8)  # steps are powers of two
-    return rounded
+    return np.asarray(np.minimum((values + steps // 2) & -steps, 255).astype(np.uint8))  # steps are powers of two

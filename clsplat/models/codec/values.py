@@ -47,14 +47,12 @@ def empty(count: int, degree: int) -> Gaussians:
 
 def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) -> Float64:
     """(n, 3) where they are in the world."""
-    means: Float64 = gaussians.means[rows] + gaussians.origin
-    return means
+    return gaussians.means[rows] + gaussians.origin
 
 
 def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
     """0 to 1 as 0 to 255, to the nearest; what lies outside is cut."""
-    found: NDArray[np.uint8] = np.clip(np.rint(values * 255), 0, 255).astype(np.uint8)
-    return found
+    return np.asarray(np.clip(np.rint(values * 255), 0, 255).astype(np.uint8))
 
 
 def opacities(logits: Float32) -> Float64:

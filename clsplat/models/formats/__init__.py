@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import inspect
 import os
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.camera import NEAR, NEARS
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, usd
@@ -136,7 +135,7 @@ def resolve(path: Path) -> tuple[Path, Format]:
     path = model_path(path)
     row = format_of(path)
     if path.suffix.lower() not in {Path(f"x{suffix}").suffix for suffix in row.suffixes}:
-        warnings.warn(plain(f"{path}: is {row.name} by its content, whatever its name says"), stacklevel=3)
+        warn(f"{path}: is {row.name} by its content, whatever its name says")
     return path, row
 
 

@@ -179,8 +179,7 @@ def _ends(head: dict[str, Any], partial: NDArray[np.int64], name: str) -> NDArra
 
 def _means(section: Section, block: NDArray[Any], start: int) -> NDArray[Any]:
     if section.centres is None or section.ends is None:
-        positions: NDArray[Any] = block["means"]
-        return positions
+        return block["means"]
     bucket = np.searchsorted(section.ends, np.arange(start, start + len(block)), side="right")
     return (block["means"].astype(np.float64) - section.middle) * section.step + section.centres[bucket]
 

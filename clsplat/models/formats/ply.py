@@ -14,7 +14,6 @@ over both.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, islice
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR
-from clsplat.errors import InputError, examples, plain
+from clsplat.errors import InputError, examples, warn
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import values
@@ -126,7 +125,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         vertex = header.vertex
         rest = _check_properties(header)
         if FILTER in dict(vertex.properties):
-            warnings.warn(plain(f"{path}: {FILTER}, mip-splatting's filter, is ignored; fuse it first"), stacklevel=4)
+            warn(f"{path}: {FILTER}, mip-splatting's filter, is ignored; fuse it first")
         if vertex.count == 0:
             raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
         gaussians = _assemble(read_vertices(file, header, "Gaussian"), vertex.count, rest, path)
@@ -339,7 +338,7 @@ def _check_properties(header: Header) -> int:
             raise InputError(f"{path}: PLY lacks the property f_rest_{index}, though it has {rest} of f_rest")
     if rest == counts[-1]:
         left_out = f"SH of degree {MAX_SH_DEGREE + 1} is left out, {MAX_SH_DEGREE} is the highest that is known"
-        warnings.warn(plain(f"{path}: {left_out}"), stacklevel=3)
+        warn(f"{path}: {left_out}")
     return rest
 
 
@@ -376,7 +375,7 @@ def _binary_blocks(file: BinaryIO, header: Header, what: str) -> Iterator[Block]
             f"{path}: truncated: {vertex.count} {what}s need {need} bytes, {have} are there ({whole} {what}s)"
         )
     if have > need and header.elements[-1] is vertex:
-        warnings.warn(plain(f"{path}: {have - need} bytes after the last {what} ignored"), stacklevel=4)
+        warn(f"{path}: {have - need} bytes after the last {what} ignored")
     file.seek(start)
     block = min(BLOCK_ROWS, max(MAX_BLOCK_BYTES // max(row.itemsize, 1), 1))
     for first in range(0, vertex.count, block):
@@ -423,7 +422,7 @@ def _ascii_blocks(file: BinaryIO, header: Header, what: str) -> Iterator[Block]:
             raise InputError(f"{path}: a value after {what} {first} is no number ({error})") from None
         yield {name: table[:, index] for index, (name, _) in enumerate(vertex.properties)}
     if header.elements[-1] is vertex and next(lines, None) is not None:
-        warnings.warn(plain(f"{path}: text after the last {what} ignored"), stacklevel=4)
+        warn(f"{path}: text after the last {what} ignored")
 
 
 def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gaussians:

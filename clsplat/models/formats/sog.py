@@ -19,7 +19,6 @@ import json
 import math
 import os
 import shutil
-import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -32,7 +31,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, plain, warn
 from clsplat.files import (
     MAX_DOCUMENT,
     atomic_write,
@@ -49,10 +48,9 @@ from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.reading import error_of, open_image
 from clsplat.models.codec import values as packing
 from clsplat.models.codec.palette import codebook, nearest, palette
+from clsplat.progress import Progress, no_progress
 
 Bytes = NDArray[np.uint8]
-
-Progress = Callable[[str, float | None], None]
 
 META = "meta.json"
 PICTURES = ("means", "quats", "scales", "sh0", "shN")
@@ -194,9 +192,7 @@ class _Meta:
             raise InputError(f"{self.path}: has {str(count)[:20]} Gaussians, expected at least one")
         self.count = count
         if meta.get("antialias"):
-            warnings.warn(
-                plain(f"{self.path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=4
-            )
+            warn(f"{self.path}: trained with anti-aliasing, which this renderer does not do")
 
     def section(self, name: str) -> dict[str, Any]:
         found = self.meta.get(name)
@@ -290,8 +286,7 @@ class _Meta:
         colours = table.reshape(-1, width, 3)
         if needed > len(colours):
             raise InputError(f"{self.path}: shN has an index {needed - 1} into a palette of {len(colours)}")
-        rest: Float32 = self.dequantised("shN", colours)[label]
-        return rest
+        return np.asarray(self.dequantised("shN", colours)[label])
 
 
 def _unpacked_quaternions(pixels: Bytes) -> Float32:
@@ -302,12 +297,8 @@ def _unpacked_quaternions(pixels: Bytes) -> Float32:
     return result
 
 
-def _no_progress(stage: str, part: float | None = None) -> None:
-    """Do nothing: progress that nobody reads."""
-
-
 def write(
-    path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool = False, progress: Progress = _no_progress
+    path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool = False, progress: Progress = no_progress
 ) -> None:
     """Write version 2: a .sog archive, or a meta.json with its pictures beside it, which are there before it is.
 

@@ -21,7 +21,6 @@ import gzip
 import io
 import os
 import struct
-import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -31,7 +30,7 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, warn
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import spz_bytes, values
@@ -109,11 +108,9 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     header, stream = _open(file, size, path)
     values.require_count(path, header.count, size)
     if header.degree > MAX_SH_DEGREE:
-        warnings.warn(
-            plain(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out"), stacklevel=3
-        )
+        warn(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out")
     if header.flags & ANTIALIASED:
-        warnings.warn(plain(f"{path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=3)
+        warn(f"{path}: trained with anti-aliasing, which this renderer does not do")
     result = values.empty(header.count, min(header.degree, MAX_SH_DEGREE))
     if header.version == 4:
         signs = _frame(_records(file.read(header.table - 32), path), path) if header.flags & HAS_EXTENSIONS else UP_BACK
@@ -125,7 +122,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     if header.flags & HAS_EXTENSIONS and (signs := _frame(_records(behind, path), path)) != UP_BACK:
         flip(result, (signs[0] * UP_BACK[0], signs[1] * UP_BACK[1], signs[2] * UP_BACK[2]))
     elif behind and not header.flags & HAS_EXTENSIONS:
-        warnings.warn(plain(f"{path}: bytes after the last Gaussian ignored"), stacklevel=3)
+        warn(f"{path}: bytes after the last Gaussian ignored")
     return result
 
 
@@ -224,7 +221,7 @@ def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iter
             if _rest(stream, path):
                 raise InputError(f"{path}: {name} have more than {wanted} bytes unpacked")
     if at != size:
-        warnings.warn(plain(f"{path}: {size - at} bytes after the last Gaussian ignored"), stacklevel=5)
+        warn(f"{path}: {size - at} bytes after the last Gaussian ignored")
 
 
 def _fill(stream: Stream, buffer: memoryview, path: Path, what: str) -> None:

@@ -19,7 +19,6 @@ import os
 import shutil
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -29,7 +28,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from clsplat.arrays import Float32
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, warn
 from clsplat.files import atomic_writer, native_name, open_input, scratch_folder
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import axes
@@ -195,7 +194,7 @@ def _gaussians(where: str, prim: Any, time: Any) -> Gaussians:
         raise InputError(f"{where}: lacks {COEFFICIENTS}")
     sh = sh.reshape(count, coefficients, 3)
     if degree > MAX_SH_DEGREE:
-        warnings.warn(plain(f"{where}: SH of degree {degree}, those above {MAX_SH_DEGREE} left out"), stacklevel=3)
+        warn(f"{where}: SH of degree {degree}, those above {MAX_SH_DEGREE} left out")
         sh = np.ascontiguousarray(sh[:, : (MAX_SH_DEGREE + 1) ** 2])
     # what the schema says where an attribute is absent: no rotation, unit scale, opaque
     quaternions = _array(where, prim, "orientations", time, 4, count)
