@@ -41,14 +41,14 @@ class ViserPage:
 
     def __init__(self, client: Any, viewing: Viewing, world: World, paths: Path | None) -> None:
         self.client, self.viewing, self.world, self.paths = client, viewing, world, paths
-        self.key: int = client.client_id
         self.recorder = Recorder()
         self._status: Any = None
         self._shown = 0
         self._drawing, self._drawn = 0, threading.Lock()
+        self.viewer = viewing.join(self)
 
     def show(self, image: Image, level: Level, text: str) -> None:
-        """See `scheduler.Page`."""
+        """Show a picture (H, W, 3), with a remark on it."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
         if self._shown == 2:  # controls keep a browser busy: they may not come before the first picture
@@ -58,7 +58,7 @@ class ViserPage:
             self._say(", ".join(filter(None, (f"{width} x {height}, exact", text))))
 
     def tell(self, message: str) -> None:
-        """See `scheduler.Page`."""
+        """Show the reason that there is no picture."""
         self._build()
         self.client.add_notification("clsplat", plain(message), auto_close_seconds=10.0)
         self._say(plain(message))
@@ -101,7 +101,7 @@ class ViserPage:
         async def changed(_: Any) -> None:
             box = [[side.value[0] for side in sides], [side.value[1] for side in sides]] if crop.value else None
             look = read_look(mode.value, degree.value, size.value, opacity.value, box)
-            self.viewing.looks(self.key, look)
+            self.viewing.looks(self.viewer, look)
             self._draw_box(look)
 
         for control in (mode, degree, size, opacity, crop, *sides):
@@ -184,7 +184,7 @@ class ViserPage:
             count.content = f"{keys or 'no'} key{'' if keys == 1 else 's'}"
 
         async def added(_: Any) -> None:
-            pose = self.viewing.pose(self.key)
+            pose = self.viewer.pose
             if pose is not None:
                 self._attempt(lambda: self.recorder.add(pose))
                 self._draw_key(len(self.recorder.keys) - 1)
@@ -243,7 +243,7 @@ class ViserPage:
 
         async def taken(_: Any) -> None:
             size = (int(width.value), int(height.value))
-            self.viewing.ask(self.key, lambda model: self.screenshot(model, size))
+            self.viewing.ask(self.viewer, lambda model: self.screenshot(model, size))
 
         take.on_click(taken)
 
@@ -253,13 +253,13 @@ class ViserPage:
 
     def screenshot(self, model: Model, size: tuple[int, int]) -> None:
         """Send an exact picture of this size, as `clsplat render` would make it. Raises InputError."""
-        pose = self.viewing.pose(self.key)
+        pose = self.viewer.pose
         if pose is None:
             return
         width, height = size
         if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and width * height <= 4 * MOST_PIXELS):
             raise InputError(f"a screenshot of {width} x {height}: expected at most {4 * MOST_PIXELS:,} pixels")
-        image, _ = model.picture(pose.camera(width, height), self.viewing.look(self.key), exact=True)
+        image, _ = model.picture(pose.camera(width, height), self.viewer.look, exact=True)
         self.client.send_file_download("screenshot.png", png(image), save_immediately=True)
 
     def _attempt(self, action: Any) -> None:

@@ -29,7 +29,7 @@ from clsplat.config.verbs import HOST, PORT
 from clsplat.errors import InputError, plain
 from clsplat.viewer.page import ViserPage
 from clsplat.viewer.pose import Start, read_pose
-from clsplat.viewer.scheduler import Viewing
+from clsplat.viewer.scheduler import Viewer, Viewing
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import View
@@ -133,21 +133,23 @@ class Server:
         if training:
             self._add_training()
 
+        viewers: dict[int, Viewer] = {}
+
         async def came(client: Any) -> None:
-            key = client.client_id
-            viewing.join(key, ViserPage(client, viewing, world, address.paths))
+            viewer = viewers[client.client_id] = ViserPage(client, viewing, world, address.paths).viewer
 
             async def moved(camera: Any) -> None:
                 size = (camera.image_width, camera.image_height)
                 pose = read_pose(camera.wxyz, camera.position, camera.fov, size, world.origin)
                 if pose is not None:
-                    viewing.moved(key, pose)
+                    viewing.moved(viewer, pose)
 
             client.camera.on_update(moved)
             await moved(client.camera)
 
         async def left(client: Any) -> None:
-            viewing.leave(client.client_id)
+            if viewer := viewers.pop(client.client_id, None):
+                viewing.leave(viewer)
 
         server.on_client_connect(came)
         server.on_client_disconnect(left)
