@@ -21,7 +21,7 @@ class ClsplatError(Exception):
 
 def plain(text: str) -> str:
     """`text` as one line that any terminal shows as it is: names in hostile files may hold anything."""
-    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)
 
 
 def warn(text: str) -> None:

@@ -52,7 +52,7 @@ def convert(verb: Convert) -> int:
     matrix = similarity(verb)
     written_by = format_of_name(verb.target, writable=True)
     check_new(verb.target, overwrite=verb.overwrite, sources=[source, *map(_file, verb.merge)])
-    for companion in written_by.beside(verb.target):
+    for companion in written_by.side_files(verb.target):
         check_new(companion, overwrite=verb.overwrite)
     original, space = load(source), colour.recorded_space(source)
     edited = original

@@ -53,10 +53,10 @@ def claim(output: Path) -> None:
     """Mark a folder as a demo's. Raises InputError where it has what a demo would replace, and is not marked."""
     if is_file(output / MARK):
         return
-    found = [name for name in MADE if (output / name).exists() or (output / name).is_symlink()]
-    if found:
+    existing = [name for name in MADE if (output / name).exists() or (output / name).is_symlink()]
+    if existing:
         raise InputError(
-            f"{output}: holds {examples(found, len(MADE))}, which no demo has made and a demo would replace; choose "
+            f"{output}: holds {examples(existing, len(MADE))}, which no demo has made and a demo would replace; choose "
             "another folder, or remove them"
         )
     atomic_write(output / MARK, b"What is beside this file was made by clsplat demo, which may replace it.\n")

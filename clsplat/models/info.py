@@ -40,7 +40,7 @@ def model_info(path: Path) -> dict[str, Any]:
 
 def size(path: Path, form: Format) -> int:
     """Bytes of the model's files."""
-    return sum(file.stat().st_size for file in (path, *form.beside(path)) if is_file(file))
+    return sum(file.stat().st_size for file in (path, *form.side_files(path)) if is_file(file))
 
 
 def _blocks(model: Gaussians) -> Iterator[Gaussians]:
@@ -89,8 +89,8 @@ def _summary(blocks: Iterator[Gaussians], origin: NDArray[np.float64]) -> dict[s
 
 
 def _percentiles(values: NDArray[Any]) -> dict[str, float]:
-    found = np.percentile(values, PERCENTILES)
-    return {f"p{percent}": float(value) for percent, value in zip(PERCENTILES, found, strict=True)}
+    results = np.percentile(values, PERCENTILES)
+    return {f"p{percent}": float(value) for percent, value in zip(PERCENTILES, results, strict=True)}
 
 
 def _listed(percentiles: dict[str, float]) -> str:

@@ -155,9 +155,9 @@ class _Binary:
             raise corrupt(self.path, f"{self.left} bytes follow the last of its {number} {what}s")
 
 
-def corrupt(path: Path, found: str) -> InputError:
+def corrupt(path: Path, trouble: str) -> InputError:
     """The error for a model's file whose contents cannot be."""
-    return InputError(f"{path}: truncated or corrupt: {found}; copy the file again or export the model anew")
+    return InputError(f"{path}: truncated or corrupt: {trouble}; copy the file again or export the model anew")
 
 
 def _is_model(folder: Path) -> bool:
@@ -202,7 +202,7 @@ def _warn_of_newer_text(folder: Path) -> None:
         warn(f"{folder}: {read} is read and not the newer {not_read}; remove what is not meant")
 
 
-def _check_count(path: Path, found: int) -> None:
+def _check_count(path: Path, count: int) -> None:
     """Warn of text that is cut at the end of a line, which has nothing else that is wrong."""
     if path.suffix != ".txt":
         return
@@ -211,8 +211,8 @@ def _check_count(path: Path, found: int) -> None:
         while (line := file.readline(MAX_NAME_BYTES)).lstrip(b"\xef\xbb\xbf").startswith(b"#"):
             if match := ANNOUNCED.match(line.lstrip(b"\xef\xbb\xbf").decode("utf-8", "replace")):
                 announced = int(match[1])
-    if found < announced:
-        warn(f"{path}: its header announces {announced:,}, and it holds {found:,}; is it cut, or edited since?")
+    if count < announced:
+        warn(f"{path}: its header announces {announced:,}, and it holds {count:,}; is it cut, or edited since?")
 
 
 def _read_cameras(folder: Path) -> dict[int, Lens]:
@@ -325,8 +325,8 @@ def _read_points(folder: Path) -> tuple[Float64, Float32]:
     good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all(axis=1)
     if not good.all():
         index = int(np.argmin(good))
-        found = f"point {index + 1} of {len(table)} has the position and colour {table[index].tolist()}"
-        raise corrupt(path, f"{found}, expected finite numbers and colours 0 to 255")
+        trouble = f"point {index + 1} of {len(table)} has the position and colour {table[index].tolist()}"
+        raise corrupt(path, f"{trouble}, expected finite numbers and colours 0 to 255")
     return np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3:] / 255, np.float32)
 
 

@@ -136,13 +136,13 @@ def check_lens(lens: Lens, where: str) -> Lens:
 def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
     """A warning of the pictures whose lens bends beyond reason, or nothing. lenses: with the pictures' names."""
     bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
-    found = [(name, lens) for name, lens in lenses if bend[lens]]
-    if not found:
+    bent = [(name, lens) for name, lens in lenses if bend[lens]]
+    if not bent:
         return ""
-    lens = found[0][1]
+    lens = bent[0][1]
     params = " ".join(f"{value:g}" for value in lens.params)
     return (
-        f"the lens of {examples(name for name, _ in found)} bends the picture beyond reason ({lens.model} {params}): "
+        f"the lens of {examples(name for name, _ in bent)} bends the picture beyond reason ({lens.model} {params}): "
         "check its coefficients, and their order"
     )
 

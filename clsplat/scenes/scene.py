@@ -82,8 +82,8 @@ class View:
     def _read(self) -> Float32:
         image = read_image(self.path, orient=self.upright)
         if image.shape[:2] != (self.lens.height, self.lens.width):
-            found = f"{image.shape[1]} x {image.shape[0]}"
-            raise InputError(f"{self.path}: is {found} pixels now, expected {self.lens.width} x {self.lens.height}")
+            actual = f"{image.shape[1]} x {image.shape[0]}"
+            raise InputError(f"{self.path}: is {actual} pixels now, expected {self.lens.width} x {self.lens.height}")
         return image
 
 
@@ -141,7 +141,7 @@ class Scene:
     def _of_each(self, work: Callable[[View], T]) -> dict[str, T]:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             try:
-                return {view.name: each for view, each in zip(self.views, pool.map(work, self.views), strict=True)}
+                return {view.name: result for view, result in zip(self.views, pool.map(work, self.views), strict=True)}
             finally:
                 pool.shutdown(cancel_futures=True)
 

@@ -86,8 +86,8 @@ def reconstruct(
         raise InputError(f"matching {matching!r}: expected auto, exhaustive or sequential")
     if camera_model not in CAMERA_MODELS:
         raise InputError(f"camera model {camera_model!r}: expected one of {', '.join(CAMERA_MODELS)}")
-    found = sfm_photos.find_photos(images, excluded=output)
-    paths = found.photos
+    photo_files = sfm_photos.find_photos(images, excluded=output)
+    paths = photo_files.photos
     settings = f"{matching} {camera_model} {shared_camera} {max_image_size} {max_features} {seed}"
     fingerprint = sfm_photos.fingerprint(images, paths, settings)
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
@@ -96,9 +96,9 @@ def reconstruct(
     if len(paths) < MINIMUM_PHOTOS:
         raise InputError(f"{images}: only {len(paths)} photo(s) found, expected at least {MINIMUM_PHOTOS}")
     for left_out, why in (
-        (found.others, "convert to JPEG, PNG or TIFF first"),
-        (found.broken, "links that lead nowhere"),
-        (found.companions, "by their names masks, depths or the like of other photos"),
+        (photo_files.others, "convert to JPEG, PNG or TIFF first"),
+        (photo_files.broken, "links that lead nowhere"),
+        (photo_files.companions, "by their names masks, depths or the like of other photos"),
     ):
         if left_out:
             warn(f"{images}: {_listed(left_out, images)} left out: {why}")
@@ -205,8 +205,8 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
 def _sizes(result: Path) -> dict[str, int]:
     """Bytes of the files of a result, by their names in it."""
     folders = (result / "images", result / "sparse")
-    found = (path for folder in folders for path in folder.rglob("*"))
-    return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(found) if is_file(path)}
+    paths = (path for folder in folders for path in folder.rglob("*"))
+    return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(paths) if is_file(path)}
 
 
 def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:

@@ -188,8 +188,8 @@ class Keys:
     def text(self, key: str) -> str:
         value = self.get(key)
         if not isinstance(value, str) or not value.strip():
-            found = f"has no '{key}'" if value is None else f"'{key}' is {short(value)}, expected text"
-            raise InputError(f"{self.where}: {found}; {EXPORT_AGAIN}")
+            trouble = f"has no '{key}'" if value is None else f"'{key}' is {short(value)}, expected text"
+            raise InputError(f"{self.where}: {trouble}; {EXPORT_AGAIN}")
         return value
 
     def number(self, key: str) -> float | None:
@@ -265,15 +265,15 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
                     f"{keys.where}: has no 'w' and 'h', nor is its picture there: {file}; give both --width and "
                     "--height"
                 )
-            found = size
+            actual = size
         else:
-            found = image_size(file, orient=False)
+            actual = image_size(file, orient=False)
         if width is not None:  # the other one in the picture's proportions
-            height = width * found[1] / found[0]
+            height = width * actual[1] / actual[0]
         elif height is not None:
-            width = height * found[0] / found[1]
+            width = height * actual[0] / actual[1]
         else:
-            width, height = found
+            width, height = actual
     assert height is not None
     fx = _focal(keys, "fl_x", "camera_angle_x", width)
     fy = _focal(keys, "fl_y", "camera_angle_y", height)
@@ -330,7 +330,7 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
 def numbers(given: Any) -> Float64:
     """An array of a list of numbers, or of lists of them; (0,) for what is none. True and false are no numbers."""
     rows = given if isinstance(given, list) else []
-    if any(isinstance(each, bool) for row in rows for each in (row if isinstance(row, list) else [row])):
+    if any(isinstance(value, bool) for row in rows for value in (row if isinstance(row, list) else [row])):
         return np.empty(0)
     try:
         return np.array(given, np.float64)

@@ -160,12 +160,12 @@ class ViserPage:
         )
 
         async def clicked(_: Any) -> None:
-            own = self.client.camera
-            ahead = float(np.linalg.norm(own.look_at - own.position))
+            viewpoint = self.client.camera
+            ahead = float(np.linalg.norm(viewpoint.look_at - viewpoint.position))
             with self.client.atomic():
-                own.position = camera.position - self.world.origin
-                own.look_at = camera.position - self.world.origin + ahead * camera.rotation[2]
-                own.fov = fov
+                viewpoint.position = camera.position - self.world.origin
+                viewpoint.look_at = camera.position - self.world.origin + ahead * camera.rotation[2]
+                viewpoint.fov = fov
 
         handle.on_click(clicked)
 

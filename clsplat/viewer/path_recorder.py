@@ -50,10 +50,10 @@ class Recorder:
         if not (math.isfinite(apart) and math.isfinite(fps) and 0 < fps <= 1000 and 0 < apart <= 3600):
             raise InputError(f"{apart} seconds at {fps} frames a second: expected up to 3600 and up to 1000")
         step = max(round(apart * fps), 1)
-        found: dict[str, Any] = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
+        contents: dict[str, Any] = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
         if loop and len(self.keys) > 1:
-            found["loop_frames"] = step * len(self.keys)
-        found["keys"] = [
+            contents["loop_frames"] = step * len(self.keys)
+        contents["keys"] = [
             {
                 "frame": 1 + step * index,
                 "position": [float(value) for value in pose.position],
@@ -62,7 +62,7 @@ class Recorder:
             }
             for index, pose in enumerate(self.keys)
         ]
-        return json.dumps(found, indent=2) + "\n"
+        return json.dumps(contents, indent=2) + "\n"
 
 
 def save_path(folder: Path, document: str) -> Path:

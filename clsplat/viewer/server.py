@@ -70,8 +70,8 @@ class Address:
         if self.paths is not None and not self.paths.is_dir():
             raise InputError(f"--paths {self.paths}: no such folder, expected one to save camera paths in")
         try:
-            found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-            family, kind, protocol, _, address = found[0]
+            addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+            family, kind, protocol, _, address = addresses[0]
             with socket.socket(family, kind, protocol) as probe:
                 if os.name == "posix":  # as asyncio does; on Windows it would take the port of another server
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -230,8 +230,8 @@ def _tell(_: Any, context: dict[str, Any]) -> None:
     """Print a line in place of a traceback; it takes what asyncio gives its handler for errors in tasks."""
     error = context.get("exception")
     words = f"{type(error).__name__}: {error}" if error is not None else str(context.get("message", ""))
-    told = plain(" ".join(words.split()))[:200].rstrip(": ")
-    print(f"clsplat: warning: a page sent what makes no sense here: {told}", file=sys.stderr)
+    message = plain(" ".join(words.split()))[:200].rstrip(": ")
+    print(f"clsplat: warning: a page sent what makes no sense here: {message}", file=sys.stderr)
 
 
 def refused(headers: Any, *, local: bool) -> str:

@@ -93,8 +93,8 @@ class Asset:
             raise InputError(f"{self.path}: {kind} has no {index!r}; is it damaged?")
         if not isinstance(items[index], dict):
             raise InputError(f"{self.path}: {kind} {index} is no object; is it damaged?")
-        found: dict[str, Any] = items[index]
-        return found
+        result: dict[str, Any] = items[index]
+        return result
 
     def integer(self, holder: dict[str, Any], key: str, default: int | None = None) -> int:
         value = holder.get(key, default)
@@ -111,7 +111,7 @@ class Asset:
             roots = list(range(len(nodes))) if isinstance(nodes, list) else []
         todo: deque[tuple[object, NDArray[np.float64]]] = deque((root, np.eye(4)) for root in _list(roots))
         seen: set[int] = set()
-        found = 0
+        count = 0
         while todo:
             index, parent = todo.popleft()
             node = self.item("nodes", index)
@@ -127,8 +127,8 @@ class Asset:
                 continue
             for place, primitive in enumerate(_list(self.item("meshes", node["mesh"]).get("primitives", []))):
                 if isinstance(primitive, dict) and EXTENSION in as_object(primitive.get("extensions")):
-                    found += 1
-                    if found > MAX_PRIMITIVES:
+                    count += 1
+                    if count > MAX_PRIMITIVES:
                         raise InputError(f"{self.path}: has more than {MAX_PRIMITIVES} primitives of Gaussians")
                     yield f"primitive {place} of node {index}", matrix, primitive
 
@@ -138,12 +138,12 @@ class Asset:
         def numbers(key: str, default: list[float]) -> NDArray[np.float64]:
             value = node.get(key, default)
             try:
-                found = np.array(value, np.float64)
+                vector = np.array(value, np.float64)
             except (TypeError, ValueError, OverflowError):
-                found = np.empty(0)
-            if found.shape != (len(default),) or not np.isfinite(found).all():
+                vector = np.empty(0)
+            if vector.shape != (len(default),) or not np.isfinite(vector).all():
                 raise InputError(f"{self.path}: {key} of node {index} is no list of {len(default)} numbers")
-            return found
+            return vector
 
         if "matrix" in node:
             return numbers("matrix", list(np.eye(4).ravel())).reshape(4, 4).T
@@ -188,17 +188,19 @@ class Asset:
             [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
             for degree in range(MAX_SH_DEGREE + 1)
         ]
-        degree = max((degree for degree in range(4) if any(each in indices for each in names[degree])), default=0)
+        degree = max(
+            (degree for degree in range(4) if any(semantic in indices for semantic in names[degree])), default=0
+        )
         sources = {
             "means": position,
             "quaternions": array(f"{EXTENSION}:ROTATION", 4),
             "log_scales": array(f"{EXTENSION}:SCALE", 3),
             "opacities": array(f"{EXTENSION}:OPACITY", 1),
         }
-        coefficients = [array(each, 3) for band in names[: degree + 1] for each in band]
-        for each in (*sources.values(), *coefficients):
-            if len(each) != count:
-                raise InputError(f"{self.path}: {name} has {len(each)} values of an attribute, expected {count}")
+        coefficients = [array(semantic, 3) for band in names[: degree + 1] for semantic in band]
+        for values in (*sources.values(), *coefficients):
+            if len(values) != count:
+                raise InputError(f"{self.path}: {name} has {len(values)} values of an attribute, expected {count}")
         result = packing.empty(count, degree)
         for first in range(0, count, BLOCK_ROWS):
             rows = slice(first, min(first + BLOCK_ROWS, count))

@@ -81,10 +81,10 @@ def palette(
         progress(index / len(members))
         if not len(rows):
             continue
-        found, label = _k_means(vectors[rows], min(int(share), len(rows)), iterations)
-        centres.append(found)
+        clusters, label = _k_means(vectors[rows], min(int(share), len(rows)), iterations)
+        centres.append(clusters)
         labels[rows] = used + label
-        used += len(found)
+        used += len(clusters)
     result = np.zeros((size, width), np.float32)
     result[:used] = np.concatenate(centres)
     return result, labels
@@ -135,8 +135,8 @@ def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
     scores = np.empty((TILE, len(centres)), np.float32)
     for start in range(0, len(vectors), TILE):
         rows = vectors[start : start + TILE]
-        found = scores[: len(rows)]
+        products = scores[: len(rows)]
         for at, part in columns:
-            np.matmul(rows, part, out=found[:, at])
-        labels[start : start + TILE] = np.subtract(halves, found, out=found).argmin(axis=1)
+            np.matmul(rows, part, out=products[:, at])
+        labels[start : start + TILE] = np.subtract(halves, products, out=products).argmin(axis=1)
     return labels

@@ -83,8 +83,8 @@ def log_scales(linear: NDArray[Any], path: Path | str, first: int) -> Float64:
         bad = ~(linear >= 0).all(axis=1)
     if bad.any():
         at = int(bad.argmax())
-        found = " ".join(f"{value:g}" for value in linear[at])
-        raise InputError(f"{path}: Gaussian {first + at} has the scales {found}, expected numbers of at least 0")
+        scales = " ".join(f"{value:g}" for value in linear[at])
+        raise InputError(f"{path}: Gaussian {first + at} has the scales {scales}, expected numbers of at least 0")
     return np.asarray(np.log(np.maximum(linear, LEAST_SCALE, dtype=np.float64)))
 
 

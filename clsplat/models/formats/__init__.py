@@ -43,7 +43,7 @@ class Format:
     loses: what the format does not keep, in a few words; floats: True if it keeps floats; sh_degree: the highest that
     it holds; describe(path): the format's part of `clsplat info`; order(gaussians): (n,), the Gaussian of each row of
     a written file, None for their own order; blocks(path): the origin, and the Gaussians in the world some rows at a
-    time, for a format that need not be held whole; beside(path): the other files of a model of this name.
+    time, for a format that need not be held whole; side_files(path): the other files of a model of this name.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Format:
     describe: Callable[[Path], dict[str, Any]] = lambda _: {}
     order: Callable[[Gaussians], NDArray[np.int64]] | None = None
     blocks: Callable[[Path], tuple[Float64, Iterator[Gaussians]]] | None = None
-    beside: Callable[[Path], list[Path]] = lambda _: []
+    side_files: Callable[[Path], list[Path]] = lambda _: []
 
 
 UNIT_QUATERNIONS = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
@@ -68,13 +68,13 @@ FORMATS: tuple[Format, ...] = (
            loses="position and scale to 10 or 11 bits of a chunk's range, rotation to 10, colour and opacity to 8, SH "
                  "to 1/32", describe=compressed_ply.describe, order=compressed_ply.order),
     Format("glTF", (".gltf", ".glb"), gltf.read, gltf.write, gltf.recognises,
-           loses=UNIT_QUATERNIONS, floats=True, describe=gltf.describe, beside=gltf.beside),
+           loses=UNIT_QUATERNIONS, floats=True, describe=gltf.describe, side_files=gltf.side_files),
     Format("ksplat", (".ksplat",), ksplat.read, loses="not written here", describe=ksplat.describe),
     Format("3DGS PLY", (".ply",), ply.read, ply.write, ply.recognises,
            loses="nothing", floats=True, describe=ply.describe, blocks=ply.blocks),
     Format("SOG", ("meta.json", ".sog"), sog.read, sog.write, sog.recognises,
            loses="positions to 16 bits, the rest to 8, spherical harmonics to a palette",
-           describe=sog.describe, beside=sog.beside),
+           describe=sog.describe, side_files=sog.side_files),
     Format("splat", (".splat",), splat.read, splat.write,
            loses="SH beyond degree 0; colour, opacity and rotation to 8 bits, colour beyond 0 to 1", sh_degree=0),
     Format("SPZ", (".spz",), spz.read, spz.write, spz.recognises,

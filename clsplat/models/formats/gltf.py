@@ -71,7 +71,7 @@ def describe(path: Path) -> dict[str, Any]:
     return {}
 
 
-def beside(path: Path) -> list[Path]:
+def side_files(path: Path) -> list[Path]:
     """The .bin of a .gltf."""
     return [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
 

@@ -84,8 +84,8 @@ def read(path: Path) -> Gaussians:
             raise InputError(f"{path}: truncated: has {size} bytes, expected a header of {HEADER.itemsize}")
         header = packing.read_rows(file, HEADER, 1, path)[0]
         if header["major"] != 0 or header["minor"] < 1 or header["level"] > 2:
-            found = f"version {header['major']}.{header['minor']}, compression level {header['level']}"
-            raise InputError(f"{path}: {found}, expected a .ksplat of version 0.1, level 0, 1 or 2")
+            version = f"version {header['major']}.{header['minor']}, compression level {header['level']}"
+            raise InputError(f"{path}: {version}, expected a .ksplat of version 0.1, level 0, 1 or 2")
         sections = _sections(file, int(header["sections"]), int(header["level"]), size, path)
         count = sum(section.count for section in sections)
         if count != header["count"] or not count:
@@ -124,7 +124,7 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
     at = HEADER.itemsize + sections * SECTION.itemsize
     if size < at:
         raise InputError(f"{path}: truncated: {sections} sections need {at} bytes, {size} are there")
-    found = []
+    result = []
     for index, fields in enumerate(packing.read_rows(file, SECTION, sections, path)):
         head = {name: fields[name].item() for name in SECTION.names or ()}
         name = f"{path}: section {index}"
@@ -146,9 +146,9 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
             ends = _ends(head, partial, name)
         scale_range = head["range"] or DEFAULT_RANGE
         step = head["block"] / 2 / scale_range
-        found.append(Section(head["count"], start, kind, head["degree"], step, scale_range, centres, ends))
+        result.append(Section(head["count"], start, kind, head["degree"], step, scale_range, centres, ends))
         at = end
-    return found
+    return result
 
 
 def _record(level: int, degree: int) -> np.dtype[Any]:

@@ -91,8 +91,8 @@ class Header:
     @property
     def vertex(self) -> Element:
         """The element of the Gaussians. Raises InputError where there is none."""
-        if found := [element for element in self.elements if element.name == "vertex"]:
-            return found[0]
+        if vertices := [element for element in self.elements if element.name == "vertex"]:
+            return vertices[0]
         names = examples(element.name for element in self.elements) or "none"
         raise InputError(f"{self.path}: PLY has no element 'vertex' (elements: {names})")
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -76,7 +75,7 @@ def describe(path: Path) -> dict[str, Any]:
     return {"version": meta.get("version", 1), "antialiased": bool(meta.get("antialias", False))}
 
 
-def beside(path: Path) -> list[Path]:
+def side_files(path: Path) -> list[Path]:
     """The pictures of a meta.json."""
     pictures = sorted(path.parent.glob("*.webp")) if path.name == META else []
     return [picture for picture in pictures if picture.stem.partition("_")[0] in PICTURES]
@@ -113,15 +112,15 @@ class _Files:
     def file(self, name: str, limit: int) -> Path:  # noqa: ARG002  # an archive needs the limit
         folder = Path(os.path.realpath(self.path)).parent
         try:
-            found = Path(os.path.realpath(folder / name))
+            picture = Path(os.path.realpath(folder / name))
         except ValueError:  # a zero byte
-            found = folder
-        if found.parent != folder:
+            picture = folder
+        if picture.parent != folder:
             raise InputError(f"{self.path}: has a picture {name[:80]!r}, expected one beside it")
-        if not is_file(found):
+        if not is_file(picture):
             raise InputError(f"{self.path}: its picture {name} is missing")
-        self.size += found.stat().st_size
-        return found
+        self.size += picture.stat().st_size
+        return picture
 
 
 class _Archive(_Files):
@@ -135,9 +134,9 @@ class _Archive(_Files):
         return self.parsed(self.unpacked(META, MAX_DOCUMENT).read_bytes())
 
     def file(self, name: str, limit: int) -> Path:
-        found = self.unpacked(name, limit)
-        self.size += found.stat().st_size
-        return found
+        picture = self.unpacked(name, limit)
+        self.size += picture.stat().st_size
+        return picture
 
     def unpacked(self, name: str, limit: int) -> Path:
         target = self.folder / f"file{META[-5:] if name == META else '.webp'}"
@@ -195,20 +194,20 @@ class _Meta:
             warn(f"{self.path}: trained with anti-aliasing, which this renderer does not do")
 
     def section(self, name: str) -> dict[str, Any]:
-        found = self.meta.get(name)
-        if not isinstance(found, dict):
+        value = self.meta.get(name)
+        if not isinstance(value, dict):
             raise InputError(f"{self.path}: {META} has no {name}")
-        return found
+        return value
 
     def numbers(self, section: str, key: str, least: int, most: int) -> NDArray[np.float64]:
         value = self.section(section).get(key)
         try:
-            found = np.atleast_1d(np.array(value, np.float64))
+            array = np.atleast_1d(np.array(value, np.float64))
         except (TypeError, ValueError, OverflowError):
-            found = np.empty(0)
-        if found.ndim != 1 or not least <= len(found) <= most or not np.isfinite(found).all():
+            array = np.empty(0)
+        if array.ndim != 1 or not least <= len(array) <= most or not np.isfinite(array).all():
             raise InputError(f"{self.path}: {key} of {section} in {META} are not {least} numbers")
-        return found
+        return array
 
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
         """(height, width, channels) of the bytes, with room for every Gaussian, or `least` pixels."""
@@ -228,14 +227,14 @@ class _Meta:
                     f"{file}: is {spec.width} x {spec.height} with {spec.nchannels} channels, expected at least "
                     f"{least} pixels with {channels}"
                 )
-            found = source.read_image(oiio.UINT8)
+            decoded = source.read_image(oiio.UINT8)
             reason = error_of(source)
             source.close()
-            if found is None or reason:
+            if decoded is None or reason:
                 raise InputError(f"{file}: does not decode: {reason or 'the decoder gives no reason'}")
         except InputError as error:
             raise InputError(str(error).replace(str(file), f"{self.path}: {names[index][:80]}", 1)) from None
-        return np.asarray(found).reshape(spec.height, spec.width, -1)[:, :, :channels]
+        return np.asarray(decoded).reshape(spec.height, spec.width, -1)[:, :, :channels]
 
     def pixels(self, section: str, index: int, channels: int) -> Bytes:
         return self.picture(section, index, channels).reshape(-1, channels)[: self.count]
@@ -280,7 +279,7 @@ class _Meta:
         table = self.picture("shN", 0, 3, least=needed)
         width = table.shape[1] // PALETTE_COLUMNS
         said = self.section("shN").get("bands") if self.version == 2 else None
-        bands = next((degree for degree, each in COEFFICIENTS.items() if each == width and degree), 0)
+        bands = next((degree for degree, coefficients in COEFFICIENTS.items() if coefficients == width and degree), 0)
         if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
             raise InputError(f"{self.path}: shN's palette is {table.shape[1]} pixels wide for {str(said)[:20]} bands")
         colours = table.reshape(-1, width, 3)
@@ -314,18 +313,17 @@ def write(
         text = json.dumps(meta, separators=(",", ":")).encode()
         files = sorted(folder.iterdir())
         if path.name.lower().endswith(".json"):
-            for each in files:
-                with atomic_writer(path.with_name(each.name), each.stat().st_size) as file, each.open("rb") as source:
-                    shutil.copyfileobj(source, file)
+            for picture in files:
+                atomic_write(path.with_name(picture.name), picture.read_bytes())
             atomic_write(path, text)
-            for name in {*SH_PICTURES} - {each.name for each in files}:  # of a model that had more SH
+            for name in {*SH_PICTURES} - {picture.name for picture in files}:  # of a model that had more SH
                 path.with_name(name).unlink(missing_ok=True)
             return
-        total = sum(each.stat().st_size for each in files)
+        total = sum(picture.stat().st_size for picture in files)
         with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:  # stored: WebP is compressed
             archive.writestr(zipfile.ZipInfo(META), text)
-            for each in files:
-                archive.writestr(zipfile.ZipInfo(each.name), each.read_bytes())
+            for picture in files:
+                archive.writestr(zipfile.ZipInfo(picture.name), picture.read_bytes())
 
 
 def _room(count: int) -> int:
@@ -340,7 +338,7 @@ def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, p
     height = 4 * math.ceil(count / width / 4)
 
     def picture(name: str, columns: list[Bytes]) -> str:
-        pixels = np.zeros((height * width, sum(each.shape[1] for each in columns)), np.uint8)
+        pixels = np.zeros((height * width, sum(column.shape[1] for column in columns)), np.uint8)
         pixels[:count] = np.concatenate(columns, axis=1)
         _write_webp(folder / name, pixels.reshape(height, width, -1))
         return name

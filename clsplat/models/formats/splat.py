@@ -36,17 +36,17 @@ def read(path: Path) -> Gaussians:
             raise InputError(f"{path}: has {size} bytes, expected some Gaussians of {ROW.itemsize} bytes each")
         _check_first(values.read_rows(file, ROW, min(BLOCK_ROWS, count), path), path)
         file.seek(0)
-        found = values.empty(count, 0)
+        result = values.empty(count, 0)
         for start in range(0, count, BLOCK_ROWS):
             block = values.read_rows(file, ROW, min(BLOCK_ROWS, count - start), path)
             rows = slice(start, start + len(block))
-            found.means[rows] = block["means"]
-            found.log_scales[rows] = values.log_scales(block["scales"], path, start)
-            found.sh[rows, 0] = values.coefficients(block["rgba"][:, :3] / 255)
-            found.opacity_logits[rows] = values.byte_logits()[block["rgba"][:, 3]]
-            found.quaternions[rows] = block["quaternions"].astype(np.float32) / 128 - 1
-    values.require_finite(path, found)
-    return found
+            result.means[rows] = block["means"]
+            result.log_scales[rows] = values.log_scales(block["scales"], path, start)
+            result.sh[rows, 0] = values.coefficients(block["rgba"][:, :3] / 255)
+            result.opacity_logits[rows] = values.byte_logits()[block["rgba"][:, 3]]
+            result.quaternions[rows] = block["quaternions"].astype(np.float32) / 128 - 1
+    values.require_finite(path, result)
+    return result
 
 
 def _check_first(block: Any, path: Path) -> None:

@@ -168,20 +168,20 @@ def _check(header: Header, path: Path) -> None:
 
 def _records(data: bytes, path: Path) -> dict[int, bytes]:
     """Extensions by their type. Each is its type and its length, 32 bits each, and then its bytes."""
-    found, at = {}, 0
+    records, at = {}, 0
     while len(data) - at >= 8:
         kind, length = struct.unpack_from("<II", data, at)
         if length > len(data) - at - 8:
             raise InputError(f"{path}: truncated: SPZ extension {kind:#x} of {length} bytes")
-        found[kind] = data[at + 8 : at + 8 + length]
+        records[kind] = data[at + 8 : at + 8 + length]
         at += 8 + length
-    return found
+    return records
 
 
 def _frame(records: dict[int, bytes], path: Path) -> Signs:
-    if len(found := records.get(COORDINATE_SYSTEM, b"")) != 4:
+    if len(system := records.get(COORDINATE_SYSTEM, b"")) != 4:
         return UP_BACK
-    (value,) = struct.unpack("<I", found)
+    (value,) = struct.unpack("<I", system)
     if value >= len(FRAMES):
         raise InputError(f"{path}: SPZ in the coordinate system {value}, expected one with y up or down (0 to 8)")
     return FRAMES[value]

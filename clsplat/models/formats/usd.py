@@ -63,9 +63,9 @@ def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **ar
     binary file says to anywhere, and so deep into a file that its stack ends."""
     _pxr(path)
     with open_input(path, "a USD stage") as file:
-        alone, found = _stands_alone(file), os.fstat(file.fileno())
+        alone, status = _stands_alone(file), os.fstat(file.fileno())
     words = json.dumps(arguments)
-    if not (alone or _lives(call, words, os.path.realpath(path), found.st_mtime_ns, found.st_size)):
+    if not (alone or _lives(call, words, os.path.realpath(path), status.st_mtime_ns, status.st_size)):
         raise InputError(f"{path}: USD's library crashes when it reads it; is it damaged, or a file that it refers to?")
 
 
@@ -166,16 +166,16 @@ def read_here(path: Path) -> Gaussians:
 
 def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int | None) -> Float32 | None:
     """(count, width), from the attribute of floats or that of halves; None where neither has a value."""
-    for each in (name, f"{name}h"):
-        attribute = prim.GetAttribute(each)
+    for key in (name, f"{name}h"):
+        attribute = prim.GetAttribute(key)
         value = attribute.Get(time) if attribute else None
         if value is not None:
-            found = np.asarray(value)
-            if found.size % width or not np.issubdtype(found.dtype, np.floating):
-                raise InputError(f"{where}: {each} are {found.dtype} {found.shape}, expected rows of {width} numbers")
-            rows = found.reshape(-1, width)
+            array = np.asarray(value)
+            if array.size % width or not np.issubdtype(array.dtype, np.floating):
+                raise InputError(f"{where}: {key} are {array.dtype} {array.shape}, expected rows of {width} numbers")
+            rows = array.reshape(-1, width)
             if count is not None and len(rows) < count:
-                raise InputError(f"{where}: has {len(rows)} {each}, expected {count}")
+                raise InputError(f"{where}: has {len(rows)} {key}, expected {count}")
             return rows[:count].astype(np.float32)
     return None
 
