@@ -5,12 +5,8 @@ from __future__ import annotations
 
 import errno
 import os
-import sys
 import warnings
 from collections.abc import Iterable
-from pathlib import Path
-
-_PACKAGE = str(Path(__file__).parent)
 
 
 class ClsplatError(Exception):
@@ -25,11 +21,8 @@ def plain(text: str) -> str:
 
 
 def warn(text: str) -> None:
-    """Warn in one line, as of the line outside of the package that led here."""
-    frame, level = sys._getframe(1), 2  # noqa: SLF001
-    while frame.f_back and frame.f_code.co_filename.startswith(_PACKAGE):
-        frame, level = frame.f_back, level + 1
-    warnings.warn(plain(text), stacklevel=level)
+    """Warn in one line, as of the calling line: the command line shows the warnings of this package's modules."""
+    warnings.warn(plain(text), stacklevel=2)
 
 
 def examples(names: Iterable[object], most: int = 3) -> str:

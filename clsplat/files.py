@@ -322,22 +322,20 @@ def abandoned(targets: Iterable[Path]) -> list[Path]:
 
 def digest(path: str | os.PathLike[str]) -> str:
     """SHA-256 of the file's content, in hexadecimal. Raises OSError."""
-    result = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            result.update(block)
-    return result.hexdigest()
+    return _digest(path, hashlib.sha256())
 
 
 def short_digest(path: Path) -> str | None:
     """BLAKE2b of 16 bytes of the file's content, in hexadecimal, which is quicker; None where there is no file."""
-    if not is_file(path):
-        return None
-    result = hashlib.blake2b(digest_size=16)
+    return _digest(path, hashlib.blake2b(digest_size=16)) if is_file(path) else None
+
+
+def _digest(path: str | os.PathLike[str], state: Any) -> str:
     with open(path, "rb") as file:
         while block := file.read(1 << 20):
-            result.update(block)
-    return result.hexdigest()
+            state.update(block)
+    digits: str = state.hexdigest()
+    return digits
 
 
 def _sync_folder(folder: Path) -> None:

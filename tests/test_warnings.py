@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warnings go one way: `errors.warn`, which names the caller's line, and which a scene gathers while it is read."""
+"""Warnings go one way: `errors.warn`, which the command line shows, and which a scene gathers while it is read."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from models import random_gaussians
 
+from clsplat.cli.main import main
 from clsplat.errors import warn
-from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.scenes.scene import load_scene
 
@@ -28,13 +28,13 @@ more
 """
 
 
-def test_a_warning_is_of_the_line_that_called_the_package(tmp_path: Path) -> None:
+def test_a_warning_of_a_reader_reaches_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Which passes over the warnings of other packages."""
     path = tmp_path / "model.ply"
     random_gaussians(4).save(path)
     path.write_bytes(path.read_bytes() + b"more")
-    with pytest.warns(UserWarning, match="4 bytes after the last Gaussian ignored") as caught:
-        Gaussians.load(path)
-    assert [warning.filename for warning in caught] == [__file__]
+    assert main(["info", str(path)]) == 0
+    assert capsys.readouterr().err == f"clsplat: warning: {path}: 4 bytes after the last Gaussian ignored\n"
 
 
 def test_a_warning_is_one_line() -> None:

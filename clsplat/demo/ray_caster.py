@@ -335,13 +335,6 @@ def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], n
     surface.texture = texture.reshape(surface.rows, surface.columns, 3).astype(np.float32)
 
 
-def sky(direction: Float32) -> Float32:
-    """A pale gradient, (n, 3), for unit directions (n, 3)."""
-    up = np.clip(direction[:, 2], 0, 1)[:, None]
-    horizon, zenith = np.array([0.80, 0.84, 0.88], np.float32), np.array([0.45, 0.60, 0.82], np.float32)
-    return horizon * (1 - up) + zenith * up
-
-
 def cameras(count: int, width: int, height: int, seed: int) -> list[Camera]:
     """Hand-held views: three in five on a low ring, the others on a high one, all towards the middle, with jitter."""
     generator = np.random.default_rng(seed + 1)
@@ -376,7 +369,7 @@ def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32
         distance = surface.distance(origin, direction)
         closer = distance < nearest
         nearest[closer], hit_index[closer] = distance[closer], index
-    colour = sky(direction)
+    colour = np.zeros_like(direction)  # no ray misses the wall
     for index, surface in enumerate(surfaces):
         rays = np.flatnonzero(hit_index == index)
         if not len(rays):

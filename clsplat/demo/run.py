@@ -69,7 +69,11 @@ def _run_demo(output: Path, *, device: str | None, iterations: int, frames: int)
     opened = open_device(device)
     scene_folder = make_scene(output, StageProgress())
     run_folder, turntable_folder = output / "run", output / "turntable"
-    result = _train(scene_folder, run_folder, iterations, opened)
+    config = TrainConfig(iterations=iterations)
+    run = Run.create(run_folder, config, scene=scene_folder, resume=False, overwrite=True)
+    with TrainProgress(iterations) as progress:
+        train(load_scene(scene_folder), config, device=opened, run=run, on_step=progress)
+    result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
     _render_turntable(scene_folder, run_folder, turntable_folder, frames, opened)
 
     minutes, seconds = divmod(round(time.monotonic() - start), 60)
@@ -99,17 +103,6 @@ def make_scene(output: Path, progress: Progress | None = None) -> Path:
         write_photos(photos, count=PHOTOS, width=WIDTH, height=HEIGHT, progress=progress)
     # the ray caster's lens has no distortion, as ours is known to have none: photos need no resampling
     return sfm.reconstruct(photos, scene, camera_model="SIMPLE_PINHOLE", overwrite=True, progress=progress)
-
-
-def _train(scene_folder: Path, run_folder: Path, iterations: int, device: Any) -> dict[str, Any]:
-    """Train a run and give its evaluation on the held-out photos. An earlier demo's run is replaced."""
-    config = TrainConfig(iterations=iterations)
-    scene = load_scene(scene_folder)
-    run = Run.create(run_folder, config, scene=scene_folder, resume=False, overwrite=True)
-    with TrainProgress(iterations) as progress:
-        train(scene, config, device=device, run=run, on_step=progress)
-    result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
-    return result
 
 
 def _render_turntable(scene_folder: Path, run_folder: Path, target: Path, frames: int, device: Any) -> None:

@@ -36,23 +36,26 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
         raise ValueError(f"{len(original)} and {len(read)} Gaussians")
     low, high = original.means.min(axis=0).astype(np.float64), original.means.max(axis=0).astype(np.float64)
     extent = float(np.linalg.norm(high - low))
-    attributes: dict[str, list[Float64]] = {name: [] for name in UNITS}
     shift = read.origin - original.origin
+    blocks = []
     for start in range(0, len(original), _BLOCK):
         rows = slice(start, start + _BLOCK)
-        moved = read.means[rows].astype(np.float64) - original.means[rows] + shift
-        distance = np.linalg.norm(moved, axis=1)
-        attributes["position"].append(distance)
-        attributes["position_relative"].append(distance / extent if extent else distance * 0)
-        attributes["scale"].append(_scale_errors(original.log_scales[rows], read.log_scales[rows]))
-        attributes["rotation"].append(_angles(original.quaternions[rows], read.quaternions[rows]))
-        logits = original.opacity_logits[rows], read.opacity_logits[rows]
-        attributes["opacity"].append(np.abs(packing.opacities(logits[1]) - packing.opacities(logits[0])))
-        dc = packing.colours(read.sh[rows, 0]) - packing.colours(original.sh[rows, 0])
-        attributes["colour"].append(np.abs(dc).max(axis=1))
-        attributes["sh"].append(_sh_errors(original.sh[rows, 1:], read.sh[rows, 1:]))
-    whole = {name: np.concatenate(values) for name, values in attributes.items()}
-    return {name: {"largest": float(all_.max()), "mean": float(all_.mean())} for name, all_ in whole.items()}
+        distance = np.linalg.norm(read.means[rows].astype(np.float64) - original.means[rows] + shift, axis=1)
+        opacities = [packing.opacities(model.opacity_logits[rows]) for model in (original, read)]
+        colours = [packing.colours(model.sh[rows, 0]) for model in (original, read)]
+        blocks.append(
+            {
+                "position": distance,
+                "position_relative": distance / extent if extent else distance * 0,
+                "scale": _scale_errors(original.log_scales[rows], read.log_scales[rows]),
+                "rotation": _angles(original.quaternions[rows], read.quaternions[rows]),
+                "opacity": np.abs(opacities[1] - opacities[0]),
+                "colour": np.abs(colours[1] - colours[0]).max(axis=1),
+                "sh": _sh_errors(original.sh[rows, 1:], read.sh[rows, 1:]),
+            }
+        )
+    whole = {name: np.concatenate([block[name] for block in blocks]) for name in UNITS}
+    return {name: {"largest": float(column.max()), "mean": float(column.mean())} for name, column in whole.items()}
 
 
 def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:

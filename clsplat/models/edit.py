@@ -29,8 +29,8 @@ _SIMILAR = 1e-6
 """Most that Q^T Q may differ from 1: matrices are typed with six digits, or float32's."""
 
 
-def take(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
-    """The Gaussians of those rows, (n,) booleans or indices."""
+def take(gaussians: Gaussians, rows: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
+    """The Gaussians of those rows, a slice or (n,) booleans or indices."""
     return replace(gaussians, **{name: array[rows] for name, array in gaussians.arrays().items()})
 
 
@@ -72,15 +72,9 @@ def merge(models: Sequence[Gaussians]) -> Gaussians:
     def sh(model: Gaussians) -> Float32:
         return np.pad(model.sh, ((0, 0), (0, coefficients - model.sh.shape[1]), (0, 0)))
 
-    return Gaussians(
-        np.concatenate([means(model) for model in models]),
-        np.concatenate([model.quaternions for model in models]),
-        np.concatenate([model.log_scales for model in models]),
-        np.concatenate([model.opacity_logits for model in models]),
-        np.concatenate([sh(model) for model in models]),
-        origin,
-        min(model.near for model in models),
-    )
+    parts = [replace(model, means=means(model), sh=sh(model)).arrays() for model in models]
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Gaussians(**whole, origin=origin, near=min(model.near for model in models))
 
 
 def decompose(matrix: Float64, slack: float = _SIMILAR) -> tuple[float, Float64, Float64]:

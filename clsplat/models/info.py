@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from clsplat.files import is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import recorded_space
 from clsplat.models.codec import values as packing
+from clsplat.models.edit import take
 from clsplat.models.formats import Format, resolve
 
 PERCENTILES = (0, 1, 50, 99, 100)
@@ -47,13 +49,7 @@ def _blocks(model: Gaussians) -> Iterator[Gaussians]:
     """Blocks of a whole model, in the world."""
     for start in range(0, len(model), _BLOCK):
         rows = slice(start, start + _BLOCK)
-        yield Gaussians(
-            packing.world_means(model, rows).astype(np.float32),
-            model.quaternions[rows],
-            model.log_scales[rows],
-            model.opacity_logits[rows],
-            model.sh[rows],
-        )
+        yield replace(take(model, rows), means=packing.world_means(model, rows).astype(np.float32))
 
 
 def _summary(blocks: Iterator[Gaussians], origin: NDArray[np.float64]) -> dict[str, Any]:
@@ -103,11 +99,12 @@ def text(info: dict[str, Any]) -> str:
     def numbers(values: list[float]) -> str:
         return " ".join(f"{value:.6g}" for value in values)
 
-    kind = ", ".join(
-        [info["format"], *(f"{key} {info[key]}" for key in ("version", "encoding", "level") if key in info)]
-    )
+    details = [f"{key} {info[key]}" for key in ("version", "encoding", "level") if key in info]
     count = info["gaussians"]
-    lines = [("format", kind), ("bytes", f"{info['bytes']:,}, {info['bytes'] / max(count, 1):.1f} a Gaussian")]
+    lines = [
+        ("format", ", ".join([info["format"], *details])),
+        ("bytes", f"{info['bytes']:,}, {info['bytes'] / max(count, 1):.1f} a Gaussian"),
+    ]
     lines.append(("Gaussians", f"{count:,}" + (f", {info['not_finite']:,} not finite" if info["not_finite"] else "")))
     used = info["sh_degree_used"]
     only = "" if used == info["sh_degree"] else f", zero beyond {used}"

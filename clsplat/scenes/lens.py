@@ -102,10 +102,6 @@ class Lens:
         """Project points (N, 3) in camera space to pixels (N, 2); NaN where the model has no image of them."""
         return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))
 
-    def cam_from_img(self, pixels: Float64) -> Float64:
-        """Rays of pixels (N, 2) as (N, 2), x / z and y / z."""
-        return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
-
     def _camera(self) -> pycolmap.Camera:
         camera = pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
         camera.camera_id = 1

@@ -163,17 +163,17 @@ class Scene:
         return np.asarray(np.round(middle / step) * step)
 
     @cached_property
-    def _spread(self) -> tuple[Float64, float]:
-        """The middle of the training cameras, and how far the farthest is from there."""
+    def _spread(self) -> tuple[Float64, float, float]:
+        """The middle of the training cameras, how far the farthest is from there, and their largest coordinate."""
         centres = np.stack([view.camera.position for view in self.train_views or self.views])
         middle: Float64 = centres.mean(axis=0)
-        return middle, float(np.linalg.norm(centres - middle, axis=1).max())
+        return middle, float(np.linalg.norm(centres - middle, axis=1).max()), float(np.abs(centres).max())
 
-    @cached_property
+    @property
     def in_one_place(self) -> bool:
         """True if all training cameras are in one place, but for rounding."""
-        centres = np.stack([view.camera.position for view in self.train_views or self.views])
-        return self._spread[1] <= ROUNDING * float(np.abs(centres).max())
+        _, spread, largest = self._spread
+        return spread <= ROUNDING * largest
 
     @cached_property
     def extent(self) -> float:
@@ -182,7 +182,7 @@ class Scene:
         If the cameras are all in one place, the median distance of the points from there, or 1 if there are none: it
         scales the learning rates.
         """
-        middle, spread = self._spread
+        middle, spread, _ = self._spread
         if not self.in_one_place:
             return 1.1 * spread
         return (float(np.median(np.linalg.norm(self.points - middle, axis=1))) if len(self.points) else 0.0) or 1.0
@@ -255,7 +255,11 @@ def load_scene(
         if kind in ("blender", "transforms"):
             data = _read_transforms(path, kind)
         else:
-            data, smaller = _read_colmap(_reconstruct(path, work_dir, progress) if kind == "photos" else path, images)
+            folder = path
+            if kind == "photos":
+                photos = path.resolve()
+                folder = reconstruct(photos, work_dir or photos.with_name(f"{photos.name}_colmap"), progress=progress)
+            data, smaller = _read_colmap(folder, images)
         posed = sorted(data.images, key=lambda image: image.name)
         own_split = any(image.split for image in posed)
         views = []
@@ -296,11 +300,6 @@ def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = N
         if (inner_low < inner_high).all():
             return inner_low, inner_high
     return low, high
-
-
-def _reconstruct(path: Path, work_dir: Path | None, progress: Progress | None) -> Path:
-    path = path.resolve()
-    return reconstruct(path, work_dir or path.with_name(f"{path.name}_colmap"), progress=progress)
 
 
 def _read_colmap(path: Path, chosen: str | Path | None) -> tuple[DataSet, list[Path]]:

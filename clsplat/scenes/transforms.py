@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Float32, Float64, numbers
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.images.reading import EXTENSIONS, image_size, require_images
@@ -56,9 +56,8 @@ def read_transforms(path: Path) -> DataSet:
     """
     document = load_document(path)
     readers = _readers(path, document)
-    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
-    require_images(files, path)
-    data = DataSet(_images(path, readers, files))
+    require_images([_find_file(keys) for keys in readers], path)
+    data = DataSet(_images(path, readers))
     if any("mask_path" in keys.frame for keys in readers):
         warn(f"{path}: 'mask_path' is ignored, masks are not supported")
     data.box = _ngp_box(Keys(path, None, {}, document))
@@ -73,9 +72,7 @@ def read_poses(path: Path, size: tuple[int, int] | None = None) -> list[PosedIma
     `size`, (width, height). Raises InputError as `read_transforms`; warns of what contradicts itself, and of
     lenses beyond reason.
     """
-    readers = _readers(path, load_document(path))
-    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
-    images = _images(path, readers, files, size)
+    images = _images(path, _readers(path, load_document(path)), size)
     if doubt := absurd([(image.name, image.lens) for image in images]):
         warn(doubt)
     return images
@@ -91,13 +88,11 @@ def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
     return readers
 
 
-def _images(
-    path: Path, readers: list[Keys], files: list[Path], size: tuple[int, int] | None = None
-) -> list[PosedImage]:
+def _images(path: Path, readers: list[Keys], size: tuple[int, int] | None = None) -> list[PosedImage]:
     """The images. Warns of what contradicts itself."""
     images: dict[str, PosedImage] = {}
-    for keys, file in zip(readers, files, strict=True):
-        listed = _plain(keys.text("file_path"))
+    for keys in readers:
+        file, listed = _find_file(keys), _plain(keys.text("file_path"))
         name = listed + file.name[len(PurePosixPath(listed).name) :]  # with the extension of the file
         lens = _lens(keys, file, size)
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
@@ -147,13 +142,9 @@ def _warn_of_contradictions(path: Path, readers: list[Keys], images: list[PosedI
                     contradictions.append(f"{image.name} ({used:g}, not {meant:.4g})")
         if contradictions:
             warn(f"{path}: '{focal}' is used, '{angle}' says otherwise of {examples(contradictions)}")
-    if any(_shutter(keys.get("rolling_shutter")) for keys in readers):
+    shutters = [keys.get("rolling_shutter") for keys in readers]
+    if any(any(value) if isinstance(value, list) else value for value in shutters):
         warn(f"{path}: 'rolling_shutter' is ignored, pictures are taken as exposed at once")
-
-
-def _shutter(value: object) -> bool:
-    """True if a rolling shutter does anything."""
-    return any(value) if isinstance(value, list) else bool(value)
 
 
 def read_blender(folder: Path) -> DataSet:
@@ -233,9 +224,9 @@ def _plain(listed: str) -> str:
     return "/".join(part for part in text.split("/") if part not in ("", ".", ".."))
 
 
-def _find_file(folder: Path, listed: str) -> Path:
+def _find_file(keys: Keys) -> Path:
     """The picture; one that does not exist is returned as it is listed."""
-    path = Path(os.path.normpath(folder / listed.replace("\\", "/")))
+    path = Path(os.path.normpath(keys.path.parent / keys.text("file_path").replace("\\", "/")))
     if is_file(path) or not path.name:
         return path
     for extension in (*EXTENSIONS, *(extension.upper() for extension in EXTENSIONS)):
@@ -325,17 +316,6 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
     if k3 or k4 or k5 or k6:
         return "FULL_OPENCV", [k1, k2, p1, p2, k3, k4, k5, k6]
     return "OPENCV", [k1, k2, p1, p2]
-
-
-def numbers(given: Any) -> Float64:
-    """An array of a list of numbers, or of lists of them; (0,) for what is none. True and false are no numbers."""
-    rows = given if isinstance(given, list) else []
-    if any(isinstance(value, bool) for row in rows for value in (row if isinstance(row, list) else [row])):
-        return np.empty(0)
-    try:
-        return np.array(given, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return np.empty(0)
 
 
 def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64, float]:

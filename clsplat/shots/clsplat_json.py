@@ -10,11 +10,11 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
-from clsplat.arrays import Float64
+from clsplat.arrays import Float64, numbers
 from clsplat.camera import LARGEST_FOCAL, Camera, Projection, focal_length
 from clsplat.errors import InputError
 from clsplat.rotations import rotation_from_quaternion
-from clsplat.scenes.transforms import Keys, numbers, short
+from clsplat.scenes.transforms import Keys, short
 from clsplat.shots.keys import Key, interpolate
 from clsplat.shots.nerfstudio import image_side
 from clsplat.shots.shot import MOST_FRAMES, Frame, Shot

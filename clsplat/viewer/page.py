@@ -16,7 +16,7 @@ from clsplat.errors import ClsplatError, InputError, plain
 from clsplat.rotations import quaternion_of
 from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
 from clsplat.viewer.path_recorder import FPS, Recorder, save_path
-from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS
+from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose
 from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
 
@@ -142,22 +142,14 @@ class ViserPage:
             self.client.scene.add_frame(name, show_axes=False)
 
     def _add_camera(self, index: int, view: View, *, photo: bool) -> None:
-        camera, start = view.camera, self.world.start
+        camera = view.camera
         if camera.projection != "perspective":
             return
         fov = 2 * math.atan2(0.5 * camera.height, camera.fy)
-        handle = self.client.scene.add_camera_frustum(
-            f"/cameras/{index}",
-            fov,
-            camera.width / camera.height,
-            scale=FRUSTUM * float(np.linalg.norm(start.position - start.target)),
-            color=CAMERA_COLOURS[view.split],
-            image=thumbnail(view) if photo else None,
-            wxyz=quaternion_of(camera.rotation.T),
-            position=camera.position - self.world.origin,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        pose = Pose(camera.rotation.T, camera.position, fov, camera.width, camera.height)
+        image = thumbnail(view) if photo else None
+        shadows = {"cast_shadow": False, "receive_shadow": False}
+        handle = self._add_frustum(f"/cameras/{index}", pose, view.split, image=image, **shadows)
 
         async def clicked(_: Any) -> None:
             viewpoint = self.client.camera
@@ -191,12 +183,12 @@ class ViserPage:
             counted()
 
         async def removed(_: Any) -> None:
-            self.recorder.remove_last()
+            del self.recorder.keys[-1:]
             self.client.scene.remove_by_name(f"/keys/{len(self.recorder.keys)}")
             counted()
 
         async def cleared(_: Any) -> None:
-            self.recorder.clear()
+            self.recorder.keys.clear()
             self._clear("/keys")
             counted()
 
@@ -224,17 +216,22 @@ class ViserPage:
             save.on_click(saved)
 
     def _draw_key(self, index: int) -> None:
-        pose, start = self.recorder.keys[index], self.world.start
-        self.client.scene.add_camera_frustum(
-            f"/keys/{index}",
+        # thin lines: where the camera still stands, it would frame the page
+        pose, lines = self.recorder.keys[index], {"thickness": 2.0, "thickness_units": "screen"}
+        self._add_frustum(f"/keys/{index}", pose, "key", **lines)
+
+    def _add_frustum(self, name: str, pose: Pose, kind: str, **options: Any) -> Any:
+        """Draw a camera of a kind of CAMERA_COLOURS."""
+        start = self.world.start
+        return self.client.scene.add_camera_frustum(
+            name,
             pose.fov,
             pose.width / pose.height,
             scale=FRUSTUM * float(np.linalg.norm(start.position - start.target)),
-            color=CAMERA_COLOURS["key"],
+            color=CAMERA_COLOURS[kind],
             wxyz=quaternion_of(pose.rotation),
             position=pose.position - self.world.origin,
-            thickness=2.0,
-            thickness_units="screen",  # where the camera still stands, it would frame the page
+            **options,
         )
 
     def _add_screenshot(self, gui: Any) -> None:

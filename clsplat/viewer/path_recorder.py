@@ -30,15 +30,6 @@ class Recorder:
             raise InputError(f"there are {MOST_KEYS:,} key frames already")
         self.keys.append(pose)
 
-    def remove_last(self) -> None:
-        """Nothing where there is none."""
-        if self.keys:
-            self.keys.pop()
-
-    def clear(self) -> None:
-        """Begin anew."""
-        self.keys.clear()
-
     def document(self, size: tuple[int, int], *, apart: float = 2.0, fps: float = FPS, loop: bool = False) -> str:
         """The file. size: width, height of its pictures; apart: seconds from key to key, brought to whole frames; loop:
         after the last the first comes again. Raises InputError for no keys, and for numbers that make no path."""

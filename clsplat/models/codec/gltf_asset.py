@@ -22,6 +22,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import numbers
 from clsplat.errors import InputError, warn
 from clsplat.files import MAX_DOCUMENT, open_input, parse_json, read_document
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
@@ -135,24 +136,20 @@ class Asset:
     def matrix(self, node: dict[str, Any], index: int) -> NDArray[np.float64]:
         from scipy.spatial.transform import Rotation
 
-        def numbers(key: str, default: list[float]) -> NDArray[np.float64]:
-            value = node.get(key, default)
-            try:
-                vector = np.array(value, np.float64)
-            except (TypeError, ValueError, OverflowError):
-                vector = np.empty(0)
-            if vector.shape != (len(default),) or not np.isfinite(vector).all():
+        def vector(key: str, default: list[float]) -> NDArray[np.float64]:
+            values = numbers(node.get(key, default))
+            if values.shape != (len(default),) or not np.isfinite(values).all():
                 raise InputError(f"{self.path}: {key} of node {index} is no list of {len(default)} numbers")
-            return vector
+            return values
 
         if "matrix" in node:
-            return numbers("matrix", list(np.eye(4).ravel())).reshape(4, 4).T
+            return vector("matrix", list(np.eye(4).ravel())).reshape(4, 4).T
         result = np.eye(4)
-        rotation = numbers("rotation", [0, 0, 0, 1])
+        rotation = vector("rotation", [0, 0, 0, 1])
         if not rotation.any():
             raise InputError(f"{self.path}: rotation of node {index} is 0, expected a quaternion")
-        result[:3, :3] = Rotation.from_quat(rotation).as_matrix() * numbers("scale", [1, 1, 1])
-        result[:3, 3] = numbers("translation", [0, 0, 0])
+        result[:3, :3] = Rotation.from_quat(rotation).as_matrix() * vector("scale", [1, 1, 1])
+        result[:3, 3] = vector("translation", [0, 0, 0])
         return result
 
     def extension(self, primitive: dict[str, Any]) -> dict[str, Any]:
@@ -184,10 +181,7 @@ class Asset:
         self.total += count
         size = self.size + sum(len(buffer) for buffer in self.buffers.values())
         packing.require_count(self.path, self.total if count else 0, size)
-        names = [
-            [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
-            for degree in range(MAX_SH_DEGREE + 1)
-        ]
+        names = [sh_attributes(degree) for degree in range(MAX_SH_DEGREE + 1)]
         degree = max(
             (degree for degree in range(4) if any(semantic in indices for semantic in names[degree])), default=0
         )
@@ -287,6 +281,11 @@ class Asset:
         with open_input(file, f"the buffer of {self.path}") as opened:
             size = os.fstat(opened.fileno()).st_size
         return _map(file, 0, size)
+
+
+def sh_attributes(degree: int) -> list[str]:
+    """The attributes of one degree's coefficients, in our order."""
+    return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
 
 
 class _Normalised(np.ndarray[Any, Any]):

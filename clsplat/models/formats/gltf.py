@@ -45,6 +45,7 @@ from clsplat.models.codec.gltf_asset import (
     Array,
     Asset,
     as_object,
+    sh_attributes,
 )
 from clsplat.models.codec.values import BLOCK_ROWS
 from clsplat.models.edit import merge
@@ -191,10 +192,7 @@ def _document(
 ) -> tuple[dict[str, Any], _Buffer]:
     count = len(gaussians)
     attributes = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))]
-    degrees = range(gaussians.sh_degree + 1)
-    attributes += [
-        f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for degree in degrees for index in range(2 * degree + 1)
-    ]
+    attributes += [name for degree in range(gaussians.sh_degree + 1) for name in sh_attributes(degree)]
     attributes.append("COLOR_0")
     corners = [gaussians.means.min(axis=0) * LEFT_UP, gaussians.means.max(axis=0) * LEFT_UP]
     bounds = {"min": np.minimum(*corners).tolist(), "max": np.maximum(*corners).tolist()}

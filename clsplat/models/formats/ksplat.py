@@ -35,23 +35,13 @@ HEADER = np.dtype(
 )
 SECTION = np.dtype(
     {
-        "names": [
-            "count",
-            "room",
-            "bucket_size",
-            "buckets",
-            "block",
-            "bucket_bytes",
-            "range",
-            "full",
-            "partial",
-            "degree",
-        ],
+        "names": ["count", "room", "bucket_size", "buckets", "block",
+                  "bucket_bytes", "range", "full", "partial", "degree"],
         "formats": ["<u4", "<u4", "<u4", "<u4", "<f4", "<u2", "<u4", "<u4", "<u4", "<u2"],
         "offsets": [0, 4, 8, 12, 16, 20, 24, 32, 36, 40],
         "itemsize": 1024,
     }
-)
+)  # fmt: skip
 BUCKET_BYTES = 12
 DEFAULT_RANGE = 32767
 DEFAULT_SH = 1.5

@@ -38,14 +38,22 @@ MAX_NUMBER_BYTES = 128
 """The longest number in text, as a row of them is made an array whose elements have the width of the widest."""
 
 TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
 }
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
@@ -240,8 +248,11 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             break
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
-            origin = _origin(words) if words[:3] == ORIGIN else origin
-            near = _near(words) if words[:3] == NEAR_PLANE else near
+            numbers = _numbers(words[3:])
+            if words[:3] == ORIGIN:
+                origin = numbers if len(numbers) == 3 else None
+            if words[:3] == NEAR_PLANE:
+                near = float(numbers[0]) if len(numbers) == 1 and numbers[0] > 0 else NEAR
             comments += [" ".join(words[1:])] if words else []
             continue
         if words == ["end_header"]:
@@ -268,22 +279,13 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     raise InputError(f"{path}: PLY header is truncated or damaged (no line 'end_header')")
 
 
-def _origin(words: list[str]) -> Float64 | None:
-    """None where the comment is not one of ours after all."""
+def _numbers(words: list[str]) -> Float64:
+    """Finite numbers; none where the comment is not one of ours after all."""
     try:
-        origin = np.array([float(word) for word in words[3:]])
+        values = np.array([float(word) for word in words])
     except ValueError:
-        return None
-    return origin if origin.shape == (3,) and np.isfinite(origin).all() else None
-
-
-def _near(words: list[str]) -> float:
-    """The usual one where the comment is not one of ours after all."""
-    try:
-        near = float(words[3])
-    except (ValueError, IndexError):
-        return NEAR
-    return near if len(words) == 4 and 0 < near < np.inf else NEAR
+        return np.empty(0)
+    return values if np.isfinite(values).all() else np.empty(0)
 
 
 def _local_means(file: BinaryIO, header: Header) -> Float32 | None:

@@ -29,7 +29,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Float32, Float64, numbers
 from clsplat.errors import InputError, plain, warn
 from clsplat.files import (
     MAX_DOCUMENT,
@@ -95,7 +95,6 @@ class _Files:
 
     def __init__(self, path: Path) -> None:
         self.path = path / META if path.is_dir() else path
-        self.size = 0
 
     def meta(self) -> dict[str, Any]:
         return self.parsed(read_document(self.path, "SOG's meta.json"))
@@ -119,7 +118,6 @@ class _Files:
             raise InputError(f"{self.path}: has a picture {name[:80]!r}, expected one beside it")
         if not is_file(picture):
             raise InputError(f"{self.path}: its picture {name} is missing")
-        self.size += picture.stat().st_size
         return picture
 
 
@@ -131,14 +129,9 @@ class _Archive(_Files):
         self.archive, self.folder = archive, folder
 
     def meta(self) -> dict[str, Any]:
-        return self.parsed(self.unpacked(META, MAX_DOCUMENT).read_bytes())
+        return self.parsed(self.file(META, MAX_DOCUMENT).read_bytes())
 
     def file(self, name: str, limit: int) -> Path:
-        picture = self.unpacked(name, limit)
-        self.size += picture.stat().st_size
-        return picture
-
-    def unpacked(self, name: str, limit: int) -> Path:
         target = self.folder / f"file{META[-5:] if name == META else '.webp'}"
         try:
             with self.archive.open(name) as source, target.open("wb") as file:
@@ -201,10 +194,7 @@ class _Meta:
 
     def numbers(self, section: str, key: str, least: int, most: int) -> NDArray[np.float64]:
         value = self.section(section).get(key)
-        try:
-            array = np.atleast_1d(np.array(value, np.float64))
-        except (TypeError, ValueError, OverflowError):
-            array = np.empty(0)
+        array = numbers(value if isinstance(value, list) else [value])
         if array.ndim != 1 or not least <= len(array) <= most or not np.isfinite(array).all():
             raise InputError(f"{self.path}: {key} of {section} in {META} are not {least} numbers")
         return array

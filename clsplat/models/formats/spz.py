@@ -23,12 +23,12 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.errors import InputError, warn
 from clsplat.files import atomic_writer, open_input
@@ -38,6 +38,8 @@ from clsplat.models.codec.axes import UP_BACK, Signs, flip, quaternion_signs, sh
 from clsplat.models.codec.values import BLOCK_ROWS
 
 MAGIC = b"NGSP"
+Stream = Any
+"""A file, or a reader of gzip or Zstandard."""
 VERSIONS = (2, 3, 4)
 DEFAULT_VERSION = 4
 """Version that the format's library and splat-transform write."""
@@ -57,10 +59,6 @@ MAX_WINDOW = 1 << 27
 COLOUR_SCALE = 0.15 * 255
 
 
-class Stream(Protocol):
-    def readinto(self, buffer: memoryview, /) -> int | None: ...
-
-
 @dataclass(frozen=True)
 class Header:
     version: int
@@ -76,7 +74,8 @@ class Header:
         """Bytes that a Gaussian has of each attribute, in the file's order."""
         rest = 3 * (self.degree * (self.degree + 2))
         rotations = 3 if self.version == 2 else 4
-        return {"positions": 9, "alphas": 1, "colours": 3, "scales": 3, "rotations": rotations, "sh": rest}
+        widths = {"positions": 9, "alphas": 1, "colours": 3, "scales": 3, "rotations": rotations}
+        return widths | ({"sh": rest} if rest else {})
 
 
 def recognises(head: bytes) -> bool:
@@ -117,7 +116,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
         _unpack(_zstd_streams(file, header, size, path), header, signs, result, path)
         return result
     assert stream is not None
-    _unpack(((name, stream) for name, width in header.widths.items() if width), header, UP_BACK, result, path)
+    _unpack(((name, stream) for name in header.widths), header, UP_BACK, result, path)
     behind = _rest(stream, path)
     if header.flags & HAS_EXTENSIONS and (signs := _frame(_records(behind, path), path)) != UP_BACK:
         flip(result, (signs[0] * UP_BACK[0], signs[1] * UP_BACK[1], signs[2] * UP_BACK[2]))
@@ -134,7 +133,7 @@ def _open(file: BinaryIO, size: int, path: Path) -> tuple[Header, Any]:
             raise InputError(f"{path}: truncated: {len(head)} bytes, expected a header of 32")
         header = Header(4, *struct.unpack("<IBBBBI", head[8:20]))
         _check(header, path)
-        expected = sum(width > 0 for width in header.widths.values())
+        expected = len(header.widths)
         if header.streams != expected:
             raise InputError(f"{path}: SPZ has {header.streams} streams, expected {expected}")
         if not 32 <= header.table <= min(32 + MAX_EXTENSIONS, size - 16 * expected):
@@ -206,8 +205,7 @@ def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iter
     file.seek(header.table)
     table = file.read(16 * header.streams)
     at = header.table + len(table)
-    names = [name for name, width in header.widths.items() if width]
-    for name, (packed, unpacked) in zip(names, struct.iter_unpack("<QQ", table), strict=True):
+    for name, (packed, unpacked) in zip(header.widths, struct.iter_unpack("<QQ", table), strict=True):
         wanted = header.count * header.widths[name]
         if packed > size - at:
             raise InputError(f"{path}: truncated: {name} have {packed} bytes, {size - at} are there")
@@ -225,36 +223,38 @@ def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iter
 
 
 def _fill(stream: Stream, buffer: memoryview, path: Path, what: str) -> None:
-    import zstandard
-
     at = 0
-    try:
+    with _decompressing(path, f"within {what}"):
         while at < len(buffer):
             got = stream.readinto(buffer[at:])
             if not got:
                 raise EOFError
             at += got
-    except EOFError:
-        raise InputError(f"{path}: truncated within {what}") from None
-    except (zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as error:
-        raise InputError(f"{path}: does not decompress within {what} ({error}); is it damaged?") from None
 
 
 def _rest(stream: Any, path: Path) -> bytes:
     """The bytes after the Gaussians, up to MAX_EXTENSIONS; gzip checks its sum at the end."""
+    with _decompressing(path, "at its end"):
+        return bytes(stream.read(MAX_EXTENSIONS))
+
+
+@contextmanager
+def _decompressing(path: Path, place: str) -> Iterator[None]:
+    """Raise InputError for a stream that ends, or is damaged, at this place."""
     import zstandard
 
     try:
-        return bytes(stream.read(MAX_EXTENSIONS))
+        yield
     except EOFError:
-        raise InputError(f"{path}: truncated at its end") from None
+        raise InputError(f"{path}: truncated {place}") from None
     except (zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as error:
-        raise InputError(f"{path}: does not decompress to its end ({error}); is it damaged?") from None
+        raise InputError(f"{path}: does not decompress {place} ({error}); is it damaged?") from None
 
 
 def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs, result: Gaussians, path: Path) -> None:
     buffer = bytearray(BLOCK_ROWS * max(header.widths.values()))
     alpha_logits = values.byte_logits()
+    means_factor = np.array(signs, np.float32) * np.float32(0.5**header.fractional_bits)
     # as wide as the array: NumPy is several times slower where the last axis is short
     sh_factor = np.repeat(sh_signs(signs)[1 : result.sh.shape[1], None] / np.float32(128), 3, axis=1)
     for name, stream in streams:
@@ -266,7 +266,7 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
             block = np.frombuffer(view, np.uint8).reshape(-1, width)
             match name:
                 case "positions":
-                    result.means[rows] = spz_bytes.fixed(block) * _means_factor(header, signs)
+                    result.means[rows] = spz_bytes.fixed(block) * means_factor
                 case "alphas":
                     result.opacity_logits[rows] = alpha_logits[block[:, 0]]
                 case "colours":
@@ -281,10 +281,6 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
                     rest = result.sh[rows, 1:]
                     np.subtract(block.reshape(len(block), -1, 3)[:, : kept - 1], np.float32(128), out=rest)
                     rest *= sh_factor
-
-
-def _means_factor(header: Header, signs: Signs) -> NDArray[np.float32]:
-    return np.array(signs, np.float32) * np.float32(0.5**header.fractional_bits)
 
 
 def write(
@@ -325,12 +321,12 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
         fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:
             stream.write(MAGIC + struct.pack("<IIBBBB", *fields))
-            for name in (name for name, width in header.widths.items() if width):
+            for name in header.widths:
                 _pack(name, gaussians, header, sh_bits, stream.write)
         return
     import zstandard
 
-    names = [name for name, width in header.widths.items() if width]
+    names = list(header.widths)
     numbers = (4, header.count, header.degree, header.fractional_bits, header.flags, len(names), 32)
     file.write(MAGIC + struct.pack("<IIBBBBI12x", *numbers))
     table = file.tell()
