@@ -649,11 +649,12 @@ def test_a_checkpoints_directory_claims_at_most_what_it_has(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    "text", ["{}", "[]", "null", "[" * 100_000, '{"unregistered": 3}', '{"unregistered": [3]}', "{"]
+    "text", ["{}", "[]", "null", "[" * 100_000, '{"fingerprint": 3}', '{"fingerprint": "0", "files": [3]}', "{"]
 )
 def test_records_that_are_none(text: str, tmp_path: Path) -> None:
     (tmp_path / "sfm.json").write_text(text)
-    assert str(tmp_path / "sfm.json") in refusal(lambda: sfm.unregistered(tmp_path))
+    refused = refusal(lambda: sfm._is_finished(tmp_path, tmp_path / "photos", "0", overwrite=False))
+    assert str(tmp_path) in refused
 
 
 def test_spoiling_is_a_matter_of_the_seed_alone() -> None:

@@ -32,6 +32,7 @@ from clsplat.scenes.lens import Lens, absurd, check_lens, models
 Value = TypeVar("Value")
 
 STEMS = ("cameras", "images", "points3D")
+COUNT = struct.Struct("<Q")
 OBSERVATION_BYTES = 24  # x, y, id of the point
 TRACK_BYTES = 8  # ids of the image and of the observation in it
 MAX_NAME_BYTES = 4096
@@ -125,10 +126,7 @@ class _Binary:
 
     def _take(self, size: int) -> None:
         if size > self.left:
-            raise InputError(
-                f"{self.path}: truncated or corrupt: its {self.size} bytes end inside {self.doing}; "
-                "copy the file again or export the model anew"
-            )
+            raise corrupt(self.path, f"its {self.size} bytes end inside {self.doing}")
         self.left -= size
 
     def name(self) -> str:
@@ -141,18 +139,20 @@ class _Binary:
         except UnicodeDecodeError:
             raise corrupt(self.path, f"{self.doing} has the name {raw[:40]!r}, expected UTF-8") from None
 
-    def count(self, what: str, least: int) -> Iterator[int]:
-        """The records that the file says it has, each of at least `least` bytes, in turn."""
-        (count,) = self.read(struct.Struct("<Q"))
-        number = int(count)
-        if number * least > self.size:
-            self.doing = f"the {number} {what}s that its header announces"
-            self.skip(number * least)
+
+def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
+    """The file at each of the records that it says it has, of at least `least` bytes each, in turn."""
+    with open_input(path, EXPECTED) as opened:
+        file = _Binary(path, opened)
+        (number,) = map(int, file.read(COUNT))
+        if number * least > file.size:
+            file.doing = f"the {number} {what}s that its header announces"
+            file.skip(number * least)
         for index in range(number):
-            self.doing = f"{what} {index + 1} of {number}"
-            yield index
-        if self.left:
-            raise corrupt(self.path, f"{self.left} bytes follow the last of its {number} {what}s")
+            file.doing = f"{what} {index + 1} of {number}"
+            yield file
+        if file.left:
+            raise corrupt(path, f"{file.left} bytes follow the last of its {number} {what}s")
 
 
 def corrupt(path: Path, trouble: str) -> InputError:
@@ -228,17 +228,15 @@ def _read_cameras(folder: Path) -> dict[int, Lens]:
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     layout, known = struct.Struct("<IiQQ"), models()
-    with open_input(path, EXPECTED) as opened:
-        file = _Binary(path, opened)
-        for _ in file.count("camera", layout.size):
-            key, model, width, height = (int(value) for value in file.read(layout))
-            if model not in known:
-                raise InputError(
-                    f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
-                    f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
-                )
-            name, parameters = known[model]
-            yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
+    for file in _records(path, "camera", layout.size):
+        key, model, width, height = (int(value) for value in file.read(layout))
+        if model not in known:
+            raise InputError(
+                f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
+                f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
+            )
+        name, parameters = known[model]
+        yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
@@ -271,15 +269,13 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
 
 
 def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
-    head, count = struct.Struct("<I7dI"), struct.Struct("<Q")
-    with open_input(path, EXPECTED) as opened:
-        file = _Binary(path, opened)
-        for _ in file.count("image", head.size + 1 + count.size):
-            _, *pose, camera = file.read(head)
-            name = file.name()
-            (observations,) = file.read(count)
-            file.skip(int(observations) * OBSERVATION_BYTES)
-            yield name, int(camera), tuple(pose)
+    head = struct.Struct("<I7dI")
+    for file in _records(path, "image", head.size + 1 + COUNT.size):
+        _, *pose, camera = file.read(head)
+        name = file.name()
+        (observations,) = file.read(COUNT)
+        file.skip(int(observations) * OBSERVATION_BYTES)
+        yield name, int(camera), tuple(pose)
 
 
 def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
@@ -332,12 +328,10 @@ def _read_points(folder: Path) -> tuple[Float64, Float32]:
 
 def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
     layout = struct.Struct("<Q3d3BdQ")
-    with open_input(path, EXPECTED) as opened:
-        file = _Binary(path, opened)
-        for _ in file.count("point", layout.size):
-            _, *values, _, track = file.read(layout)
-            file.skip(int(track) * TRACK_BYTES)
-            yield tuple(values)
+    for file in _records(path, "point", layout.size):
+        _, *values, _, track = file.read(layout)
+        file.skip(int(track) * TRACK_BYTES)
+        yield tuple(values)
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:

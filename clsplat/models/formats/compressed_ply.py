@@ -58,7 +58,9 @@ def read(path: Path) -> Gaussians:
     with open_input(path, "a compressed PLY") as file:
         header = ply.read_header(file, path)
         chunks, vertex, sh = _elements(header)
-        _require_whole(header, file)
+        end, have = header.start(len(header.elements)), os.fstat(file.fileno()).st_size
+        if have < end:
+            raise InputError(f"{path}: truncated: its header promises {end} bytes, {have} are there")
         bounds = _bounds(file, header, chunks)
         rest = [] if sh is None else [f"f_rest_{index}" for index in range(len(sh.properties))]
         result = packing.empty(vertex.count, {0: 0, 9: 1, 24: 2, 45: 3}[len(rest)])
@@ -144,21 +146,9 @@ def _elements(header: ply.Header) -> tuple[ply.Element, ply.Element, ply.Element
     return chunks, vertex, sh
 
 
-def _start(header: ply.Header, last: ply.Element | None) -> int:
-    """The element's start in the file; the end of all of them for None."""
-    before = header.elements[: None if last is None else header.elements.index(last)]
-    return header.size + sum(element.count * header.row_type(element).itemsize for element in before)
-
-
-def _require_whole(header: ply.Header, file: BinaryIO) -> None:
-    """Raise InputError for a file that is shorter than its header says."""
-    if (have := os.fstat(file.fileno()).st_size) < (end := _start(header, None)):
-        raise InputError(f"{header.path}: truncated: its header promises {end} bytes, {have} are there")
-
-
 def _rows(file: BinaryIO, header: ply.Header, element: ply.Element, start: int, count: int) -> NDArray[Any]:
     kind = header.row_type(element)
-    file.seek(_start(header, element) + start * kind.itemsize)
+    file.seek(header.start(header.elements.index(element)) + start * kind.itemsize)
     return packing.read_rows(file, kind, count, header.path)
 
 

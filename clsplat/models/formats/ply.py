@@ -79,6 +79,11 @@ class Element:
     properties: list[tuple[str, str]] = field(default_factory=list)
 
     @property
+    def row_bytes(self) -> int:
+        """Bytes of a row, for an element without lists."""
+        return sum(np.dtype(code).itemsize for _, code in self.properties)
+
+    @property
     def has_list(self) -> bool:
         return any(code == "" for _, code in self.properties)
 
@@ -108,6 +113,10 @@ class Header:
     def before(self) -> list[Element]:
         """The elements stored before the vertices."""
         return self.elements[: self.elements.index(self.vertex)]
+
+    def start(self, index: int) -> int:
+        """The place in a binary file of the element at this index, or of the end behind the last one."""
+        return self.size + sum(element.count * element.row_bytes for element in self.elements[:index])
 
     def row_type(self, element: Element) -> np.dtype[Any]:
         """The packed record of one row of a binary file."""
@@ -290,14 +299,13 @@ def _numbers(words: list[str]) -> Float64:
 
 def _local_means(file: BinaryIO, header: Header) -> Float32 | None:
     """The element LOCAL, if it is right behind the vertices. Raises InputError where it is cut."""
-    vertex, before = header.vertex, [*header.before, header.vertex]
-    behind = header.elements[len(before) :]
-    wanted = Element(LOCAL, vertex.count, [(name, "f4") for name in POSITION])
-    if header.format == "ascii" or not behind or behind[0] != wanted:
+    wanted = Element(LOCAL, header.vertex.count, [(name, "f4") for name in POSITION])
+    behind = len(header.before) + 1
+    if header.format == "ascii" or header.elements[behind : behind + 1] != [wanted]:
         return None
-    file.seek(header.size + sum(element.count * header.row_type(element).itemsize for element in before))
+    file.seek(header.start(behind))
     row = header.row_type(wanted)
-    need = vertex.count * row.itemsize
+    need = wanted.count * row.itemsize
     data = file.read(need)
     if len(data) != need:
         raise InputError(f"{header.path}: truncated: element {LOCAL} needs {need} bytes, {len(data)} are there")
@@ -364,11 +372,11 @@ def read_vertices(file: BinaryIO, header: Header, what: str) -> Iterator[Block]:
 
 
 def _binary_blocks(file: BinaryIO, header: Header, what: str) -> Iterator[Block]:
-    path, vertex, start = header.path, header.vertex, header.size
+    path, vertex = header.path, header.vertex
     for element in header.before:
         if element.has_list:
             raise InputError(f"{path}: PLY has lists (element {element.name!r}) before its vertices, not supported")
-        start += element.count * sum(np.dtype(code).itemsize for _, code in element.properties)
+    start = header.start(len(header.before))
     row = header.row_type(vertex)
     need, have = vertex.count * row.itemsize, max(0, os.fstat(file.fileno()).st_size - start)
     if have < need:
