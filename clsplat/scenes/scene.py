@@ -93,7 +93,7 @@ class Scene:
 
     name: the folder's; views sorted by name; points (N, 3) float64 in the world, N may be 0; point_colors (N, 3)
     float32 in [0, 1]; bounds: corners (low, high), each (3,) float64, world units, of the box for random initial
-    points; warnings: what a user should hear, a line each.
+    points; warnings: for the user, a line each.
     """
 
     name: str
@@ -236,7 +236,7 @@ def load_scene(
     size that is wanted.
 
     A folder of photos goes through `clsplat.scenes.sfm` first, into work_dir (NAME_colmap beside it if not given),
-    where a result for the same photos is found again; progress(text, fraction or None) hears of that.
+    where a result for the same photos is found again; progress(text, fraction or None) is called on the way.
 
     Raises InputError naming the file for whatever is wrong with the input: see `detect`, `colmap.read_model` and
     `transforms.read_transforms`; pictures that are listed and missing, or of another size than their camera; pictures

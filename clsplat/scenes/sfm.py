@@ -68,7 +68,7 @@ def reconstruct(
     SIMPLE_RADIAL (one distortion coefficient) for others. shared_camera: see `sfm_photos.camera_groups`.
     max_image_size: pixels, longest side for features alone, the undistorted photos keep their size. threads: all
     cores if None. The same seed gives the same cameras, bit by bit up to 80 photos. overwrite: replace a result of
-    other photos. progress(text, fraction or None) hears of every stage.
+    other photos. progress(text, fraction or None) is called in every stage.
 
     Warns of photos that could not be placed, are of a kind that cannot be read, or lost their alpha. Raises InputError
     for a folder without photos, a photo that does not decode, an output that is something else, and photos that no

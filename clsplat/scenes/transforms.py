@@ -61,7 +61,14 @@ def read_transforms(path: Path) -> DataSet:
     if any("mask_path" in keys.frame for keys in readers):
         warn(f"{path}: 'mask_path' is ignored, masks are not supported")
     data.box = _ngp_box(Keys(path, None, {}, document))
-    _read_points(path, document, data)
+    cloud = document.get("ply_file_path")
+    if isinstance(cloud, str) and cloud:
+        _inside(path.parent, cloud, f"{path}: 'ply_file_path'")
+        file = path.parent / cloud.replace("\\", "/")
+        if is_file(file):
+            data.points, data.colors = read_point_cloud(file)
+        else:
+            warn(f"{path}: its points 'ply_file_path' are missing: {file}; using random ones")
     return data
 
 
@@ -360,18 +367,6 @@ def _ngp_box(keys: Keys) -> tuple[Float64, Float64] | None:
     if not (1 / MAX_NUMBER < factor < MAX_NUMBER and (np.abs(shift) < MAX_NUMBER).all()):
         raise InputError(f"{keys.where}: 'scale' is {factor}, 'offset' {shift.tolist()}, expected a scale above 0")
     return (0.5 - side / 2 - shift) / factor, (0.5 + side / 2 - shift) / factor
-
-
-def _read_points(path: Path, document: dict[str, Any], data: DataSet) -> None:
-    listed = document.get("ply_file_path")
-    if not isinstance(listed, str) or not listed:
-        return
-    _inside(path.parent, listed, f"{path}: 'ply_file_path'")
-    cloud = path.parent / listed.replace("\\", "/")
-    if is_file(cloud):
-        data.points, data.colors = read_point_cloud(cloud)
-    else:
-        warn(f"{path}: its points 'ply_file_path' are missing: {cloud}; using random ones")
 
 
 def read_point_cloud(path: Path) -> tuple[Float64, Float32]:

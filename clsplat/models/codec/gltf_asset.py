@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import io
 import os
 import struct
 from collections import deque
@@ -23,13 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import numbers
-from clsplat.errors import InputError, warn
+from clsplat.errors import InputError
 from clsplat.files import MAX_DOCUMENT, open_input, parse_json, read_document
-from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
-from clsplat.models.codec import values as packing
-from clsplat.models.codec.axes import LEFT_UP, flip
-from clsplat.models.codec.values import BLOCK_ROWS
-from clsplat.models.formats import spz
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
@@ -155,62 +149,6 @@ class Asset:
     def extension(self, primitive: dict[str, Any]) -> dict[str, Any]:
         return as_object(primitive["extensions"][EXTENSION])
 
-    def gaussians(self, name: str, primitive: dict[str, Any]) -> Gaussians:
-        """The primitive's Gaussians in our frame."""
-        said = self.extension(primitive)
-        kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
-        if kernel != "ellipse":
-            raise InputError(f"{self.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse")
-        if space != COLOR_SPACES[0]:
-            warn(f"{self.path}: the colours are in {str(space)[:40]}, kept as they are")
-        nested = as_object(said.get("extensions", {}))
-        for extension in SPZ_EXTENSIONS:
-            if extension in nested:
-                blob = self.view(as_object(nested[extension]).get("bufferView"))
-                return spz.read_from(io.BytesIO(blob.data), len(blob), self.path)
-        return self.attributes(name, as_object(primitive.get("attributes")))
-
-    def attributes(self, name: str, indices: dict[str, Any]) -> Gaussians:
-        def array(semantic: str, width: int) -> Array:
-            if semantic not in indices:
-                raise InputError(f"{self.path}: {name} lacks the attribute {semantic}")
-            return self.accessor(indices[semantic], width, semantic)
-
-        position = array("POSITION", 3)
-        count = len(position)
-        self.total += count
-        size = self.size + sum(len(buffer) for buffer in self.buffers.values())
-        packing.require_count(self.path, self.total if count else 0, size)
-        names = [sh_attributes(degree) for degree in range(MAX_SH_DEGREE + 1)]
-        degree = max(
-            (degree for degree in range(4) if any(semantic in indices for semantic in names[degree])), default=0
-        )
-        sources = {
-            "means": position,
-            "quaternions": array(f"{EXTENSION}:ROTATION", 4),
-            "log_scales": array(f"{EXTENSION}:SCALE", 3),
-            "opacities": array(f"{EXTENSION}:OPACITY", 1),
-        }
-        coefficients = [array(semantic, 3) for band in names[: degree + 1] for semantic in band]
-        for values in (*sources.values(), *coefficients):
-            if len(values) != count:
-                raise InputError(f"{self.path}: {name} has {len(values)} values of an attribute, expected {count}")
-        result = packing.empty(count, degree)
-        for first in range(0, count, BLOCK_ROWS):
-            rows = slice(first, min(first + BLOCK_ROWS, count))
-            result.means[rows] = _real(position[rows])
-            result.quaternions[rows] = _real(sources["quaternions"][rows])[:, [3, 0, 1, 2]]
-            scales = _real(sources["log_scales"][rows])
-            result.log_scales[rows] = packing.log_scales(scales, f"{self.path}: {name}", first)
-            opacity = _real(sources["opacities"][rows])[:, 0]
-            if not ((opacity >= 0) & (opacity <= 1)).all():
-                raise InputError(f"{self.path}: {name} has an opacity outside [0, 1]")
-            result.opacity_logits[rows] = packing.logits(opacity)
-            for index, coefficient in enumerate(coefficients):
-                result.sh[rows, index] = _real(coefficient[rows])
-        flip(result, LEFT_UP)
-        return result
-
     def accessor(self, index: object, width: int, semantic: str) -> Array:
         """(count, width), as it lies in the file."""
         said = self.item("accessors", index)
@@ -292,12 +230,13 @@ class _Normalised(np.ndarray[Any, Any]):
     """Integers that stand for fractions of their largest."""
 
 
-def _real(values: Array) -> NDArray[np.float32]:
+def real(values: Array) -> NDArray[np.float32]:
     floats = np.asarray(values).astype(np.float32)
     if isinstance(values, _Normalised):
         floats = np.maximum(floats / np.float32(np.iinfo(values.dtype).max), np.float32(-1))
     return floats
 
+    """Floats; of normalised integers, their fractions of the largest."""
 
 def _map(path: Path, start: int, size: int) -> NDArray[np.uint8]:
     if size == 0:

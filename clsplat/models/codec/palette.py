@@ -56,8 +56,8 @@ def nearest(entries: NDArray[np.floating], values: NDArray[np.floating]) -> NDAr
 def palette(
     vectors: Float32, size: int, iterations: int = 10, progress: Callable[[float], None] = lambda part: None
 ) -> tuple[Float32, NDArray[np.int64]]:
-    """Up to `size` vectors, and which of them stands for each: (n, d) -> (size, d), (n,). progress: hears what part of
-    them has been found.
+    """Up to `size` vectors, and which of them stands for each: (n, d) -> (size, d), (n,). progress: called with the
+    part of them that has been found.
 
     k-means in two levels: clusters, and in each of them a share of the palette by its squared error, so that the work
     is n d sqrt(size) and not n d size.

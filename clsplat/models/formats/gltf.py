@@ -29,9 +29,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, warn
 from clsplat.files import atomic_write, atomic_writer
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.colour import srgb_to_linear
 from clsplat.models.codec import axes, values
 from clsplat.models.codec.axes import LEFT_UP
@@ -45,6 +45,7 @@ from clsplat.models.codec.gltf_asset import (
     Array,
     Asset,
     as_object,
+    real,
     sh_attributes,
 )
 from clsplat.models.codec.values import BLOCK_ROWS
@@ -82,7 +83,7 @@ def read(path: Path) -> Gaussians:
     asset = Asset.open(path)
     parts = []
     for name, matrix, primitive in list(asset.primitives()):  # all of them are counted first
-        part = asset.gaussians(name, primitive)
+        part = _gaussians(asset, name, primitive)
         # the node's matrix is in glTF's frame, the Gaussians are in ours already
         turn = np.diag([*LEFT_UP, 1.0])
         parts.append(axes.place(part, turn @ matrix @ turn, f"{path}: {name}"))
@@ -91,6 +92,62 @@ def read(path: Path) -> Gaussians:
     model = merge(parts)
     values.require_finite(path, model)
     return model
+
+
+def _gaussians(asset: Asset, name: str, primitive: dict[str, Any]) -> Gaussians:
+    """The primitive's Gaussians in our frame."""
+    said = asset.extension(primitive)
+    kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
+    if kernel != "ellipse":
+        raise InputError(f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse")
+    if space != COLOR_SPACES[0]:
+        warn(f"{asset.path}: the colours are in {str(space)[:40]}, kept as they are")
+    nested = as_object(said.get("extensions", {}))
+    for extension in SPZ_EXTENSIONS:
+        if extension in nested:
+            blob = asset.view(as_object(nested[extension]).get("bufferView"))
+            return spz.read_from(io.BytesIO(blob.data), len(blob), asset.path)
+    return _from_attributes(asset, name, as_object(primitive.get("attributes")))
+
+
+def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussians:
+    def array(semantic: str, width: int) -> Array:
+        if semantic not in indices:
+            raise InputError(f"{asset.path}: {name} lacks the attribute {semantic}")
+        return asset.accessor(indices[semantic], width, semantic)
+
+    position = array("POSITION", 3)
+    count = len(position)
+    asset.total += count
+    size = asset.size + sum(len(buffer) for buffer in asset.buffers.values())
+    values.require_count(asset.path, asset.total if count else 0, size)
+    names = [sh_attributes(degree) for degree in range(MAX_SH_DEGREE + 1)]
+    degree = max((degree for degree in range(4) if indices.keys() & set(names[degree])), default=0)
+    sources = {
+        "means": position,
+        "quaternions": array(f"{EXTENSION}:ROTATION", 4),
+        "log_scales": array(f"{EXTENSION}:SCALE", 3),
+        "opacities": array(f"{EXTENSION}:OPACITY", 1),
+    }
+    coefficients = [array(semantic, 3) for band in names[: degree + 1] for semantic in band]
+    for attribute in (*sources.values(), *coefficients):
+        if len(attribute) != count:
+            raise InputError(f"{asset.path}: {name} has {len(attribute)} values of an attribute, expected {count}")
+    result = values.empty(count, degree)
+    for first in range(0, count, BLOCK_ROWS):
+        rows = slice(first, min(first + BLOCK_ROWS, count))
+        result.means[rows] = real(position[rows])
+        result.quaternions[rows] = real(sources["quaternions"][rows])[:, [3, 0, 1, 2]]
+        scales = real(sources["log_scales"][rows])
+        result.log_scales[rows] = values.log_scales(scales, f"{asset.path}: {name}", first)
+        opacity = real(sources["opacities"][rows])[:, 0]
+        if not ((opacity >= 0) & (opacity <= 1)).all():
+            raise InputError(f"{asset.path}: {name} has an opacity outside [0, 1]")
+        result.opacity_logits[rows] = values.logits(opacity)
+        for index, coefficient in enumerate(coefficients):
+            result.sh[rows, index] = real(coefficient[rows])
+    axes.flip(result, LEFT_UP)
+    return result
 
 
 def write(

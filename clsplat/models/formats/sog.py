@@ -292,7 +292,7 @@ def write(
     """Write version 2: a .sog archive, or a meta.json with its pictures beside it, which are there before it is.
 
     iterations: of k-means for the palette. sort: by place (Morton's order), so that the pictures compress better; the
-    Gaussians come back in that order. progress: hears what is made, and what part of it is there. Means count from the
+    Gaussians come back in that order. progress: called with what is made, and the part of it. Means count from the
     world's origin: far from it they lose more. The same Gaussians give the same values. Raises InputError for values
     that are not finite.
     """
