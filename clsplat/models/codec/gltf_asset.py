@@ -231,12 +231,12 @@ class _Normalised(np.ndarray[Any, Any]):
 
 
 def real(values: Array) -> NDArray[np.float32]:
+    """Floats; of normalised integers, their fractions of the largest."""
     floats = np.asarray(values).astype(np.float32)
     if isinstance(values, _Normalised):
         floats = np.maximum(floats / np.float32(np.iinfo(values.dtype).max), np.float32(-1))
     return floats
 
-    """Floats; of normalised integers, their fractions of the largest."""
 
 def _map(path: Path, start: int, size: int) -> NDArray[np.uint8]:
     if size == 0:
