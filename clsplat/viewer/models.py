@@ -103,7 +103,7 @@ class LiveModel:
         return max(view.camera.width * view.camera.height for view in self.trainer.views)
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
-        """The picture, and a remark on it. Raises InputError for what needs more memory than a limited training leaves."""
+        """The picture, and a remark on it. Raises InputError where a limited training leaves too little memory."""
         trainer = self.trainer
         degree = round(trainer.parameters.coefficients**0.5) - 1
         key = look.changes(degree)
