@@ -13,7 +13,7 @@ from tiny import hidden_model, short
 
 import clsplat
 from clsplat.api import train
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
@@ -51,7 +51,7 @@ def loaded(scene: Path) -> Scene:
             "--density.growth budgets: expected one of paper, budget",
         ),
         (TrainConfig(rasterizer=RasterizerConfig(extent="opacit")), "--rasterizer.extent opacit: expected one of"),
-        (TrainConfig(rasterizer=RasterizerConfig(row_skip="no")), "--rasterizer.row-skip no: expected True or False"),
+        (TrainConfig(rasterizer=BenchSwitches(row_skip="no")), "--rasterizer.row-skip no: expected True or False"),
     ],
     ids=str,
 )

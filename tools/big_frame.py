@@ -18,8 +18,8 @@ from pathlib import Path
 from clsplat.bench.subject import synthetic
 from clsplat.config.memory import parse_bytes
 from clsplat.device.context import open_device
-from clsplat.frame.pipeline import Pictures
-from clsplat.frame.strips import strip_rows
+from clsplat.frame.draw import drawn_by
+from clsplat.frame.strips import strip_rows, write_in_strips
 from clsplat.rendering.renderer import Renderer
 
 
@@ -37,7 +37,7 @@ def main(arguments: list[str]) -> int:
     renderer = Renderer(open_device(None, limit))
     rows = strip_rows(renderer.device, camera, ("rgb", "alpha"))
     start = time.monotonic()
-    Pictures(renderer, subject.gaussians).write(Path(path), lambda _: camera, ("rgb", "alpha"))
+    write_in_strips(Path(path), drawn_by(renderer, subject.gaussians), camera, ("rgb", "alpha"), rows)
     seconds = time.monotonic() - start
     peak, host = renderer.device.memory.peak, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print(

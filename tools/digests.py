@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / part) for part in ("tests", "tests/stages", "tools", ".")]
+sys.path[:0] = [str(ROOT / part) for part in ("tests/support", "tools", ".")]
 
 import numpy as np  # noqa: E402
 from processor import processor  # noqa: E402

@@ -72,7 +72,7 @@ except ClsplatError as error:
 SCENE = """
 import sys
 from pathlib import Path
-sys.path[:0] = [{tests!r}, {stages!r}]
+sys.path.insert(0, {support!r})
 from tiny import write_scene
 write_scene(Path(sys.argv[1]))
 """
@@ -251,7 +251,7 @@ def full() -> Step:
 def ten_steps(folder: str, *, limit: float = TRAIN_LIMIT, status: int = 0, says: str = "") -> tuple[Step, Step]:
     """Ten steps of training on a tiny scene below a folder, which is written first, by this machine too."""
     scene, run = f"{folder}/scene", f"{folder}/run"
-    tests = SCENE.format(tests=str(ROOT / "tests"), stages=str(ROOT / "tests" / "stages"))
+    tests = SCENE.format(support=str(ROOT / "tests" / "support"))
     train = (PYTHON, "-m", "clsplat", "train", scene, "-o", run, "--iterations", "10")
     return (
         Step("scene", (PYTHON, "-c", tests, scene), limit),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from clsplat.device.context import Device
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "stages"), str(ROOT)]
+sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT)]
 
 GOLDEN = ROOT / "tests" / "golden"
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from clsplat.bench.stages import _Picture
 from clsplat.camera import Camera
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device import buffers, launch, program
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
@@ -84,9 +84,9 @@ def frames(device: Device) -> None:
     view = camera(33, 17)
     gaussians, background = cloud(40, view), upload(device, np.array([0.1, 0.2, 0.3], np.float32))
     held = upload_gaussians(device, gaussians)
-    names = [each.name for each in fields(RasterizerConfig) if isinstance(each.default, bool)]
+    names = [each.name for each in fields(BenchSwitches) if isinstance(each.default, bool)]
     switched: dict[str, Any] = {"tile_test": "square", "depth_sort": "pairs", "key_bits": "all"}
-    all_off = RasterizerConfig(**switched, **dict.fromkeys(names, False))
+    all_off = BenchSwitches(**switched, **dict.fromkeys(names, False))
     for config, small in ((RasterizerConfig(), False), (all_off, False), (RasterizerConfig(), True)):
         rasterizer = Rasterizer(device, config)
         if small:
@@ -128,9 +128,9 @@ def pictures(device: Device) -> None:
         after = replace(view, translation=np.array([0.1, 0.0, 0.1]))
         _, found = renderer.render_channels(gaussians, view, ("normal", "position", *motion), after=after)
         slices = renderer.render_deep(gaussians, view, np.array([2.0, 3.0], np.float32))
-        if not all(np.isfinite(values).all() for values in (found.depth, *found.fields.values(), slices)):
+        if not all(np.isfinite(values).all() for values in (*found.values(), slices)):
             raise SystemExit(f"a channel of the {view.projection} camera is not finite")
-        if not found.count.any():
+        if not found["count"].any():
             raise SystemExit(f"nothing is in the picture of the {view.projection} camera")
 
 

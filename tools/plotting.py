@@ -10,7 +10,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-from clsplat.bench.plots import BLACK, BLUE, COLOURS, SIZE, VERMILION, WIDTH, save_figure, wrapped
+from clsplat.bench.plots import BLACK, BLUE, COLOURS, LETTERS, SIZE, VERMILION, WIDTH, save_figure
 
 MARKERS = "os^DvP*X"
 DASHES = ("-", "--", "-.", ":")
@@ -90,7 +90,7 @@ def plot_grid(path: Path, panels: Sequence[Panel], title: str, columns: int = CO
 
 def _figure(height: float, title: str) -> Any:
     figure = import_module("matplotlib.figure").Figure((WIDTH, height), layout="constrained")
-    figure.suptitle("\n".join(wrapped(figure, title)), fontsize=SIZE)
+    figure.suptitle("\n".join(wrap(title, LETTERS)), fontsize=SIZE)
     return figure
 
 

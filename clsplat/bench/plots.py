@@ -11,9 +11,12 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
-from clsplat.bench.labels import Box, Place, place_labels
+import numpy as np
+
+from clsplat.bench.labels import place_labels
 from clsplat.bench.settings import ALL_OFF, PSNR_MAX, front
 from clsplat.errors import InputError
 from clsplat.files import atomic_writer
@@ -33,10 +36,15 @@ BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK, GREY = COLOURS = (
     "#000000",
     "#666666",
 )
+LETTERS = 92
+"""Of a line over the whole width."""
+ABOVE = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": 3, "frameon": False, "fontsize": SIZE}
+"""Place of a legend over the axes, where it covers no point."""
 PAD = 2.0
 """Pixels around a label."""
 
 Points = Sequence[Mapping[str, Any]]
+Point = tuple[float, float]
 
 
 def check_plot(path: Path) -> None:
@@ -79,9 +87,8 @@ def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
     notes = ["Time without the switch over the time of exact, which has all of them. 1.00: no difference."]
     if (faster := result["exact_switches_faster"]) is not None:
         notes.append(f"All off: {faster['frame']:.2f} times for a frame, {faster['iteration']:.2f} times for a step.")
-    names = [name for _, name in rows]
-    heights = {"top": 0.4, "bottom": 0.6, "axes": max(0.42 * len(rows) + 0.2, 1.0)}
-    figure, axes = sheet(["What each exact switch is worth", title], notes, heights, _left_of(names))
+    inches = max(0.42 * len(rows) + 0.2, 1.0)
+    figure, axes = _sheet(["What each exact switch is worth", title], notes, inches)
     for index, (key, colour) in enumerate((("a frame", BLUE), ("a training step", ORANGE))):
         values = [ratios[index] for ratios, _ in rows]
         places = [row + 0.2 - 0.4 * index for row in range(len(rows))]
@@ -90,7 +97,7 @@ def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
             text = f"{value:.2f}"
             axes.annotate(text, (max(value, 1), place), (4, 0), textcoords="offset points", va="center", fontsize=SIZE)
     axes.axvline(1, color=BLACK, linewidth=1)
-    axes.set_yticks(range(len(rows)), names, fontsize=SIZE)
+    axes.set_yticks(range(len(rows)), [name for _, name in rows], fontsize=SIZE)
     axes.set_ylim(-0.6, len(rows) - 0.4)
     ratios = [value for both, _ in rows for value in both]
     low, high = min([1.0, *ratios]), max([1.05, *ratios])
@@ -98,7 +105,7 @@ def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
     axes.set_xlabel("times as long without it", fontsize=SIZE)
     axes.grid(alpha=0.3, axis="x")
     if rows:
-        legend_above(axes, 2)
+        axes.legend(**ABOVE)
     else:
         axes.text(0.5, 0.5, "no exact switch was measured", transform=axes.transAxes, ha="center", fontsize=SIZE)
     return figure
@@ -119,8 +126,7 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
     ]
     if same:
         notes.append(f"Approximate, but the same bits as exact here: {', '.join(same)}.")
-    heights = {"top": 0.7, "bottom": 0.6, "axes": 5.0}
-    figure, axes = sheet(["Time against error of the approximate settings", title], notes, heights, 0.75)
+    figure, axes = _sheet(["Time against error of the approximate settings", title], notes, 5.0)
     axes.set_xlabel("ms a frame, median", fontsize=SIZE)
     axes.set_ylabel("PSNR, dB", fontsize=SIZE)
     axes.grid(alpha=0.3)
@@ -141,15 +147,15 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
     edges = [(point["frame_ms"], point["psnr"]) for point, is_best in zip(rivals, best, strict=True) if is_best]
     steps = _steps([(ms, min(psnr, top) if psnr >= PSNR_MAX else psnr) for ms, psnr in sorted(edges)])
     axes.plot(*zip(*steps, strict=True), color=VERMILION, linewidth=1.5, zorder=2)
-    legend_above(axes, 2, rise=0.05)
     lines = list(pairwise(steps))
     if exact is not None:
         ms = exact["frame_ms"]
-        axes.axvline(ms, color=GREY, linewidth=1.2, linestyle="--", zorder=1)
-        _over_the_axes(figure, axes, ms, f"exact: {ms:.1f} ms")
+        axes.axvline(ms, color=GREY, linewidth=1.2, linestyle="--", zorder=1, label=f"exact: {ms:.1f} ms")
         lines.append(((ms, axes.get_ylim()[0]), (ms, top)))
     texts = [f"{point['name']} ({point['max_abs']:.2g})" for point in drawn]
-    label_points(figure, axes, [(point["frame_ms"], point["psnr"]) for point in drawn], texts, lines)
+    axes.legend(**ABOVE)
+    figure.draw_without_rendering()  # the axes have their place now
+    _label_points(figure, axes, [(point["frame_ms"], point["psnr"]) for point in drawn], texts, lines)
     return figure
 
 
@@ -172,88 +178,33 @@ def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return path
 
 
-def _left_of(names: Sequence[str]) -> float:
-    """Inches that the longest of some names takes left of the axes."""
-    figure = import_module("matplotlib.figure").Figure(dpi=DPI)
-    return max((_extent(figure, name)[0] for name in names), default=0.0) / DPI + 0.25
-
-
-def _over_the_axes(figure: Any, axes: Any, x: float, text: str) -> None:
-    """A text over the top edge of the axes, in the middle over `x` where it does not stick out."""
-    half = _extent(figure, text)[0] / 2
-    box = axes.get_window_extent()
-    middle = min(max(axes.transData.transform((x, 0))[0], box.x0 + half), box.x1 - half)
-    place = figure.transFigure.inverted().transform((middle, box.y1 + 3))
-    figure.text(*place, text, ha="center", va="bottom", fontsize=SIZE, color=GREY)
-
-
-def label_points(
-    figure: Any,
-    axes: Any,
-    points: Sequence[tuple[float, float]],
-    texts: Sequence[str],
-    lines: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
-) -> list[Place]:
+def _label_points(
+    figure: Any, axes: Any, points: Sequence[Point], texts: Sequence[str], lines: Sequence[tuple[Point, Point]] = ()
+) -> None:
     """Write a text beside each point, with a leader line where it lies apart; `lines` are better not crossed. The axes
     must have their place and limits."""
     to_pixels, to_figure = axes.transData.transform, figure.transFigure.inverted().transform
     bounds = axes.get_window_extent()
-    frame = Box(bounds.x0 + PAD, bounds.y0 + PAD, bounds.x1 - PAD, bounds.y1 - PAD)
-    sizes = [(width + 2 * PAD, height + 2 * PAD) for width, height in (_extent(figure, text) for text in texts)]
-    spots = [tuple(map(float, to_pixels(point))) for point in points]
-    crossed = [(tuple(map(float, to_pixels(a))), tuple(map(float, to_pixels(b)))) for a, b in lines]
-    places = place_labels(spots, sizes, frame, crossed)  # type: ignore[arg-type]
+    frame = np.array([bounds.x0 + PAD, bounds.y0 + PAD, bounds.x1 - PAD, bounds.y1 - PAD])
+    sizes = np.array([_extent(figure, text) for text in texts]) + 2 * PAD
+    segments = to_pixels(np.reshape(lines, (-1, 2))).reshape(-1, 2, 2)
     line = import_module("matplotlib.lines").Line2D
-    for text, place in zip(texts, places, strict=True):
-        corner = to_figure((place.box.left + PAD, place.box.bottom + PAD))
-        figure.text(*corner, text, ha="left", va="bottom", fontsize=SIZE)
+    for text, place in zip(texts, place_labels(to_pixels(points), sizes, frame, segments), strict=True):
+        figure.text(*to_figure(place.box[:2] + PAD), text, ha="left", va="bottom", fontsize=SIZE)
         if place.leader is not None:
-            x, y = zip(*map(to_figure, place.leader), strict=True)
-            figure.add_artist(line(x, y, color=GREY, linewidth=0.8, zorder=1))
-    return places
+            figure.add_artist(line(*to_figure(place.leader).T, color=GREY, linewidth=0.8, zorder=1))
 
 
-def sheet(titles: Sequence[str], notes: Sequence[str], heights: Mapping[str, float], left: float) -> tuple[Any, Any]:
-    """A figure with one pair of axes, titles over it and notes below. heights: inches of the axes, and of what belongs
-    to them on `top` (a legend) and at the `bottom` (ticks and their label)."""
-    line = 0.2
-    figure = import_module("matplotlib.figure").Figure(dpi=DPI)
-    first, *others = (wrapped(figure, text) for text in titles)
-    below = [text for note in notes for text in wrapped(figure, note)]
-    head = [*first, *(text for lines in others for text in lines)]
-    height = 0.1 + line * len(head) + heights["top"] + heights["axes"] + heights["bottom"] + line * len(below) + 0.1
-    figure.set_size_inches(WIDTH, height)
-    for number, text in enumerate(head):
-        weight = "bold" if number < len(first) else "normal"
-        figure.text(0.1 / WIDTH, 1 - (0.1 + line * number) / height, text, va="top", fontsize=SIZE, weight=weight)
-    for number, text in enumerate(reversed(below)):
-        figure.text(0.1 / WIDTH, (0.1 + line * number) / height, text, va="bottom", fontsize=SIZE)
-    bottom = (0.1 + line * len(below) + heights["bottom"]) / height
-    axes = figure.add_axes((left / WIDTH, bottom, 1 - (left + 0.2) / WIDTH, heights["axes"] / height))
-    axes.tick_params(labelsize=SIZE)
+def _sheet(titles: Sequence[str], notes: Sequence[str], inches: float) -> tuple[Any, Any]:
+    """A figure with one pair of axes of about so many inches, titles over it, the first in bold, and notes below."""
+    head, below = ([line for text in texts for line in wrap(text, LETTERS)] for texts in (titles[1:], notes))
+    height = inches + 0.2 * (len(head) + len(below)) + 1.3
+    figure = import_module("matplotlib.figure").Figure((WIDTH, height), dpi=DPI, layout="constrained")
+    figure.suptitle(titles[0], x=0.01, ha="left", weight="bold", fontsize=SIZE)
+    figure.supxlabel("\n".join(below), x=0.01, ha="left", fontsize=SIZE)
+    axes = figure.subplots()
+    axes.set_title("\n".join(head) + "\n\n", loc="left", fontsize=SIZE)
     return figure, axes
-
-
-def wrapped(figure: Any, text: str) -> list[str]:
-    """The lines of a text that fit into the figure's width."""
-    lines = []
-    for part in text.split("\n"):
-        line = ""
-        for word in part.split(" "):
-            longer = f"{line} {word}" if line else word
-            if line and _extent(figure, longer)[0] > (WIDTH - 0.3) * DPI:
-                lines.append(line)
-                line = word
-            else:
-                line = longer
-        lines.append(line)
-    return lines
-
-
-def legend_above(axes: Any, columns: int, rise: float = 0.0) -> None:
-    """A legend over the axes, where it covers no point."""
-    place = {"loc": "lower left", "bbox_to_anchor": (0, 1 + rise), "borderaxespad": 0.2}
-    axes.legend(fontsize=SIZE, ncols=columns, frameon=False, **place)
 
 
 def _extent(figure: Any, text: str) -> tuple[float, float]:

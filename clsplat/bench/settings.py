@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from clsplat.bench.stages import columns, held_kind, picture_of, trainer_of, wal
 from clsplat.bench.subject import Progress, Subject
 from clsplat.camera import Camera
 from clsplat.config.presets import PRESETS
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import PLAIN_SLOTS
@@ -60,35 +60,27 @@ class Error:
         return cls(psnr, float(np.abs(difference).max()))
 
 
-def settings() -> dict[str, RasterizerConfig]:
+def settings() -> dict[str, BenchSwitches]:
     """The points of the plot: presets, and each switch away from its default alone, and the exact ones together."""
-    named = {f"preset {name}": config for name, config in PRESETS.items()}
+    named = {f"preset {name}": config.switches() for name, config in PRESETS.items()}
+    flags = [switch.name for switch in fields(BenchSwitches) if switch.default is True]
     changes: dict[str, dict[str, Any]] = {
         "extent constant": {"extent": "constant"},
         "tile-test box": {"tile_test": "box"},
         "tile-test square": {"tile_test": "square"},
         "depth-sort pairs": {"depth_sort": "pairs"},
         "key-bits all": {"key_bits": "all"},
-        "no row-skip": {"row_skip": False},
-        "no column-skip": {"column_skip": False},
-        "no vector-skip": {"vector_skip": False},
-        "no early-stop": {"early_stop": False},
-        "no last-contributor": {"last_contributor": False},
-        "no record-cells": {"record_cells": False},
-        "no gradient-skip": {"gradient_skip": False},
-        "no frustum-cull": {"frustum_cull": False},
-        "no opacity-cull": {"opacity_cull": False},
+        **{f"no {flag.replace('_', '-')}": {flag: False} for flag in flags},
     }
-    together: dict[str, Any] = {key: value for change in changes.values() for key, value in change.items()}
-    changes[ALL_OFF] = together
+    changes[ALL_OFF] = {key: value for change in changes.values() for key, value in change.items()}
     changes["extent 3sigma"] = {"extent": "3sigma"}
     changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
     changes.update({f"sh-tolerance {steps}/255": {"sh_tolerance": steps / 255} for steps in (4, 16, 64)})
     changes["sh-storage half"] = {"sh_storage": "half"}
     changes.update({f"alpha-min {steps}/255": {"alpha_min": steps / 255} for steps in (2, 4)})
     changes.update({f"transmittance-min {value:g}": {"transmittance_min": value} for value in (1e-3, 1e-2)})
-    named.update({name: replace(RasterizerConfig(), **change) for name, change in changes.items()})
-    merged: dict[RasterizerConfig, str] = {}
+    named.update({name: BenchSwitches(**change) for name, change in changes.items()})
+    merged: dict[BenchSwitches, str] = {}
     for name, config in named.items():
         merged[config] = f"{merged[config]} = {name.removeprefix('preset ')}" if config in merged else name
     return {name: config for config, name in merged.items()}
@@ -103,7 +95,7 @@ def approximate(config: RasterizerConfig) -> bool:
 def compare(
     subject: Subject,
     device: Device,
-    candidates: dict[str, RasterizerConfig] | None = None,
+    candidates: Mapping[str, RasterizerConfig] | None = None,
     *,
     repeat: int = 5,
     progress: Progress | None = None,
@@ -113,7 +105,7 @@ def compare(
     image. Where both are among the settings, also how many times faster all exact switches together make them.
     """
     say = progress or (lambda *_: None)
-    candidates = candidates or settings()
+    tried = {name: config.switches() for name, config in (candidates or settings()).items()}
     trainer, camera = trainer_of(subject, device, PRESETS["exact"]), subject.camera
     model, work = trainer.parameters, trainer.rasterizer.work
     background = upload(device, np.zeros(3, np.float32))
@@ -134,20 +126,18 @@ def compare(
         trainer.train_step()
 
     models: dict[tuple[object, ...], AnyGaussians] = {held_kind(PRESETS["exact"]): model}
-    for config in candidates.values():
+    for config in tried.values():
         if (kind := held_kind(config)) not in models:
             models[kind] = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
     exact = picture_of(draw(trainer.rasterizer))
-    rasterizers = {name: Rasterizer(device, config, work) for name, config in candidates.items()}
+    rasterizers = {name: Rasterizer(device, config, work) for name, config in tried.items()}
+    size = (model.count, model.coefficients, [camera])
     for rasterizer in rasterizers.values():
-        config = rasterizer.config
-        rasterizer.follow(
-            plan_step(device, model.count, model.coefficients, [camera], config, fields=PLAIN_SLOTS, agreement=False)
-        )
-    found = {}
+        rasterizer.follow(plan_step(device, *size, rasterizer.config, fields=PLAIN_SLOTS, agreement=False))
+    differences = {}
     for done, (name, rasterizer) in enumerate(rasterizers.items()):
         say("settings", done / len(rasterizers))
-        found[name] = errors(picture_of(draw(rasterizer)))
+        differences[name] = errors(picture_of(draw(rasterizer)))
         step(rasterizer)
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in rasterizers}
     for done in range(repeat):
@@ -155,27 +145,27 @@ def compare(
         for name, rasterizer in rasterizers.items():
             both = wall_ms(device, partial(draw, rasterizer)), wall_ms(device, partial(step, rasterizer))
             times[name].append(both)
-    medians = {name: tuple(map(statistics.median, zip(*each, strict=True))) for name, each in times.items()}
+    medians = {name: tuple(map(statistics.median, zip(*pairs, strict=True))) for name, pairs in times.items()}
     whole = (width, height) == (camera.width, camera.height)
     return {
-        "exact": _exact_of(candidates),
-        "exact_switches_faster": _faster(candidates, medians),
+        "exact": _exact_of(tried),
+        "exact_switches_faster": _faster(tried, medians),
         "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
         "crop": list(crop),
         "exact_against_float64": asdict(errors(exact)[0]),
-        "points": _points(candidates, found, medians, whole=whole),
+        "points": _points(tried, differences, medians, whole=whole),
     }
 
 
 def _points(
-    candidates: Mapping[str, RasterizerConfig],
-    found: Mapping[str, tuple[Error, Error]],
+    candidates: Mapping[str, BenchSwitches],
+    differences: Mapping[str, tuple[Error, Error]],
     medians: Mapping[str, tuple[float, ...]],
     *,
     whole: bool,
 ) -> list[dict[str, Any]]:
     points = []
-    for name, (from_reference, from_exact) in found.items():
+    for name, (from_reference, from_exact) in differences.items():
         points.append(
             {
                 "name": name,
@@ -193,13 +183,13 @@ def _points(
     return points
 
 
-def _exact_of(candidates: Mapping[str, RasterizerConfig]) -> str | None:
+def _exact_of(candidates: Mapping[str, BenchSwitches]) -> str | None:
     """The name of the setting that is the `exact` preset."""
-    return next((name for name, config in candidates.items() if config == PRESETS["exact"]), None)
+    return next((name for name, config in candidates.items() if config == PRESETS["exact"].switches()), None)
 
 
 def _faster(
-    candidates: Mapping[str, RasterizerConfig], medians: Mapping[str, tuple[float, ...]]
+    candidates: Mapping[str, BenchSwitches], medians: Mapping[str, tuple[float, ...]]
 ) -> dict[str, float] | None:
     on = _exact_of(candidates)
     if on is None or ALL_OFF not in medians:
@@ -247,6 +237,6 @@ def settings_table(result: dict[str, Any]) -> str:
     )
     lines = [*columns(rows), "", note]
     if (faster := result["exact_switches_faster"]) is not None:
-        each = f"a frame {faster['frame']:.2f} times faster, a training step {faster['iteration']:.2f} times"
-        lines.append(f"the exact switches together: {each}")
+        gain = f"a frame {faster['frame']:.2f} times faster, a training step {faster['iteration']:.2f} times"
+        lines.append(f"the exact switches together: {gain}")
     return "\n".join(lines)

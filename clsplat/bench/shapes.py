@@ -66,17 +66,17 @@ def choose(trials: list[Trial]) -> Shape:
     timed = [(trial.ms, trial.shape) for trial in trials if trial.ms is not None]
     if not timed:
         return default.shape
-    ms, shape = min(timed, key=lambda found: found[0])
+    ms, shape = min(timed, key=lambda trial: trial[0])
     return shape if default.ms is None or ms <= ENOUGH * default.ms else default.shape
 
 
 def _in_a_process(index: int, shape: Shape) -> float | None:
     with Child(python_module("clsplat.bench.shapes", str(index), str(shape.lanes), str(shape.items))) as child:
         try:
-            told = child.receive(patience())
+            answer = child.receive(patience())
         except TimeoutError:
             return None
-    return float(told["ms"]) if told is not None else None
+    return float(answer["ms"]) if answer is not None else None
 
 
 def measure(device: Device, workload: tuple[int, int, int] = WORKLOAD, repeat: int = 7) -> float:

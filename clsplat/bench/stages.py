@@ -11,7 +11,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
+from clsplat.gaussians import GROUPS, floats_of
 from clsplat.rendering.rasterizer import Frame
 from clsplat.rendering.renderer import Renderer, held_sh
 from clsplat.scenes.lens import Lens
@@ -34,7 +35,7 @@ from clsplat.training.trainer import Trainer
 
 FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")
 """Stages that are measured in a frame; the others in a training step."""
-GAUSSIAN_BYTES = 4 * 59 * 4
+GAUSSIAN_BYTES = 4 * floats_of(16) * 4
 """Bytes of a Gaussian of SH degree 3 in a training step: parameters, gradients and two moments."""
 
 
@@ -50,7 +51,7 @@ def bench(
     """Measure every stage; returns what `clsplat bench --json` prints. The device's queue should have been made with
     profiling."""
     say = progress or (lambda *_: None)
-    config = config or RasterizerConfig()
+    config = (config or RasterizerConfig()).switches()
     say("limits", None)
     limits = limits or measure_limits(device)
     say("frame", None)
@@ -68,15 +69,8 @@ def bench(
     for band in frame.bands:
         part = rasterizer.part(frame, band)
         listed += part.counted.pairs
-        added, looked_at = count_pairs(
-            rasterizer.device,
-            rasterizer.work,
-            part.lists,
-            frame.projected.splats,
-            frame.background,
-            subject.camera,
-            band,
-        )
+        drawn = (part.lists, frame.projected.splats, frame.background, subject.camera, band)
+        added, looked_at = count_pairs(rasterizer.device, rasterizer.work, *drawn)
         contributing, evaluated = contributing + added, evaluated + looked_at
     in_frame = _measure(device, draw, repeat)
     say("training step", None)
@@ -138,8 +132,8 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Measur
     for name, record in by_events[0].items():
         waits = [stages[name].wall_ms for stages in by_waiting]
         times = [stages[name].kernels for stages in by_events]
-        kernels = {kernel: statistics.median(each.get(kernel, 0.0) for each in times) for kernel in record.kernels}
-        total = statistics.median(waits if by_wall else [sum(each.values()) for each in times])
+        kernels = {kernel: statistics.median(run.get(kernel, 0.0) for run in times) for kernel in record.kernels}
+        total = statistics.median(waits if by_wall else [sum(run.values()) for run in times])
         medians[name] = replace(record, kernels=kernels, ms=total, wall_ms=statistics.median(waits))
     return _Measured(statistics.median(walls), medians, by_wall)
 
@@ -155,15 +149,7 @@ def wall_ms(device: Device, work: Callable[[], object]) -> float:
 
 def _row(record: StageRecord, limits: Limits) -> dict[str, Any]:
     rate = 1e3 * record.bytes / record.ms if record.ms > 0 else 0.0
-    return {
-        "ms": record.ms,
-        "wall_ms": record.wall_ms,
-        "launches": record.launches,
-        "bytes": record.bytes,
-        "bytes_per_second": rate,
-        "share_of_copy": rate / limits.copy_bytes_per_second,
-        "kernels": record.kernels,
-    }
+    return {**asdict(record), "bytes_per_second": rate, "share_of_copy": rate / limits.copy_bytes_per_second}
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,12 +173,11 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
     pixels = (photograph / np.float32(255)).astype(np.float32)
     view = _Picture("bench", camera, Path("bench"), "train", lens, pixels=pixels)
     scene = Scene("bench", [view], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (np.zeros(3), np.ones(3)))
-    names = [each.name for each in fields(OptimiserConfig)]
-    still = {name: 0.0 for name in names if "_rate" in name and name != "means_rate_steps"}
+    still = {group.rate: 0.0 for group in GROUPS.values()}
     settings = TrainConfig(
         sh_degree=subject.gaussians.sh_degree,
         warmup=(),
-        optimiser=OptimiserConfig(**still),  # type: ignore[arg-type]  # all of them are floats
+        optimiser=OptimiserConfig(means_rate_end=0.0, **still),  # type: ignore[arg-type]  # all of them are floats
         density=DensityConfig(every=0),
         rasterizer=config,
     )

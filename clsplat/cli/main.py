@@ -35,7 +35,7 @@ from clsplat.config.pictures import (
     VideoConfig,
 )
 from clsplat.config.presets import PRESETS, Preset, Schedule, bundled
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.config.verbs import DEMO_ITERATIONS, HOST, PORT
 from clsplat.errors import ClsplatError, InputError, switched_on, system_trouble
@@ -285,7 +285,7 @@ class Bench:
     If not given: all that the device has."""
     json: Flag = False
     """Print the result as JSON."""
-    rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
+    rasterizer: BenchSwitches = field(default_factory=BenchSwitches)
 
 
 @dataclass(frozen=True)
@@ -417,7 +417,7 @@ def parse(arguments: Sequence[str]) -> Verb:
         default = replace(verb, config=config, **_unset(verb))
         verb = _tyro(Train, arguments[1:], prog="clsplat train", default=default)
     elif isinstance(verb, Bench) and verb.preset != "default":
-        bench = replace(verb, rasterizer=PRESETS[verb.preset], **_unset(verb))
+        bench = replace(verb, rasterizer=PRESETS[verb.preset].switches(), **_unset(verb))
         verb = _tyro(Bench, arguments[1:], prog="clsplat bench", default=bench)
     elif isinstance(verb, Render) and (verb.preset is not None or verb.model.is_dir()):
         from clsplat.models.formats import model_path

@@ -22,7 +22,7 @@ from clsplat.errors import examples
 from clsplat.process import endings, interrupt, status_of
 from clsplat.progress import FrameProgress
 from clsplat.sequence import existing, workers
-from clsplat.sequence.frame_renderer import open_shader
+from clsplat.sequence.frame_renderer import open_frame_renderer
 from clsplat.sequence.task import Record, Task
 
 if TYPE_CHECKING:
@@ -41,12 +41,14 @@ def render(verb: Render) -> int:
 
 def _run(job: Job) -> int:
     verb, tasks, options = job.verb, job.tasks, job.options
-    shaders = []
+    renderers = []
     if not job.on_farm:
         how: dict[str, Any] = {"memory_limit": job.memory_limit, "profile": verb.profile}
-        shaders = [open_shader(job.gaussians, options, job.rasterizer, device=each, **how) for each in job.devices]
-        for shader in shaders:
-            shader.check(tasks)
+        renderers = [
+            open_frame_renderer(job.gaussians, options, job.rasterizer, device=device, **how) for device in job.devices
+        ]
+        for renderer in renderers:
+            renderer.check(tasks)
     if threading.current_thread() is threading.main_thread():
         for each in endings():  # again, as pycolmap and compilers of kernels install handlers of their own
             signal.signal(each, interrupt)
@@ -74,7 +76,7 @@ def _run(job: Job) -> int:
             if job.on_farm:
                 _on_farm(job, left, done, video)
             else:
-                workers.run_tasks(left, shaders, options, done, video)
+                workers.run_tasks(left, renderers, options, done, video)
     except KeyboardInterrupt as error:
         count = f"{len(records)} of {len(tasks)} frames"
         advice = "nothing is left of the video" if job.is_video else "go on with --skip-existing"
@@ -87,18 +89,18 @@ def _run(job: Job) -> int:
             "model's world?"
         )
     if verb.profile:
-        _print_profile(records.values(), time.monotonic() - start, len(shaders))
+        _print_profile(records.values(), time.monotonic() - start, len(renderers))
     if verb.json:
         print(json.dumps([records[task.number].document() for task in tasks], indent=2))
     return 0
 
 
 def _on_farm(job: Job, tasks: Sequence[Task], done: Callable[[Record], None], video: VideoWriter | None = None) -> None:
-    from clsplat.sequence.farm import Scene, render_on_farm
+    from clsplat.sequence.farm import WorkerJob, render_on_farm
 
     if job.verb.profile:
         warn("--profile is not used: it is for devices of this process")
-    scene = Scene(
+    worker_job = WorkerJob(
         str(job.model.absolute()),
         job.digest,
         job.options,
@@ -107,7 +109,7 @@ def _on_farm(job: Job, tasks: Sequence[Task], done: Callable[[Record], None], vi
         job.memory_limit,
     )
     verb = job.verb
-    render_on_farm(tasks, scene, done, scheduler=verb.scheduler, workers=verb.workers, video=video)
+    render_on_farm(tasks, worker_job, done, scheduler=verb.scheduler, workers=verb.workers, video=video)
 
 
 def _print_profile(records: Any, wall: float, devices: int) -> None:

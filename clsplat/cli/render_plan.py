@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from clsplat.cli.render_request import Job, frames_there
+from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import FPS
 from clsplat.errors import amount, examples
-from clsplat.frame.draw import COLOUR, renderer_channels
-from clsplat.frame.supersample import finer
-from clsplat.frame.window import crop, on_tiles
+from clsplat.frame.draw import feature_floats, on_tiles
+from clsplat.frame.samples import finer
+from clsplat.frame.window import crop
 from clsplat.sequence import workers
 from clsplat.sequence.task import picture_camera
 from clsplat.shots.frame_numbers import ranges
@@ -113,13 +114,12 @@ def plan_of(job: Job, selector: str | None) -> DevicePlan:
     from clsplat.frame.strips import strip_rows
     from clsplat.rendering.memory_needs import plan_frame
     from clsplat.rendering.renderer import held_sh
-    from clsplat.stages.channels import Features
     from clsplat.stages.deep import DEEP_FLOATS
 
     device, options = open_device(selector, job.memory_limit), job.options
     floats = held_sh(job.gaussians, job.rasterizer).floats
     framing, names = options.pictures.framing, set(options.channels)
-    beside = Features.of(renderer_channels(options.channels)).floats if names - set(COLOUR) else 0
+    features = feature_floats(names)
     cameras = {(each.width, each.height): each for each in (picture_camera(task, options) for task in job.tasks)}
     found = []
     for camera in cameras.values():
@@ -128,11 +128,11 @@ def plan_of(job: Job, selector: str | None) -> DevicePlan:
         else:
             rows, planes = strip_rows(device, camera, options.channels, framing), 0
         strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
-        drawn = [(strip, beside)]
-        if framing.supersample > 1 and names & set(COLOUR):
+        drawn = [(strip, features)]
+        if framing.supersample > 1 and light_and_rest(names)[0]:
             drawn.append((finer(strip, framing), 0))
-        for each, features in drawn:
-            sizes = (on_tiles(each)[0], job.rasterizer, features, planes)
+        for window, floats_beside in drawn:
+            sizes = (on_tiles(window)[0], job.rasterizer, floats_beside, planes)
             plan = plan_frame(device, len(job.gaussians), floats, *sizes)
             found.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
     return max(found, key=lambda each: each.plan.needed)

@@ -17,14 +17,13 @@ from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureC
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError, examples
 from clsplat.files import check_new, digest
-from clsplat.frame.supersample import finer
+from clsplat.frame.samples import finer
 from clsplat.gaussians import Gaussians
 from clsplat.images.channels import VIDEO, check_format, parse_channels
 from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
 from clsplat.runs.run import model_file
-from clsplat.sequence import existing, task_list, workers
-from clsplat.sequence.settings_digest import digest_of
-from clsplat.sequence.task import RenderOptions, Task, picture_camera
+from clsplat.sequence import existing
+from clsplat.sequence.task import RenderOptions, Task, digest_of, make_tasks, picture_camera
 from clsplat.shots import Shot, choose_shot
 
 _PICTURES = (".png", ".tif", ".tiff")
@@ -85,7 +84,7 @@ def read_job(verb: Render) -> Job:
     )
     chosen = whole if verb.frames is None else whole.only(verb.frames)
     sampling = options.pictures.sampling
-    tasks = task_list.make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
+    tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
     _check_pictures(tasks, options)
     existing.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
@@ -128,7 +127,7 @@ def check_foreign(job: Job, there: Collection[int]) -> None:
     """Raise InputError where a frame that is not `there` would replace another program's picture."""
     if job.verb.overwrite or job.is_video:
         return
-    if others := workers.foreign([task for task in job.tasks if task.number not in there]):
+    if others := existing.foreign([task for task in job.tasks if task.number not in there]):
         raise InputError(
             f"{examples(others)}: there already, and no frames of clsplat; name other files, or give --overwrite to "
             "replace pictures that it did not make"

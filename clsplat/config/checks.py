@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 from numbers import Integral, Real
-from typing import Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from clsplat.errors import InputError
 
@@ -30,22 +30,27 @@ def check_kinds(config: object, prefix: str) -> None:
     through, or larger than config.toml can hold."""
     for name, kind in get_type_hints(type(config)).items():
         value = getattr(config, name)
-        if get_origin(kind) is Literal:
-            fits, expected = isinstance(value, str) and value in get_args(kind), f"one of {', '.join(get_args(kind))}"
-        elif get_origin(kind) is tuple:
-            fits = isinstance(value, tuple | list) and all(_is_whole(step) for step in value)
-            expected = f"whole numbers below {MOST}"
-        elif kind is int:
-            fits, expected = _is_whole(value), f"a whole number below {MOST}"
-        elif kind is float:
-            fits = isinstance(value, Real) and not _is_truth(value) and not 1e300 <= abs(float(value)) < inf
-            expected = "a number below 1e300"
-        else:
-            fits = _is_truth(value) if kind is bool else isinstance(value, kind)
-            expected = "True or False" if kind is bool else f"{kind.__name__}(...)"
-        if not fits:
+        if expected := misfit(kind, value):
             text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
             raise InputError(f"{prefix}{name.replace('_', '-')} {text:.100}: expected {expected}")
+
+
+def misfit(kind: Any, value: object) -> str | None:
+    """The values that a field of type `kind` takes, in words; None if `value` is one of them."""
+    if get_origin(kind) is Literal:
+        fits, expected = isinstance(value, str) and value in get_args(kind), f"one of {', '.join(get_args(kind))}"
+    elif get_origin(kind) is tuple:
+        fits = isinstance(value, tuple | list) and all(_is_whole(step) for step in value)
+        expected = f"whole numbers below {MOST}"
+    elif kind is int:
+        fits, expected = _is_whole(value), f"a whole number below {MOST}"
+    elif kind is float:
+        fits = isinstance(value, Real) and not _is_truth(value) and not 1e300 <= abs(value) < inf  # type: ignore[operator]
+        expected = "a number below 1e300"
+    else:
+        fits = _is_truth(value) if kind is bool else isinstance(value, kind)
+        expected = "True or False" if kind is bool else f"{kind.__name__}(...)"
+    return None if fits else expected
 
 
 def _is_truth(value: object) -> bool:

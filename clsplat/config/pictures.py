@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Literal
 
+from clsplat.config.checks import Rule, check_rules
 from clsplat.errors import InputError
 
 Filter = Literal["box", "blackman-harris"]
@@ -61,11 +62,6 @@ class FramingConfig:
         if not 1 <= self.supersample <= _MOST_SUPERSAMPLES:
             raise InputError(f"--supersample {self.supersample}: expected 1 to {_MOST_SUPERSAMPLES}")
 
-    @property
-    def on(self) -> bool:
-        """True if anything differs from the plain frame."""
-        return bool(self.region) or self.supersample > 1 or parse_overscan(self.overscan) != (0, 0.0)
-
 
 def parse_overscan(text: str) -> tuple[int, float]:
     """(pixels, 0) or (0, share) of "32" or "5%". Raises InputError."""
@@ -117,10 +113,13 @@ class SamplingConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        if not 1 <= self.samples <= _MOST_SAMPLES:
-            raise InputError(f"--samples {self.samples}: expected 1 to {_MOST_SAMPLES}")
-        if not 0 <= self.shutter_angle <= 3600:
-            raise InputError(f"--shutter-angle {self.shutter_angle}: expected 0 to 3600 degrees")
+        rules: tuple[Rule, ...] = (
+            (("samples",), lambda value: 1 <= value <= _MOST_SAMPLES, f"1 to {_MOST_SAMPLES}"),
+            (("shutter_angle",), lambda value: 0 <= value <= 3600, "0 to 3600 degrees"),
+            (("f_stop", "sensor_width", "metres"), lambda value: value is None or 0 < value < inf, "a number above 0"),
+            (("aperture",), lambda value: 0 <= value < inf, "a radius of at least 0"),
+        )
+        check_rules(self, "--", rules)
         if self.shutter_open is not None or self.shutter_close is not None:
             if self.shutter_angle:
                 raise InputError("--shutter-angle and --shutter-open exclude each other")
@@ -131,15 +130,6 @@ class SamplingConfig:
             ):
                 times = f"--shutter-open {self.shutter_open} --shutter-close {self.shutter_close}"
                 raise InputError(f"{times}: expected two times, the second after the first")
-        for flag, value in (
-            ("--f-stop", self.f_stop),
-            ("--sensor-width", self.sensor_width),
-            ("--metres", self.metres),
-        ):
-            if value is not None and not 0 < value < inf:
-                raise InputError(f"{flag} {value}: expected a number above 0")
-        if not 0 <= self.aperture < inf:
-            raise InputError(f"--aperture {self.aperture}: expected a radius of at least 0")
         if self.aperture and self.f_stop is not None:
             raise InputError("--aperture and --f-stop exclude each other: both are the size of the lens")
         if self.has_lens and not 0 < self.focus < inf:
@@ -151,6 +141,12 @@ class SamplingConfig:
         if self.shutter_open is not None and self.shutter_close is not None:
             return self.shutter_open, self.shutter_close
         return -self.shutter_angle / 720, self.shutter_angle / 720
+
+    @property
+    def middle(self) -> float:
+        """The time half way between opening and closing, in frames from the frame."""
+        begin, end = self.shutter
+        return 0.5 * (begin + end)
 
     @property
     def moves(self) -> bool:
@@ -201,11 +197,11 @@ class DeepConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        if not 1 <= self.bins <= _MOST_BINS:
-            raise InputError(f"--deep.bins {self.bins}: expected 1 to {_MOST_BINS}")
-        for flag, value in (("--deep.near", self.near), ("--deep.far", self.far)):
-            if not 0 <= value < inf:
-                raise InputError(f"{flag} {value}: expected a depth, or 0 for that of what is in view")
+        rules: tuple[Rule, ...] = (
+            (("bins",), lambda value: 1 <= value <= _MOST_BINS, f"1 to {_MOST_BINS}"),
+            (("near", "far"), lambda value: 0 <= value < inf, "a depth, or 0 for that of what is in view"),
+        )
+        check_rules(self, "--deep.", rules)
         if self.near and self.far and not self.near < self.far:
             raise InputError(f"--deep.far {self.far}: expected more than --deep.near {self.near}")
 

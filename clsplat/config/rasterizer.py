@@ -11,14 +11,54 @@ from clsplat.config.checks import Rule, check_kinds, check_rules
 
 @dataclass(frozen=True)
 class RasterizerConfig:
-    """Work that the rasterizer skips. Only settings that are marked as approximate change a picture; the others change
-    no bit of a frame, and are there to be measured.
+    """Approximations of the rasterizer: each saves work and changes pictures, but for the defaults.
 
     sh-tolerance and sh-storage are of frames of a model that is held on the device (render, eval), not of training.
     docs/performance.md has the error of each setting, and the time that it buys.
     """
 
-    extent: Literal["opacity", "constant", "3sigma"] = "opacity"
+    extent: Literal["opacity", "3sigma"] = "opacity"
+    """Reach of a Gaussian. opacity: to where its alpha is alpha-min; 3sigma: three standard deviations, which cuts what
+    is visible of opaque ones (approximate)."""
+    sh_degree_limit: int = 3
+    """Leave out the bands of spherical harmonics (SH, colour by direction) above this degree, 0 to 3 (approximate)."""
+    sh_tolerance: float = 0.0
+    """Leave out a Gaussian's highest SH bands as long as that changes no channel of its colour, 0 to 1, by more than
+    this, from any direction: 0 leaves out those that are zero (approximate above 0). Bands that none needs are always
+    left out, those that some need only where that is half of all coefficients: from there on it pays."""
+    sh_storage: Literal["float", "half"] = "float"
+    """Keep the SH bands above 0 in 32 or in 16 bits (half is approximate, of half the memory)."""
+    alpha_min: float = 1 / 255
+    """Skip a Gaussian at a pixel where its alpha is less than this (approximate above the default, 1/255: one step of 8
+    bits)."""
+    transmittance_min: float = 1e-4
+    """A Gaussian that would take a pixel's transmittance to this or less is left out and ends the pixel (approximate
+    above 1e-4)."""
+
+    def check(self) -> None:
+        """Raise InputError naming the first setting whose value makes no sense."""
+        rules: tuple[Rule, ...] = (
+            (("sh_degree_limit",), lambda value: 0 <= value <= 3, "0 to 3"),
+            (("sh_tolerance",), lambda value: 0 <= value <= 1, "0 to 1"),
+            (("alpha_min",), lambda value: 1e-3 <= value < 0.5, "0.001 to 0.5"),
+            (("transmittance_min",), lambda value: 1e-6 <= value < 0.5, "1e-6 to 0.5"),
+        )
+        check_kinds(self, "--rasterizer.")
+        check_rules(self, "--rasterizer.", rules)
+
+    def switches(self) -> BenchSwitches:
+        """Every setting that the rasterizer reads. Switches that this configuration does not have are on."""
+        return BenchSwitches(**vars(self))
+
+
+@dataclass(frozen=True)
+class BenchSwitches(RasterizerConfig):
+    """Settings of the rasterizer, with the switches that change no bit of a frame and are there to be measured.
+
+    docs/performance.md has the error of each setting, and the time that it buys.
+    """
+
+    extent: Literal["opacity", "constant", "3sigma"] = "opacity"  # type: ignore[assignment]  # one value more
     """Reach of a Gaussian. opacity: to where its alpha is alpha-min; constant: as far as an opaque one would, whatever
     its opacity; 3sigma: three standard deviations, which cuts what is visible of opaque ones (approximate)."""
     tile_test: Literal["ellipse", "box", "square"] = "ellipse"
@@ -53,28 +93,3 @@ class RasterizerConfig:
     opacity_cull: bool = True
     """Leave out a Gaussian whose opacity is not over alpha-min before its colour is worked out; else as with
     frustum-cull off, wherever it lies: it has no extent."""
-    sh_degree_limit: int = 3
-    """Leave out the bands of spherical harmonics (SH, colour by direction) above this degree, 0 to 3 (approximate)."""
-    sh_tolerance: float = 0.0
-    """Leave out a Gaussian's highest SH bands as long as that changes no channel of its colour, 0 to 1, by more than
-    this, from any direction: 0 leaves out those that are zero (approximate above 0). Bands that none needs are always
-    left out, those that some need only where that is half of all coefficients: from there on it pays."""
-    sh_storage: Literal["float", "half"] = "float"
-    """Keep the SH bands above 0 in 32 or in 16 bits (half is approximate, of half the memory)."""
-    alpha_min: float = 1 / 255
-    """Skip a Gaussian at a pixel where its alpha is less than this (approximate above the default, 1/255: one step of 8
-    bits)."""
-    transmittance_min: float = 1e-4
-    """A Gaussian that would take a pixel's transmittance to this or less is left out and ends the pixel (approximate
-    above 1e-4)."""
-
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
-        rules: tuple[Rule, ...] = (
-            (("sh_degree_limit",), lambda value: 0 <= value <= 3, "0 to 3"),
-            (("sh_tolerance",), lambda value: 0 <= value <= 1, "0 to 1"),
-            (("alpha_min",), lambda value: 1e-3 <= value < 0.5, "0.001 to 0.5"),
-            (("transmittance_min",), lambda value: 1e-6 <= value < 0.5, "1e-6 to 0.5"),
-        )
-        check_kinds(self, "--rasterizer.")
-        check_rules(self, "--rasterizer.", rules)

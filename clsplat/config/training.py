@@ -58,7 +58,7 @@ class OptimiserConfig:
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        rates = tuple(each.name for each in fields(self) if each.name.endswith(("_rate", "_rate_end")))
+        rates = tuple(setting.name for setting in fields(self) if setting.name.endswith(("_rate", "_rate_end")))
         rules: tuple[Rule, ...] = (
             (rates, lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("means_rate_steps", "sh_rest_every"), lambda value: value >= 1, "at least 1"),

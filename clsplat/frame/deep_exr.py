@@ -19,17 +19,18 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
+from clsplat.config.channels import DEEP
 from clsplat.config.pictures import DEEP_STRIP_FLOATS, DeepConfig, Encoding
 from clsplat.device.context import Device
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
+from clsplat.frame.draw import on_tiles
 from clsplat.frame.strips import strips
-from clsplat.frame.window import on_tiles
 from clsplat.gaussians import Gaussians
-from clsplat.images.channels import DEEP, HALF_MAX, deep_spec
+from clsplat.images.channels import HALF_MAX, deep_spec
 from clsplat.images.colour import Colours
 from clsplat.images.exr_header import Header
-from clsplat.images.writing import atomic_output
+from clsplat.images.writing import write_rows
 from clsplat.rendering.memory_needs import frame_pixels
 from clsplat.rendering.renderer import Renderer
 from clsplat.stages.deep import DEEP_FLOATS
@@ -71,14 +72,6 @@ def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bounds
     return renderer.render_deep(gaussians, larger, bounds)[:, rows, columns]
 
 
-def flattened(slices: Float32) -> Float32:
-    """(bins, H, W, 6) to (H, W, 4): the slices over each other, front to back."""
-    flat = np.zeros((*slices.shape[1:3], 4), np.float64)
-    for each in slices.astype(np.float64):
-        flat += (1 - flat[:, :, 3:]) * each[:, :, :4]
-    return flat.astype(np.float32)
-
-
 def deep_rows(device: Device, camera: Camera, bins: int) -> int:
     """Rows of the strips, in whole tiles, that a deep picture of `bins` slices is rendered in."""
     floats = DEEP_FLOATS * bins
@@ -100,31 +93,25 @@ def write_deep(
 
     Channels R G B A Z ZBack; a pixel has a sample for each slice that it has something in, with the depths of the first
     and the last Gaussian that it takes there. Colours are half or float as the encoding says, depths are float. Raises
-    InputError and ClsplatError as `images.channels.write_layers`.
+    InputError and ClsplatError as `images.channels.write_channels`.
     """
-    path, config = Path(path), config or DeepConfig()
+    config = config or DeepConfig()
     encoding, header, colours = encoding or Encoding(), header or Header(), colours or Colours()
     if path.suffix.lower() != ".exr":
         raise InputError(f"{path}: deep samples want an .exr file")
     bounds = bin_bounds(gaussians, camera, config)
-    kinds = [oiio.TypeDesc("half" if encoding.depth == "half" else "float")] * 4 + [oiio.TypeDesc("float")] * 2
-    spec = deep_spec(camera.width, camera.height, header)
-    spec.nchannels = len(DEEP)
-    spec.channelnames = DEEP
-    spec.channelformats = tuple(kinds)
-    spec.alpha_channel, spec.z_channel = 3, 4
-    spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
+    spec = deep_spec(camera.width, camera.height, encoding, header)
     rows = deep_rows(renderer.device, camera, len(bounds) + 1)
-    with atomic_output(path, [spec], "exr") as output:
-        row = spec.y
+
+    def pieces() -> Iterator[tuple[Any, int]]:
         for strip in strips(camera, rows):
             slices = render_deep(renderer, gaussians, strip, bounds)
-            for each in slices:
-                rgb, alpha = np.ascontiguousarray(each[:, :, :3]), np.ascontiguousarray(each[:, :, 3])
-                each[:, :, :3] = colours.convert(rgb, alpha, colours.model, colours.output)
-            for data, count in _deep_rows(slices, kinds, half=encoding.depth == "half"):
-                output.take(output.file.write_deep_scanlines(row, row + count, 0, data))
-                row += count
+            for image in slices:
+                rgb, alpha = np.ascontiguousarray(image[:, :, :3]), np.ascontiguousarray(image[:, :, 3])
+                image[:, :, :3] = colours.convert(rgb, alpha, colours.model, colours.output)
+            yield from _deep_rows(slices, list(spec.channelformats), half=encoding.depth == "half")
+
+    write_rows(path, spec, "exr", pieces())
 
 
 def _deep_rows(slices: Float32, kinds: list[Any], *, half: bool) -> Iterator[tuple[Any, int]]:
@@ -134,18 +121,18 @@ def _deep_rows(slices: Float32, kinds: list[Any], *, half: bool) -> Iterator[tup
         slices[:, :, :, :4] = np.clip(slices[:, :, :, :4], -HALF_MAX, HALF_MAX)
     for top in range(0, height, step := max((1 << 18) // width, 1)):
         rows = slices[:, top : top + step].reshape(bins, -1, DEEP_FLOATS).transpose(1, 0, 2)
-        there = rows[:, :, 3] > 0
+        taken = rows[:, :, 3] > 0
         data = oiio.DeepData()
         data.init(len(rows), len(DEEP), kinds, list(DEEP))
-        _each(data.set_samples, range(len(rows)), there.sum(axis=1).tolist())
-        pixels = np.nonzero(there)[0].tolist()
-        samples = (np.cumsum(there, axis=1) - 1)[there].tolist()
-        values = rows[there]
+        _call_with(data.set_samples, range(len(rows)), taken.sum(axis=1).tolist())
+        pixels = np.nonzero(taken)[0].tolist()
+        samples = (np.cumsum(taken, axis=1) - 1)[taken].tolist()
+        values = rows[taken]
         for channel in range(len(DEEP)):
-            _each(data.set_deep_value, pixels, repeat(channel), samples, values[:, channel].tolist())
+            _call_with(data.set_deep_value, pixels, repeat(channel), samples, values[:, channel].tolist())
         yield data, len(rows) // width
 
 
-def _each(function: Any, *arguments: Any) -> None:
+def _call_with(function: Any, *arguments: Any) -> None:
     """Call it with each row of arguments: OpenImageIO takes deep values one by one, and a loop takes twice as long."""
     deque(map(function, *arguments), maxlen=0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A `Draw` makes the named layers of a camera's picture; here, the one by the kernels."""
+"""A `Draw` makes the named channels of a camera's picture; here, the one by the kernels."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.frame.window import on_tiles, reframed
-from clsplat.images.channels import LAYERS
+from clsplat.config.channels import CHANNELS, feature_names, light_and_rest
+from clsplat.device.layout import TILE
+from clsplat.frame.window import crop, reframed
+from clsplat.stages.channels import Features
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
 
 
-Layers = dict[str, NDArray[Any]]
-Draw = Callable[[Camera, Collection[str]], Layers]
-"""(camera, names of layers) -> those layers, (height, width) or (height, width, channels); rgb over the background,
-so over black it is associated with alpha."""
-COLOUR = ("rgb", "alpha")
-"""Layers that light is added up in; the other layers have no mean."""
-_FEATURES = {"normals": "normal", "position": "position", "motion": "motion"}
+Planes = dict[str, NDArray[Any]]
+"""Channels by name, (height, width) or (height, width, floats); rgb over the background, so over black it is associated
+with alpha."""
+Draw = Callable[[Camera, Collection[str]], Planes]
+"""From a camera and the names of channels to their planes."""
 
 
 def drawn_by(
@@ -35,35 +35,54 @@ def drawn_by(
 ) -> Draw:
     """A Draw by the kernels; after: the camera of a whole frame that motion goes to.
 
-    Motion is turned over: in files v is up, and docs/channels.md has y down. Layers need not be contiguous: the
-    encoder, which may be another thread, puts them in order.
+    Planes need not be contiguous: the encoder, which may be another thread, puts them in order.
     """
 
-    def draw(camera: Camera, names: Collection[str]) -> Layers:
+    def draw(camera: Camera, names: Collection[str]) -> Planes:
         camera, rows, columns = on_tiles(camera)
-        if set(names) <= set(COLOUR):
+        _, rest = light_and_rest(names)
+        made: Planes = {}
+        if not rest:
             picture = renderer.render(gaussians, camera, background, contiguous=False)
-            layers: Layers = {"rgb": picture.image, "alpha": picture.alpha}
         else:
-            wanted = renderer_channels(names)
-            picture, found = renderer.render_channels(
+            picture, made = renderer.render_channels(
                 gaussians,
                 camera,
-                wanted,
+                feature_names(rest),
                 after=after and reframed(after, camera),
                 background=background,
                 contiguous=False,
             )
-            layers = {"rgb": picture.image, "alpha": picture.alpha, "depth": found.depth, "median": found.median}
-            layers |= {"first": found.first, "count": found.count, "id": found.index}
-            layers |= {name: found.fields[_FEATURES[name]] for name in names if name in _FEATURES}
-            if "motion" in layers:
-                layers["motion"] = layers["motion"] * np.array([1, -1], np.float32)
-        return {name: layers[name][rows, columns] for name in LAYERS if name in names}
+        planes: Planes = {"rgb": picture.image, "alpha": picture.alpha}
+        for name in rest:
+            plane, signs = made[CHANNELS[name].kernel], CHANNELS[name].signs
+            planes[name] = plane * np.array(signs, np.float32) if signs else plane
+        return {name: planes[name][rows, columns] for name in names}
 
     return draw
 
 
-def renderer_channels(names: Collection[str]) -> tuple[str, ...]:
-    """Names, in `Renderer.render_channels`, of those layers that it makes only when asked."""
-    return tuple(own for name, own in _FEATURES.items() if name in names)
+def in_two(light: Draw, rest: Draw) -> Draw:
+    """A Draw that takes the channels that light is added up in from one, and the others from another."""
+
+    def draw(camera: Camera, names: Collection[str]) -> Planes:
+        of_light, others = light_and_rest(names)
+        planes = rest(camera, others) if others else {}
+        return planes | light(camera, of_light) if of_light else planes
+
+    return draw
+
+
+def feature_floats(names: Collection[str]) -> int:
+    """Floats of each Gaussian's that these channels are blended from, 0 where they are colour alone."""
+    _, rest = light_and_rest(names)
+    return Features.of(feature_names(rest)).floats if rest else 0
+
+
+def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
+    """A camera whose picture begins with a whole tile of its frame, and where the wanted one is in that."""
+    if camera.window is None:
+        return camera, slice(None), slice(None)
+    left, top = camera.window.x % TILE, camera.window.y % TILE
+    larger = crop(camera, -left, -top, camera.width + left, camera.height + top)
+    return larger, slice(top, None), slice(left, None)

@@ -4,27 +4,25 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config.pictures import STRIP_PIXELS, Encoding, FramingConfig
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
-from clsplat.frame.draw import Draw, Layers
+from clsplat.frame.draw import Draw, Planes, feature_floats
 from clsplat.frame.window import crop
-from clsplat.images.channels import LAYERS, check_format, encoded
+from clsplat.images.channels import check_target, encoded
 from clsplat.images.exr_header import Header
-from clsplat.images.writing import atomic_output
+from clsplat.images.writing import write_rows
 from clsplat.rendering.memory_needs import frame_pixels
 
 if TYPE_CHECKING:
     from clsplat.device.context import Device
-
-_FEATURE_FLOATS = {"normals": 3, "position": 3, "motion": 2}
 
 
 def strip_rows(
@@ -32,11 +30,10 @@ def strip_rows(
 ) -> int:
     """Rows of a strip that leaves room for the rest, whole tiles of them; the picture's height where it needs none.
 
-    names: of the layers that are wanted; config: supersampling makes strips larger than they are written.
+    names: of the channels that are wanted; config: supersampling makes strips larger than they are written.
     """
-    features = 0 if set(names) <= {"rgb", "alpha"} else 1 + sum(_FEATURE_FLOATS.get(name, 0) for name in names)
     samples = config.supersample if config else 1
-    most = min(frame_pixels(device, features), STRIP_PIXELS)
+    most = min(frame_pixels(device, feature_floats(names)), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
     rows = most // across - 2 * TILE  # what a window that begins within a tile, and a filter's margins, add
     if rows >= camera.height:
@@ -58,13 +55,21 @@ def strips(camera: Camera, rows: int) -> Iterator[Camera]:
 
 
 def in_strips(draw: Draw, rows: int) -> Draw:
-    """The same layers, drawn in strips: bounds the device's memory, not the host's."""
+    """The same channels, drawn in strips: bounds the device's memory, not the host's."""
 
-    def drawn(camera: Camera, names: Collection[str]) -> Layers:
+    def drawn(camera: Camera, names: Collection[str]) -> Planes:
         parts = [draw(strip, names) for strip in strips(camera, rows)]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return {name: np.concatenate([part[name] for part in parts]) for name in names} if len(parts) > 1 else parts[0]
 
     return drawn
+
+
+def check_parts(camera: Camera, encoding: Encoding) -> None:
+    """Raise InputError for several parts, which a file has one after the other."""
+    if encoding.parts == "several":
+        raise InputError(
+            f"--parts several: a picture of {camera.width}x{camera.height} is written in strips here, expected one part"
+        )
 
 
 def write_in_strips(
@@ -76,38 +81,21 @@ def write_in_strips(
     encoding: Encoding | None = None,
     header: Header | None = None,
 ) -> None:
-    """Draw and write a picture strip by strip, atomically; the same bytes as `write_layers` writes of all of it, but
-    for layouts of a file that depend on how it is handed over.
+    """Draw and write a picture strip by strip, atomically. The bytes are those that `write_channels` writes of all of
+    it, except in formats whose layout depends on how the rows come.
 
     Raises InputError for what the format cannot hold and for several parts, which a file has one after the other;
     ClsplatError if writing fails.
     """
-    path, encoding, header = Path(path), encoding or Encoding(), header or Header()
-    extension = path.suffix.lower()
-    check_format(str(path), names)
-    if not path.parent.is_dir():
-        raise InputError(f"{path.parent}: no such folder to write {path.name} to")
-    if extension == ".exr" and encoding.parts == "several":
-        raise InputError(
-            f"--parts several: a picture of {camera.width}x{camera.height} is written in strips, expected one part"
-        )
-    pictures = strips(camera, rows)
-
-    def made(strip: Camera) -> tuple[NDArray[Any], Any]:
-        layers = draw(strip, names)
-        ordered = {name: layers[name] for name in LAYERS if name in names}
-        ((pixels, spec),) = encoded(extension, ordered, encoding, header)
-        return pixels, spec
-
-    pixels, spec = made(next(pictures))
+    encoding, header, extension = encoding or Encoding(), header or Header(), path.suffix.lower()
+    check_target(path, names)
+    if extension == ".exr":
+        check_parts(camera, encoding)
+    parts = (encoded(extension, draw(strip, names), encoding, header)[0] for strip in strips(camera, rows))
+    first, spec = next(parts)
     spec.height = camera.height
     if header.window is None:
         spec.full_height = camera.height
-    with atomic_output(path, [spec], extension[1:]) as output:
-        row = spec.y
-        while True:
-            output.take(output.file.write_scanlines(row, row + len(pixels), 0, pixels))
-            row += len(pixels)
-            if row == spec.y + camera.height:
-                break
-            pixels, _ = made(next(pictures))
+    pieces = chain(iter([first]), (pixels for pixels, _ in parts))
+    del first  # its memory is free before the third is drawn
+    write_rows(path, spec, extension[1:], ((pixels, len(pixels)) for pixels in pieces))

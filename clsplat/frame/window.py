@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Windows of a frame, the pixels that are rendered of it: overscan, region of interest, supersampling.
+"""Windows of a frame, the pixels that are rendered of it: overscan and region of interest.
 
-A `Draw` makes the named layers of a camera's picture; the functions here take one and give another. A picture is a
-window of its frame (`Camera.window`), and its pixels have the bits that the frame's have there (docs/pictures.md).
+A picture is a window of its frame (`Camera.window`). Its pixels have the bits that the frame's have there
+(docs/pictures.md).
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from dataclasses import replace
 
 from clsplat.camera import FRAME_CLAMP, Camera, Window
 from clsplat.config.pictures import FramingConfig, parse_overscan, parse_region
-from clsplat.device.layout import TILE
 from clsplat.errors import InputError
 
 
@@ -51,12 +50,3 @@ def reframed(camera: Camera, like: Camera) -> Camera:
     sized = camera if (camera.width, camera.height) == (frame.width, frame.height) else None
     sized = sized or camera.resized(frame.width, frame.height)
     return replace(sized, width=like.width, height=like.height, window=like.window)
-
-
-def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
-    """A camera whose picture begins with a whole tile of its frame, and where the wanted one is in that."""
-    if camera.window is None:
-        return camera, slice(None), slice(None)
-    left, top = camera.window.x % TILE, camera.window.y % TILE
-    larger = crop(camera, -left, -top, camera.width + left, camera.height + top)
-    return larger, slice(top, None), slice(left, None)

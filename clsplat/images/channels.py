@@ -1,54 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of rendered frames: layers of channels in EXR, one part or several, or a plain picture.
+"""Files of rendered frames: channels in EXR, one part or several, or a plain picture.
 
-EXR names follow the OpenEXR documentation ("Technical introduction", layers): R G B A Z, N.x N.y N.z, P.x P.y P.z,
-forward.u forward.v. Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
+Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
 vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standard attributes (ImfStandardAttributes.h).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from clsplat.config.channels import CHANNELS, DEEP
 from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
-from clsplat.files import native_name
 from clsplat.images.alpha import unassociate
 from clsplat.images.exr_header import Header
-from clsplat.images.reading import image_size
+from clsplat.images.reading import decodes, image_size, opened
 from clsplat.images.writing import steps_of, write_spec
-
-
-@dataclass(frozen=True)
-class Layer:
-    """names: of the channels in a file. kind: colour is half or float as asked for; exact stays float, as a half has 11
-    bits of a depth; whole is uint32 in a part of its own, else float. part: its name in a file of several parts."""
-
-    names: tuple[str, ...]
-    kind: Literal["colour", "exact", "whole"]
-    part: str
-
-
-LAYERS: dict[str, Layer] = {
-    "rgb": Layer(("R", "G", "B"), "colour", "rgba"),
-    "alpha": Layer(("A",), "colour", "rgba"),
-    "depth": Layer(("Z",), "exact", "depth"),
-    "median": Layer(("median.Z",), "exact", "median"),
-    "first": Layer(("first.Z",), "exact", "first"),
-    "normals": Layer(("N.x", "N.y", "N.z"), "colour", "N"),
-    "position": Layer(("P.x", "P.y", "P.z"), "exact", "P"),
-    "motion": Layer(("forward.u", "forward.v"), "exact", "forward"),
-    "count": Layer(("count",), "whole", "count"),
-    "id": Layer(("id",), "whole", "id"),
-}
-"""Every channel that `--channels` takes, in the order of a file."""
 
 HALF_MAX = np.float32(65504)
 _PNG_LEVEL, _PNG_FILTER = 1, 0x40
@@ -57,23 +31,21 @@ of level 6, which can be more than a CPU device takes for the frame, for a file 
 _EXR_LEVEL = 1
 """Level of zip and zips: two thirds of the time of the usual 4, for 2 to 7 % more bytes."""
 _LARGEST_FLOAT_INDEX = 2**24
-_BLOCK, _ROWS = 1 << 12, 64
-"""Bytes of a disk's block; rows that are decoded at a time to see whether they are whole."""
+_BLOCK = 1 << 12
+"""Bytes of a disk's block."""
 
 EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
 VIDEO = ".mp4"
-DEEP = ("R", "G", "B", "A", "Z", "ZBack")
-"""Channels of a deep picture."""
 
 
 def parse_channels(text: str) -> tuple[str, ...]:
-    """The names in `text`, comma-separated, in the order of LAYERS. Raises InputError."""
+    """The names in `text`, comma-separated, in the order of CHANNELS. Raises InputError."""
     asked = [word.strip() for word in text.split(",") if word.strip()]
-    unknown = [word for word in asked if word not in LAYERS]
+    unknown = [word for word in asked if word not in CHANNELS]
     if unknown or not asked:
-        found = f"has {examples(map(repr, unknown))}" if unknown else "is empty"
-        raise InputError(f"--channels {text}: {found}, expected some of {', '.join(LAYERS)}")
-    return tuple(name for name in LAYERS if name in asked)
+        problem = f"has {examples(map(repr, unknown))}" if unknown else "is empty"
+        raise InputError(f"--channels {text}: {problem}, expected some of {', '.join(CHANNELS)}")
+    return tuple(name for name in CHANNELS if name in asked)
 
 
 def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
@@ -91,31 +63,36 @@ def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> 
         raise InputError(f"{path}: {article} {extension[1:].upper()} {lacking}; write .exr, or other --channels")
 
 
-def write_layers(
-    path: Path, layers: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
+def check_target(path: Path, channels: Iterable[str]) -> None:
+    """Raise InputError as `check_format`, and for a folder that does not exist."""
+    check_format(str(path), channels)
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such folder to write {path.name} to")
+
+
+def write_channels(
+    path: Path, channels: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
 ) -> None:
     """Write a frame, atomically.
 
-    layers: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
+    channels: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
     numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `writing.write_image`.
     """
-    path, encoding, header = Path(path), encoding or Encoding(), header or Header()
-    check_format(str(path), layers)
-    if not path.parent.is_dir():
-        raise InputError(f"{path.parent}: no such folder to write {path.name} to")
-    ordered = {name: layers[name] for name in LAYERS if name in layers}
-    pairs = encoded(path.suffix.lower(), ordered, encoding, header)
+    encoding, header = encoding or Encoding(), header or Header()
+    check_target(path, channels)
+    pairs = encoded(path.suffix.lower(), channels, encoding, header)
     write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], path.suffix.lower()[1:])
 
 
 def encoded(
-    extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
 ) -> list[tuple[NDArray[Any], Any]]:
-    """(pixels, OpenImageIO's specification) of each part of a file. layers: in the order of LAYERS."""
+    """(pixels, OpenImageIO's specification) of each part of a file."""
+    channels = {name: channels[name] for name in CHANNELS if name in channels}
     if extension != ".exr":
-        return [_picture(extension, layers, encoding, header)]
-    groups = _parts(tuple(layers)) if encoding.parts == "several" else [tuple(layers)]
-    return [_exr_part(group, layers, encoding, header, named=len(groups) > 1) for group in groups]
+        return [_picture(extension, channels, encoding, header)]
+    groups = _parts(tuple(channels)) if encoding.parts == "several" else [tuple(channels)]
+    return [_exr_part(group, channels, encoding, header, named=len(groups) > 1) for group in groups]
 
 
 def is_whole(
@@ -128,13 +105,13 @@ def is_whole(
     *,
     deep: bool = False,
 ) -> bool:
-    """True if the file holds these channels as `write_layers` writes them, and is whole.
+    """True if the file holds these channels as `write_channels` writes them, and is whole.
 
     It has to have that size and no other values of these attributes, and to decode to its last row; with a block of
     zeros in it every row is decoded. A file that was cut short fails. deep: expect a deep picture, whose channels are
     DEEP.
     """
-    channels = [name for name in LAYERS if name in set(channels)]
+    channels = [name for name in CHANNELS if name in set(channels)]
     exr = path.suffix.lower() == ".exr"
     groups = _parts(channels) if exr and encoding.parts == "several" else [tuple(channels)]
     if not path.is_file():
@@ -143,33 +120,24 @@ def is_whole(
         image_size(path)  # finds a PNG that is cut short, of which libpng would print
     except InputError:
         return False
-    source = oiio.ImageInput.open(native_name(path))
-    if source is None:
-        oiio.geterror()
-        return False
     holed = _has_hole(path)
-    try:
+    with opened(path) as source:
+        if source is None:
+            return False
         for part, group in enumerate(groups):
             if not source.seek_subimage(part, 0):
                 return False
             spec = source.spec()
-            names = DEEP if deep else tuple(channel for name in group for channel in LAYERS[name].names)
-            if (spec.width, spec.height, tuple(spec.channelnames)) != (width, height, names) or spec.deep != deep:
+            names = DEEP if deep else tuple(channel for name in group for channel in CHANNELS[name].names)
+            if (spec.width, spec.height, spec.deep) != (width, height, deep):
+                return False
+            if sorted(spec.channelnames) != sorted(names):  # OpenImageIO has its own order of an EXR's
                 return False
             if any(spec.getattribute(key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False
-            bottom = spec.y + spec.height
-            row = (
-                source.read_native_deep_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels)
-                if deep
-                else source.read_scanlines(part, 0, bottom - 1, bottom, 0, 0, spec.nchannels, oiio.FLOAT)
-            )
-            if row is None or source.geterror() or (holed and not _decodes(source, part)):
+            if not decodes(source, part, spec.height - 1) or (holed and not decodes(source, part, 0)):
                 return False
         return not source.seek_subimage(len(groups), 0)
-    finally:
-        source.geterror()
-        source.close()
 
 
 def _has_hole(path: Path) -> bool:
@@ -179,51 +147,28 @@ def _has_hole(path: Path) -> bool:
         return any(empty in block for block in iter(lambda: file.read(_BLOCK << 8), b""))
 
 
-def _decodes(source: Any, part: int) -> bool:
-    """True if every row of the part decodes."""
-    spec = source.spec()
-    for first in range(spec.y, spec.y + spec.height, _ROWS):
-        of = (part, 0, first, min(first + _ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
-        rows = source.read_native_deep_scanlines(*of) if spec.deep else source.read_scanlines(*of, oiio.FLOAT)
-        if rows is None or source.geterror():
-            return False
-    return True
-
-
 def is_foreign(path: Path) -> bool:
     """True if a file is a picture that clsplat has not made."""
-    source = oiio.ImageInput.open(native_name(path))
-    if source is None:
-        oiio.geterror()
-        return False
-    maker = source.spec().getattribute("Software")
-    source.close()
-    return "clsplat" not in str(maker)
+    with opened(path) as source:
+        return source is not None and "clsplat" not in str(source.spec().getattribute("Software"))
 
 
 def attribute(path: Path, name: str) -> Any:
     """The value of an attribute of a file's first part, None where it has none or is no picture."""
-    source = oiio.ImageInput.open(native_name(path))
-    if source is None:
-        oiio.geterror()
-        return None
-    value = source.spec().getattribute(name)
-    source.close()
-    return value
+    with opened(path) as source:
+        return None if source is None else source.spec().getattribute(name)
 
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
-    grouped: dict[str, list[str]] = {}
-    for name in names:
-        grouped.setdefault(LAYERS[name].part, []).append(name)
-    return [tuple(group) for group in grouped.values()]
+    """The channels of each part. Those of one part stand together in the table."""
+    return [tuple(group) for _, group in groupby(names, lambda name: CHANNELS[name].part)]
 
 
 def _exr_part(
-    names: Sequence[str], layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
+    names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
 ) -> tuple[NDArray[Any], Any]:
-    kinds = [LAYERS[name].kind for name in names for _ in LAYERS[name].names]
-    planes = [_planes(layers[name]) for name in names]
+    kinds = [CHANNELS[name].kind for name in names for _ in CHANNELS[name].names]
+    planes = [np.atleast_3d(channels[name]) for name in names]
     if set(kinds) == {"whole"}:
         pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes the largest
         spec = _spec(pixels, oiio.UINT32, header)
@@ -242,19 +187,19 @@ def _exr_part(
         spec = _spec(pixels, formats[0] if len(set(formats)) == 1 else oiio.FLOAT, header)
         if len(set(formats)) > 1:
             spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
-    spec.channelnames = tuple(channel for name in names for channel in LAYERS[name].names)
+    spec.channelnames = tuple(channel for name in names for channel in CHANNELS[name].names)
     if "alpha" in names:
         spec.alpha_channel = spec.channelnames.index("A")
     deflated = encoding.compression.startswith("zip")
     spec.attribute("compression", f"{encoding.compression}:{_EXR_LEVEL}" if deflated else encoding.compression)
     if named:
-        spec.attribute("oiio:subimagename", LAYERS[names[0]].part)
+        spec.attribute("oiio:subimagename", CHANNELS[names[0]].part)
     _add_matrices(spec, header)
     return np.ascontiguousarray(pixels), spec
 
 
 def _check_floats(name: str, plane: NDArray[Any]) -> None:
-    if LAYERS[name].kind == "whole" and plane.max(initial=0) > _LARGEST_FLOAT_INDEX:
+    if CHANNELS[name].kind == "whole" and plane.max(initial=0) > _LARGEST_FLOAT_INDEX:
         raise InputError(
             f"--channels {name}: the largest is {plane.max():,}, more than a float holds exactly; use --parts several, "
             "where it is a whole number"
@@ -262,10 +207,10 @@ def _check_floats(name: str, plane: NDArray[Any]) -> None:
 
 
 def _picture(
-    extension: str, layers: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
 ) -> tuple[NDArray[Any], Any]:
-    planes = [_planes(plane) for plane in layers.values()]
-    if extension == ".png" and "alpha" in layers:
+    planes = [np.atleast_3d(plane) for plane in channels.values()]
+    if extension == ".png" and "alpha" in channels:
         planes = [unassociate(np.concatenate(planes, axis=2))]
     bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
     whole = steps_of(planes, bits)
@@ -282,10 +227,6 @@ def _picture(
     return whole, spec
 
 
-def _planes(plane: NDArray[Any]) -> NDArray[Any]:
-    return plane[:, :, None] if plane.ndim == 2 else plane
-
-
 def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, kind)
@@ -293,10 +234,14 @@ def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
     return spec
 
 
-def deep_spec(width: int, height: int, header: Header) -> Any:
-    """The spec of a deep EXR, without its channels and their formats."""
-    spec = oiio.ImageSpec(width, height, 1, oiio.FLOAT)
+def deep_spec(width: int, height: int, encoding: Encoding, header: Header) -> Any:
+    """OpenImageIO's specification of a deep EXR: colours are half or float as the encoding says, depths are float."""
+    spec = oiio.ImageSpec(width, height, len(DEEP), oiio.FLOAT)
     spec.deep = True
+    spec.channelnames = DEEP
+    spec.channelformats = (oiio.TypeDesc(encoding.depth),) * 4 + (oiio.TypeDesc("float"),) * 2
+    spec.alpha_channel, spec.z_channel = 3, 4
+    spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
     _add_header(spec, header)
     _add_matrices(spec, header)
     return spec
@@ -312,8 +257,6 @@ def _add_header(spec: Any, header: Header) -> None:
         spec.x, spec.y = header.window.x, header.window.y
         spec.full_x = spec.full_y = 0
         spec.full_width, spec.full_height = header.window.width, header.window.height
-    if header.pixel_aspect != 1.0:
-        spec.attribute("PixelAspectRatio", float(header.pixel_aspect))
     if header.chromaticities:
         spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(header.chromaticities))
     spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +110,6 @@ class Colours:
         space that it lacks, with the names that are near."""
         config = config or ColourConfig()
         self._source = config.ocio_config or os.environ.get("OCIO", "") or BUILT_IN
-        self._loaded: Any = None
         self._matrices: dict[tuple[str, str], Float32 | None] = {}
         flag = "--model-colorspace" if config.model_colorspace else "the model's colour space"
         self.model = self._known(config.model_colorspace or recorded, flag)
@@ -129,46 +129,44 @@ class Colours:
         if space in _NAMES:
             return True
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]], np.float32)
-        found = self.convert(light, None, LINEAR, space)[0]
-        one, rest = found[:3][np.eye(3, dtype=bool)], found[:3][~np.eye(3, dtype=bool)]
-        return bool(np.allclose(rest, 0, atol=2e-3) and np.allclose([*one, *found[3]], found[3, 0], atol=2e-3))
+        colours = self.convert(light, None, LINEAR, space)[0]
+        one, rest = colours[:3][np.eye(3, dtype=bool)], colours[:3][~np.eye(3, dtype=bool)]
+        return bool(np.allclose(rest, 0, atol=2e-3) and np.allclose([*one, *colours[3]], colours[3, 0], atol=2e-3))
 
     def check_file(self, path: str, extension: str, video: str) -> None:
-        """Raise InputError where a file of that extension would be shown in other colours than it holds: whole numbers
-        of light in linear values, and a video, whose extension is `video`, that is not in Rec.709."""
+        """Raise InputError where a file of that extension would be shown in other colours than it holds. Whole numbers
+        are not for linear light, and a video, whose extension is `video`, has to be in Rec.709."""
         advice = "write .exr, or give --colorspace sRGB"
         if extension != ".exr" and self.is_linear(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, which is linear, expected sRGB; {advice}")
         if extension == video and not self.has_rec709(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, expected sRGB's primaries; {advice}")
 
-    @property
+    @cached_property
     def _config(self) -> Any:
-        if self._loaded is None:
-            loaded = oiio.ColorConfig(self._source)
-            if reason := loaded.geterror():
-                raise InputError(f"{self._source}: no OpenColorIO configuration: {' '.join(reason.split())}")
-            self._loaded = loaded
-        return self._loaded
+        config = oiio.ColorConfig(self._source)
+        if reason := config.geterror():
+            raise InputError(f"{self._source}: no OpenColorIO configuration: {' '.join(reason.split())}")
+        return config
 
     def _known(self, name: str, flag: str) -> str:
-        for own, names in _NAMES.items():
-            if name.lower() in {each.lower() for each in names}:
-                return own
-        found = self._config.resolve(name)
-        if self._config.getColorSpaceIndex(found) < 0:
-            spaces = {each.lower(): each for each in self._config.getColorSpaceNames()}
-            for each in list(spaces.values()):
-                spaces.update({alias.lower(): each for alias in self._config.getAliases(each)})
-            near = dict.fromkeys(spaces[each] for each in get_close_matches(name.lower(), spaces, 5, 0.4))
-            there = (
+        for space, names in _NAMES.items():
+            if name.lower() in {alias.lower() for alias in names}:
+                return space
+        resolved = self._config.resolve(name)
+        if self._config.getColorSpaceIndex(resolved) < 0:
+            spaces = {listed.lower(): listed for listed in self._config.getColorSpaceNames()}
+            for listed in list(spaces.values()):
+                spaces.update({alias.lower(): listed for alias in self._config.getAliases(listed)})
+            near = dict.fromkeys(spaces[word] for word in get_close_matches(name.lower(), spaces, 5, 0.4))
+            advice = (
                 f"near it are {', '.join(near)}" if near else f"it has {examples(self._config.getColorSpaceNames())}"
             )
-            raise InputError(f"{flag} {name}: not in the configuration {self._source}; {there}")
-        for own, names in _NAMES.items():
-            if any(self._config.resolve(each) == found for each in names):
-                return own
-        return str(found)
+            raise InputError(f"{flag} {name}: not in the configuration {self._source}; {advice}")
+        for space, names in _NAMES.items():
+            if any(self._config.resolve(alias) == resolved for alias in names):
+                return space
+        return str(resolved)
 
     def _ocio_name(self, space: str) -> str:
         """The space's name in the configuration. Raises InputError where it has no linear Rec.709."""
@@ -210,9 +208,9 @@ class Colours:
         """(3, 3), a row for each channel of the source; None where one does not do. Each conversion by OpenImageIO
         loads the configuration anew, which takes longer than a frame."""
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [4, -1, 2], [0.2, 0.01, 0.5]]], np.float32)
-        found = self._converted(light, source, target)
-        exact = np.allclose(light[0, 3:] @ found[0, :3], found[0, 3:], rtol=1e-5, atol=1e-5)  # of float32 sums up to 4
-        return found[0, :3] if exact else None
+        colours = self._converted(light, source, target)
+        matrix, sums = colours[0, :3], colours[0, 3:]
+        return matrix if np.allclose(light[0, 3:] @ matrix, sums, rtol=1e-5, atol=1e-5) else None  # sums up to 4
 
     def _converted(self, rgb: Float32, source: str, target: str) -> Float32:
         pixels = oiio.ImageBuf(np.ascontiguousarray(rgb, np.float32))

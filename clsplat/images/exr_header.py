@@ -20,7 +20,6 @@ class Header:
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
     matrices: Mapping[str, Float64] = field(default_factory=dict)
     window: Window | None = None
-    pixel_aspect: float = 1.0
     chromaticities: Sequence[float] = ()
     is_srgb: bool = True
 
@@ -29,9 +28,9 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
     """worldToCamera and worldToNDC of row vectors, as OpenEXR defines them, for a camera that has an image plane; none
     for others.
 
-    In the camera's space x is right, y up and z along the view, a left-handed frame. NDC: (0, 0) is the upper left
-    corner of the display window, (1, 1) the lower right one; z, of which OpenEXR says nothing, is 0 at the near plane
-    and 1 at infinity, or of an orthographic camera at its far plane; if that has none, 1 more a world unit.
+    In the camera's space x is right, y up and z along the view, a left-handed frame. In NDC (0, 0) is the upper left
+    corner of the display window, and (1, 1) the lower right one. OpenEXR says nothing of z: here it is 0 at the near
+    plane and 1 at infinity. Of an orthographic camera it is 1 at the far plane, or without one grows by 1 a world unit.
     """
     if camera.projection not in ("perspective", "orthographic"):
         return {}

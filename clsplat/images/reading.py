@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading, writing and scaling pictures, through OpenImageIO.
+"""Reading and scaling pictures, through OpenImageIO.
 
 In memory a picture is float32 (H, W, C), C = 3 (RGB) or 4 (RGBA), with *straight* (unassociated) alpha whatever the
 file has, in the file's own colour space: nothing is linearised. In files alpha is what OpenImageIO writes:
@@ -11,7 +11,8 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,7 @@ from scipy import sparse
 
 from clsplat.arrays import Float32
 from clsplat.errors import InputError, examples, reason_of
-from clsplat.files import (
-    is_file,
-    native_name,
-    open_input,
-)
+from clsplat.files import is_file, native_name, open_input
 from clsplat.images.alpha import associate, unassociate
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
@@ -36,6 +33,7 @@ MAX_PIXELS = 1 << 28
 FREE_FLOATS, FLOATS_A_BYTE = 48 << 20, 4096
 """Channel values that a picture may have whatever its file's length is, and for each byte of it. Both are more than any
 real picture has, compressed, as deflate makes at most 1032 bytes of one."""
+_ROWS = 64
 MAX_FILE_BYTES, FREE_FILE_BYTES = 1 << 30, 1 << 26
 SIGNATURES = (
     *(PNG_SIGNATURE, b"\xff\xd8\xff", b"\x76\x2f\x31\x01", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"#?"),
@@ -59,9 +57,9 @@ _COLOUR = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE)
 def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) -> set[Path]:
     """Those of `paths` that go with one of the pictures and are none: masks, depths, normals and the like.
 
-    They are told by name: a picture's own with such a word behind it (r_0_depth_0001.png) or before it (mask_r_0.png),
-    in place of "color" (frame-1.color.jpg, frame-1.depth.png), or with .png behind its extension (COLMAP's masks); and
-    whatever is in a sub-folder of `folder` that is called by such a word.
+    Their names tell. Such a word stands behind a picture's name (r_0_depth_0001.png), before it (mask_r_0.png) or in
+    place of "color" (frame-1.color.jpg, frame-1.depth.png). COLMAP's masks have .png behind the picture's extension.
+    Whatever is in a sub-folder of `folder` that is called by such a word counts too.
     """
     pictures = list(pictures)
 
@@ -96,7 +94,7 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     """All pictures (by extension) under `folder`, if `deep` with its sub-folders, sorted; hidden files and folders are
     left out, and links that lead nowhere. Links to folders are followed, to each folder once. Raises InputError for a
     folder that cannot be read."""
-    found: list[Path] = []
+    paths: list[Path] = []
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
         real = os.path.realpath(root)  # not the inode: some file systems of Windows number every folder 0
@@ -105,12 +103,12 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
             continue
         seen.add(real)
         folders[:] = sorted(name for name in folders if deep and not name.startswith("."))
-        found += [
+        paths += [
             path
             for path in (Path(root, name) for name in files)
             if not path.name.startswith(".") and path.suffix.lower() in EXTENSIONS and is_file(path)
         ]
-    return sorted(found)
+    return sorted(paths)
 
 
 def cannot_be_searched(error: OSError) -> None:
@@ -130,7 +128,7 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
 
     Raises InputError for a file that is missing, no picture, or a PNG that is cut short.
     """
-    source = _open(path)
+    source = open_image(path, straight=True)
     spec = source.spec()
     source.close()
     width, height = spec.full_width, spec.full_height
@@ -152,7 +150,7 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
     Raises InputError, naming the file and the decoder's reason, for a file that is missing, no picture, damaged, cut
     short, of another kind of channels, or with values that are not finite.
     """
-    source = _open(path)
+    source = open_image(path, straight=True)
     spec = source.spec()
     if source.format_name() == "png":
         _check_png_is_whole(path)
@@ -192,23 +190,20 @@ def downscale(image: Float32, width: int, height: int) -> Float32:
     return unassociate(result) if has_alpha else result
 
 
-def _open(path: Path) -> Any:
+def open_image(path: Path, *, straight: bool = False) -> Any:
+    """OpenImageIO's input of a file, whose header makes sense. straight: alpha, where the format has it so. Raises
+    InputError."""
     if not is_file(path):
         raise InputError(f"{path}: no such image file")
     hints = oiio.ImageSpec()
-    hints.attribute("oiio:UnassociatedAlpha", 1)
-    return open_image(path, hints)
-
-
-def open_image(path: Path, hints: Any = None) -> Any:
-    """OpenImageIO's input of a file, whose header makes sense. Raises InputError."""
+    if straight:
+        hints.attribute("oiio:UnassociatedAlpha", 1)
     size = path.stat().st_size
     with open_input(path, "a picture") as file:
         known = file.read(8).startswith(SIGNATURES)
     if size > MAX_FILE_BYTES or (size > FREE_FILE_BYTES and not known):
         raise InputError(f"{path}: has {size} bytes and does not begin as a picture, expected at most {MAX_FILE_BYTES}")
-    name = native_name(path)
-    source = oiio.ImageInput.open(name, hints) if hints is not None else oiio.ImageInput.open(name)
+    source = oiio.ImageInput.open(native_name(path), hints)
     if source is None:
         raise InputError(f"{path}: does not decode: {one_line(error_of(oiio))}; expected an image")
     spec = source.spec()
@@ -222,6 +217,29 @@ def open_image(path: Path, hints: Any = None) -> Any:
             f"{spec.full_width} x {spec.full_height}, in {size} bytes; is it damaged?"
         )
     return source
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """OpenImageIO's input of a file, None where that is none. Its messages are not looked at."""
+    source = oiio.ImageInput.open(native_name(path))
+    try:
+        yield source
+    finally:
+        (source or oiio).geterror()
+        if source is not None:
+            source.close()
+
+
+def decodes(source: Any, part: int, first: int) -> bool:
+    """True if the rows of an input's part decode, from the picture's row `first` on. They are read a few at a time."""
+    spec = source.spec()
+    for top in range(spec.y + first, spec.y + spec.height, _ROWS):
+        place = (part, 0, top, min(top + _ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
+        rows = source.read_native_deep_scanlines(*place) if spec.deep else source.read_scanlines(*place, oiio.FLOAT)
+        if rows is None or source.geterror():
+            return False
+    return True
 
 
 def error_of(source: Any) -> str:

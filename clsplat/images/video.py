@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterable
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
@@ -64,9 +63,17 @@ def check_size(path: Path, width: int, height: int) -> None:
         )
 
 
-def yuv420(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(3 H / 2, W): luma, below it chroma at half the size, as PyAV takes them, of (H, W, 3) in [0, 1]; sizes rounded
-    up to even ones. Rec.709, limited range, chroma sited at the left as in H.264. FFmpeg's own is darker by a level."""
+def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """(3 H / 2, W): luma, below it chroma at half the size, as PyAV takes them; sizes rounded up to even ones. Rec.709,
+    limited range, chroma sited at the left as in H.264. FFmpeg's own is darker by a level.
+
+    image: (H, W, 3), floats as they are to be displayed, clipped to [0, 1], NaN as 0, or uint8. Raises ValueError for
+    another shape."""
+    pixels = np.asarray(image)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
+        raise ValueError(f"frame {pixels.shape}: expected (H, W, 3)")
+    values = pixels / np.float32(255) if pixels.dtype == np.uint8 else np.clip(np.nan_to_num(pixels), 0, 1)
+    rgb = values.astype(np.float32, copy=False)
     height, width, _ = rgb.shape
     rgb = np.pad(rgb, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     luma = rgb @ np.array(_LUMA, np.float32)
@@ -86,17 +93,6 @@ def rate_of(fps: float) -> Fraction:
     if fps != round(fps) and abs(float(ntsc) - fps) < near:
         return ntsc
     return Fraction(fps).limit_denominator(1001)
-
-
-def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """`yuv420` of (H, W, 3), floats as they are to be displayed, clipped to [0, 1], NaN as 0, or uint8.
-
-    Raises ValueError for another shape."""
-    pixels = np.asarray(image)
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
-        raise ValueError(f"frame {pixels.shape}: expected (H, W, 3)")
-    values = pixels / np.float32(255) if pixels.dtype == np.uint8 else np.clip(np.nan_to_num(pixels), 0, 1)
-    return yuv420(values.astype(np.float32, copy=False))
 
 
 class VideoWriter:
@@ -122,15 +118,11 @@ class VideoWriter:
     def __enter__(self) -> VideoWriter:  # noqa: PYI034  # Self came with 3.11
         return self
 
-    def add(self, image: NDArray[Any]) -> None:
-        """Append a frame, as `frame_planes` takes it; all of one size.
+    def add(self, planes: NDArray[np.uint8]) -> None:
+        """Append a frame as `frame_planes` gives it; all of one size.
 
         Raises ClsplatError if writing fails, ValueError for a frame of another size.
         """
-        self.add_planes(frame_planes(image))
-
-    def add_planes(self, planes: NDArray[np.uint8]) -> None:
-        """Add a frame from what `frame_planes` gives."""
         size = planes.shape[0] * 2 // 3, planes.shape[1]
         if self.frames and size != self._size:
             raise ValueError(f"frame {size}: expected {self._size}, the size of the first")
@@ -199,11 +191,3 @@ class VideoWriter:
         with open(self._temporary, "r+b") as file:  # Windows flushes only what may be written to
             os.fsync(file.fileno())
         replace(self._temporary, self._target)
-
-
-def write_video(path: Path, frames: Iterable[NDArray[Any]], config: VideoConfig | None = None) -> int:
-    """Write all frames, see `VideoWriter`; returns how many."""
-    with VideoWriter(Path(path), config) as video:
-        for frame in frames:
-            video.add(frame)
-        return video.frames

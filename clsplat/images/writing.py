@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import OpenImageIO as oiio
@@ -17,27 +17,18 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError, WriteError, plain
 from clsplat.files import is_file, native_name, replace, require_room, room_error, temporary_name, write_error
-from clsplat.images.alpha import associate, unassociate
-from clsplat.images.reading import one_line, png_is_whole
+from clsplat.images.alpha import associate
+from clsplat.images.reading import decodes, one_line, opened, png_is_whole
 
-Metadata = Mapping[str, str | int | float]
 CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
-def write_image(
-    path: Path,
-    image: NDArray[Any],
-    metadata: Metadata | None = None,
-    *,
-    alpha: Literal["straight", "associated"] = "straight",
-    half: bool = False,
-) -> None:
+def write_image(path: Path, image: NDArray[Any]) -> None:
     """Write a picture, atomically: 8-bit PNG or float EXR, by the extension.
 
-    image (H, W) or (H, W, C), C = 1, 3 or 4; floats, in a PNG clipped to [0, 1] and rounded, or uint8. alpha: what
-    kind of RGBA is given; the file gets what its format wants. half: 16-bit floats in the EXR. metadata goes into the
-    header under its own names. Raises InputError for another extension or a folder that does not exist, ClsplatError
-    if writing fails (disk full); the previous file is whole then, and no temporary file is left.
+    image (H, W) or (H, W, C), C = 1, 3 or 4, with straight alpha; floats, in a PNG clipped to [0, 1] and rounded, or
+    uint8. Raises InputError for another extension or a folder that does not exist, ClsplatError if writing fails (disk
+    full). The previous file is whole then, and no temporary file is left.
     """
     path = Path(path)
     extension = path.suffix.lower()
@@ -54,18 +45,15 @@ def write_image(
     pixels = pixels.astype(np.float32)
 
     is_png = extension == ".png"
-    if pixels.shape[2] == 4 and (alpha == "straight") != is_png:
-        pixels = unassociate(pixels) if is_png else associate(pixels)
     if is_png:
         pixels = steps_of([pixels], 8)
+    elif pixels.shape[2] == 4:
+        pixels = associate(pixels)
     height, width, channels = pixels.shape
-    kind = oiio.UINT8 if is_png else oiio.HALF if half else oiio.FLOAT
-    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8 if is_png else oiio.FLOAT)
     spec.channelnames = CHANNEL_NAMES[channels]
     if is_png:
         spec.attribute("oiio:UnassociatedAlpha", 1)
-    for name, value in (metadata or {}).items():
-        spec.attribute(name, value)
     write_spec(path, [np.ascontiguousarray(pixels)], [spec], extension[1:])
 
 
@@ -95,28 +83,25 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
             output.take(output.file.write_image(pixels))
 
 
+def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int]]) -> None:
+    """Write a file of one part from the top as its rows come, atomically. pieces: pixels, or OpenImageIO's deep data,
+    and how many rows they are. Raises ClsplatError if writing fails."""
+    with atomic_output(path, [spec], kind) as output:
+        write = output.file.write_deep_scanlines if spec.deep else output.file.write_scanlines
+        row = spec.y
+        for pixels, count in pieces:
+            output.take(write(row, row + count, 0, pixels))
+            row += count
+
+
 def _is_whole(path: Path, kind: str, parts: int) -> bool:
     """True if the end of a picture that has been written is there: the last chunk of a PNG, the last row of others."""
     if kind == "png":
         return png_is_whole(path)
-    source = oiio.ImageInput.open(native_name(path))
-    if source is None:
-        oiio.geterror()
-        return False
-    try:
-        for part in range(parts):
-            if not source.seek_subimage(part, 0):
-                return False
-            spec = source.spec()
-            read = source.read_native_deep_scanlines if spec.deep else source.read_scanlines
-            last = spec.y + spec.height - 1
-            values = read(part, 0, last, last + 1, 0, 0, spec.nchannels, *(() if spec.deep else (oiio.FLOAT,)))
-            if values is None or source.geterror():
-                return False
-        return True
-    finally:
-        source.geterror()
-        source.close()
+    with opened(path) as source:
+        return source is not None and all(
+            source.seek_subimage(part, 0) and decodes(source, part, source.spec().height - 1) for part in range(parts)
+        )
 
 
 def jpeg_room(spec: Any) -> int:

@@ -14,7 +14,7 @@ _HALF_LOG2E = 0.5 * math.log2(math.e)
 
 def kernel_defines(config: RasterizerConfig) -> dict[str, object]:
     """The defines that make the kernels do as `config` says; only for what differs from the default."""
-    default = RasterizerConfig()
+    config, default = config.switches(), RasterizerConfig()
     defines: dict[str, object] = {}
     if config.extent == "3sigma":
         # Within a tile whole cells are skipped, so that what is cut would depend on the kernels' shape.

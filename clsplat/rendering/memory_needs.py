@@ -75,6 +75,7 @@ def _plan(
     features: int = 0,
     more: int = 0,
 ) -> Plan:
+    switches = config.switches()
     planes = loss = 0
     for camera in cameras:
         tiles_x, tiles_y = tiles_of(camera)
@@ -96,7 +97,7 @@ def _plan(
         planes=planes + loss,
         loss=loss,
         scratch=scratch_bytes(device, longest) + _SMALL,
-        sorts_pairs=config.depth_sort == "pairs",
-        extra=statistics + 4 * features + (0 if config.frustum_cull and config.opacity_cull else 4),
+        sorts_pairs=switches.depth_sort == "pairs",
+        extra=statistics + 4 * features + (0 if switches.frustum_cull and switches.opacity_cull else 4),
     )
     return plan(need, device.budget, device.max_allocation, device.row_alignment)

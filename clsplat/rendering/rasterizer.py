@@ -93,6 +93,7 @@ class Rasterizer:
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
+        self._switches = self.config.switches()
         switches = {**device.switches, **kernel_defines(self.config)}
         self.device = device.with_switches(switches)
         self._by_projection = {
@@ -102,7 +103,7 @@ class Rasterizer:
         # What `count` reads each time, with room for what training counts beside it: one copy for both.
         self.found = allocate(device, (4 + len(REFUSED),), np.uint32)
         self.found.fill(0)
-        self._all_bits = self.config.key_bits == "all"
+        self._all_bits = self._switches.key_bits == "all"
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS)
 
     def follow(self, plan: Plan) -> None:
@@ -131,7 +132,7 @@ class Rasterizer:
             del part  # its arrays may have to make room for larger ones
             part = self._part(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
             size = (camera.width, camera.height)
-            record = backward and len(bands) == 1 and self.config.record_cells
+            record = backward and len(bands) == 1 and self._switches.record_cells
             blended = blend(
                 device,
                 work,
@@ -205,7 +206,7 @@ class Rasterizer:
     ) -> Part:
         work = self.work
         counted = counted or count_band(device, work, projected, tiles, band, all_bits=self._all_bits)
-        listing = duplicate_and_sort if self.config.depth_sort == "pairs" else duplicate
+        listing = duplicate_and_sort if self._switches.depth_sort == "pairs" else duplicate
         pairs = listing(device, work, projected.splats, counted, tiles, band)
         return Part(band, counted, pairs, tile_lists(device, work, pairs, band.tiles, all_bits=self._all_bits))
 

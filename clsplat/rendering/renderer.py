@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.rendering.sh_storage import check_half, coefficients_in_use, needed_degrees
-from clsplat.stages.channels import WIDTHS, Features
+from clsplat.stages.channels import Features
 from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import AnyGaussians, HostGaussians, ShStorage, host_gaussians, upload_gaussians
@@ -35,17 +36,10 @@ class RenderResult:
     alpha: Float32
 
 
-@dataclass(frozen=True, eq=False)
-class ChannelResult:
-    """depth, median, first (H, W) float32, along the camera's axis; count, index (H, W) int32, index -1 for nothing;
-    fields: normal and position (H, W, 3), in the world, motion (H, W, 2), in pixels, those that were asked for."""
-
-    depth: Float32
-    fields: dict[str, Float32]
-    median: Float32
-    first: Float32
-    count: NDArray[np.int32]
-    index: NDArray[np.int32]
+ChannelResult = dict[str, NDArray[Any]]
+"""Channels beside colour by their names in the kernels. depth, median, first (H, W) float32, along the camera's axis;
+count, index (H, W) int32, index -1 for nothing. normal and position (H, W, 3), in the world, and motion (H, W, 2), in
+pixels, are there if they were asked for."""
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
@@ -134,18 +128,11 @@ class Renderer:
         means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (found.means, found.whole))
         if contiguous:
             means, whole = np.ascontiguousarray(means), np.ascontiguousarray(whole)
-        fields = {name: means[:, :, at : at + WIDTHS[name]] for name, at in of.offsets.items()}
-        if "position" in fields and origin.any():  # in the world: float32 keeps what it can of that
-            shown = whole[:, :, :1] > 0
-            fields["position"] = np.where(shown, fields["position"] + origin, 0).astype(np.float32)
-        return self._result(frame, contiguous=contiguous), ChannelResult(
-            depth=fields.pop("depth")[:, :, 0],
-            fields=fields,
-            median=means[:, :, -2],
-            first=means[:, :, -1],
-            count=whole[:, :, 0],
-            index=whole[:, :, 1],
-        )
+        planes = of.named(means, whole)
+        if "position" in planes and origin.any():  # in the world: float32 keeps what it can of that
+            shown = planes["count"][:, :, None] > 0
+            planes["position"] = np.where(shown, planes["position"] + origin, 0).astype(np.float32)
+        return self._result(frame, contiguous=contiguous), planes
 
     def render_deep(self, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
         """(bins, H, W, 6): the view in slices by depth, the next of which begins at each of the bounds (bins - 1,):

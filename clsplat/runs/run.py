@@ -187,8 +187,8 @@ class Run:
 
     def checkpoints(self) -> list[tuple[int, Path]]:
         """Step and path of every checkpoint, by step."""
-        found = [(re.fullmatch(r"step-(\d+)\.npz", path.name), path) for path in self.checkpoints_path.glob("*.npz")]
-        return sorted((int(match[1]), path) for match, path in found if match)
+        matches = [(re.fullmatch(r"step-(\d+)\.npz", path.name), path) for path in self.checkpoints_path.glob("*.npz")]
+        return sorted((int(match[1]), path) for match, path in matches if match)
 
     def load_latest_checkpoint(self) -> Checkpoint | None:
         """The latest checkpoint that is whole; None where there is none at all.
@@ -197,9 +197,9 @@ class Run:
         resumes, metrics.jsonl is cut back to the checkpoint's step, and what a killed process left half-written is
         removed.
         """
-        found = self.checkpoints()
+        checkpoints = self.checkpoints()
         checkpoint: Checkpoint | None = None
-        for step, path in reversed(found):
+        for step, path in reversed(checkpoints):
             try:
                 checkpoint = read_checkpoint(path)
                 if checkpoint.step != step:
@@ -209,9 +209,9 @@ class Run:
             except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly anything for a flipped bit
                 why = str(error) or type(error).__name__
                 warnings.warn(plain(f"{path}: checkpoint is damaged and was passed over ({why})"), stacklevel=2)
-        if found and checkpoint is None:
+        if checkpoints and checkpoint is None:
             raise InputError(f"{self.checkpoints_path}: no checkpoint there is whole, use --overwrite to start again")
-        if checkpoint is None and (lost := max((each.get("step", 0) for each in self.read_metrics()), default=0)):
+        if checkpoint is None and (lost := max((record.get("step", 0) for record in self.read_metrics()), default=0)):
             warnings.warn(
                 plain(f"{self.path}: has no checkpoint: training begins again, the {lost} steps before are lost"),
                 stacklevel=2,
@@ -228,8 +228,8 @@ def model_file(path: Path) -> Path:
     InputError for a run without one."""
     if not path.is_dir():
         return path
-    if not is_run(path) and (found := model_path(path)) != path:
-        return found
+    if not is_run(path) and (model := model_path(path)) != path:
+        return model
     trained = Run.open(path)
     if not trained.model_path.exists():
         raise InputError(f"{trained.model_path}: no such file, the run has not written its model yet")
@@ -267,8 +267,8 @@ def owned_files(path: Path) -> list[Path]:
     patterns = ("checkpoints/step-*.npz", "trouble-step-*.npz", "test/**/*.png", "**/.*" + TEMPORARY_SUFFIX)
     # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
     names = ("model.ply", "metrics.jsonl", "eval.json", "report.html", "scene.json", "config.toml")
-    found = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
-    return [file for file in found if file.is_file() or file.is_symlink()]
+    files = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
+    return [file for file in files if file.is_file() or file.is_symlink()]
 
 
 def check_resumed(earlier: Run, config: TrainConfig) -> None:

@@ -88,7 +88,7 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """Differences between a scene and the one that a run has begun with, in few words each. With another --resolution
     sizes may differ, and files of another size stand in."""
     was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
-    told = [
+    changes = [
         _listed("not there any more", [name for name in was if name not in new]),
         _listed("new", [name for name in new if name not in was]),
     ]
@@ -106,12 +106,12 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
             other["another photograph"].append(name)
         if a["split"] != b["split"]:
             other["split"].append(name)
-    told += [_listed(what, other[what]) for what in ("another photograph", "another camera", "another size")]
-    told.append(_listed("held out in one and not in the other", other["split"]))
-    if earlier["points"] != now["points"] and not any(told):
+    changes += [_listed(what, other[what]) for what in ("another photograph", "another camera", "another size")]
+    changes.append(_listed("held out in one and not in the other", other["split"]))
+    if earlier["points"] != now["points"] and not any(changes):
         counts = f"{earlier['points']['count']:,} then, {now['points']['count']:,} now"
-        told.append(f"other points ({counts})")
-    return [each for each in told if each]
+        changes.append(f"other points ({counts})")
+    return [change for change in changes if change]
 
 
 def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool = False) -> bool:
@@ -123,20 +123,20 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
     if earlier is None:
         return False
     now = record_of(scene, resolution)
-    found = differences(earlier, now)
-    if found and not accept:
+    changes = differences(earlier, now)
+    if changes and not accept:
         raise InputError(
             plain(
-                f"{path}: is not the scene that {run.path} began with: {'; '.join(found)}; expected the same views and "
+                f"{path}: is not the scene that {run.path} began with: {'; '.join(changes)}; expected the same views "
             )
-            + "photographs; --accept-changes goes on with these"
+            + "and photographs; --accept-changes goes on with these"
         )
     if earlier["origin"] != now["origin"]:
         raise InputError(
             f"{path}: lies elsewhere in the world than the scene that {run.path} began with (numbers count from "
             f"{now['origin']}, not {earlier['origin']}), expected the same place; start a new run"
         )
-    return bool(found)
+    return bool(changes)
 
 
 def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
@@ -170,14 +170,14 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
         and was[view.name]["blake2b"] != short_digest(view.path)
     ]
-    told = []
+    reasons = []
     if seen:
-        told.append(f"{len(seen):,} of {len(views):,} views were trained on ({examples(seen)}): they score too well")
+        reasons.append(f"{len(seen):,} of {len(views):,} views were trained on ({examples(seen)}): they score too well")
     if changed:
-        told.append(_listed("with another photograph than at the training", changed))
+        reasons.append(_listed("with another photograph than at the training", changed))
     if was and not known:
-        told.append(f"none of the views is of the scene that {run.path} began with")
-    return told
+        reasons.append(f"none of the views is of the scene that {run.path} began with")
+    return reasons
 
 
 def _close(a: list[float], b: list[float]) -> bool:

@@ -3,18 +3,20 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import warnings
 from dataclasses import asdict, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_origin, get_type_hints
 
-import numpy as np
 import tomli_w
 
 import clsplat
+from clsplat.config.checks import misfit
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
 from clsplat.files import read_document
@@ -28,8 +30,14 @@ else:
 MAX_SETTINGS, MAX_METRICS, MAX_LINE = 1 << 20, 64 << 20, 1 << 16
 """Bytes of config.toml, of metrics.jsonl, hundreds of times what the longest training writes, and of a line of it."""
 T = TypeVar("T")
-RETIRED: dict[str, Any] = {"train.rasterizer.sh_angle": 0.0}
+RETIRED: dict[str, Any] = {"train.rasterizer.sh_angle": 0.0} | {
+    f"train.rasterizer.{name}": value
+    for name, value in vars(BenchSwitches()).items()
+    if name not in vars(RasterizerConfig())
+}
 """Settings that earlier versions had, and the value of each with which it did nothing."""
+_RETIRED_VALUES = {("train.rasterizer.extent", "constant")}
+"""Values that settings had in earlier versions. In place of each there is the default."""
 
 
 def config_text(config: TrainConfig, scene: Path | None) -> str:
@@ -37,17 +45,8 @@ def config_text(config: TrainConfig, scene: Path | None) -> str:
     document: dict[str, Any] = {"clsplat": clsplat.__version__}
     if scene is not None:
         document["scene"] = str(scene)
-    document["train"] = _of_python(asdict(config))
+    document["train"] = json.loads(json.dumps(asdict(config), default=lambda number: number.item()))  # no NumPy
     return tomli_w.dumps(document)
-
-
-def _of_python(value: Any) -> Any:
-    """Settings without NumPy's numbers, which TOML does not know."""
-    if isinstance(value, dict):
-        return {key: _of_python(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_of_python(each) for each in value]
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
@@ -55,9 +54,9 @@ def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
     return parse_config(read_document(path, "the settings of a run", MAX_SETTINGS), path)
 
 
-def parse_config(text: str, path: Path, *, tell: bool = True) -> tuple[TrainConfig, Path | None]:
-    """The configuration and the scene's path from the file's text (see `read_config`). tell: warn of settings that
-    there are no more."""
+def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
+    """The configuration and the scene's path from the file's text (see `read_config`). A warning names the settings of
+    earlier versions that are passed over."""
     try:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -70,7 +69,10 @@ def parse_config(text: str, path: Path, *, tell: bool = True) -> tuple[TrainConf
     scene = document.get("scene")
     if scene is not None and not (isinstance(scene, str) and scene):
         raise InputError(f"{path}: scene is {scene!r}, expected the scene's path as text")
-    config = _from_table(TrainConfig, document.get("train", {}), path, "train", tell=tell)
+    passed_over: list[str] = []
+    config = _from_table(TrainConfig, document.get("train", {}), path, "train", passed_over)
+    if passed_over:
+        _warn_once(plain(f"{path}: passed over, as this version has no such setting: {', '.join(passed_over)}"))
     try:
         config.check()
     except InputError as error:
@@ -78,24 +80,29 @@ def parse_config(text: str, path: Path, *, tell: bool = True) -> tuple[TrainConf
     return config, Path(scene) if scene is not None else None
 
 
-def _from_table(cls: type[T], table: Any, path: Path, where: str, *, tell: bool) -> T:
-    """An instance of the dataclass `cls`; keys that are not there keep their defaults."""
+def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: list[str]) -> T:
+    """An instance of the dataclass `cls`; keys that are not there keep their defaults. Settings of earlier versions
+    are added to `passed_over`, where they did something."""
     if not isinstance(table, dict):
         raise InputError(f"{path}: {where} is {table!r}, expected a table")
     types = get_type_hints(cls)
     names = [f.name for f in fields(cls)]  # type: ignore[arg-type]  # every caller passes a dataclass
     values = {}
     for key, value in table.items():
-        if (name := f"{where}.{key}") in RETIRED:
-            if value != RETIRED[name] and tell:
-                _tell_retired(path, name, repr(value))
+        name = f"{where}.{key}"
+        if name in RETIRED or (isinstance(value, str) and (name, value) in _RETIRED_VALUES):
+            if value != RETIRED.get(name):
+                passed_over.append(f"{name} = {value!r:.100}")
             continue
         if key not in names:
             raise InputError(f"{path}: [{where}] has {key!r}, which is no setting there; {_meant(key, where)}")
         if is_dataclass(types[key]):
-            values[key] = _from_table(types[key], value, path, f"{where}.{key}", tell=tell)
+            values[key] = _from_table(types[key], value, path, name, passed_over)
         else:
-            values[key] = _value(types[key], value, f"{path}: {where}.{key}")
+            if expected := misfit(types[key], value):
+                raise InputError(f"{path}: {name} is {value!r:.100}, expected {expected}")
+            kind = get_origin(types[key]) or types[key]
+            values[key] = kind(value) if kind in (float, tuple) else value
     return cls(**values)
 
 
@@ -115,23 +122,6 @@ def _meant(key: str, where: str) -> str:
 
 
 @cache
-def _tell_retired(path: Path, name: str, value: str) -> None:
-    """A warning, once for a file however often it is read."""
-    warnings.warn(plain(f"{path}: {name} is {value} there and is passed over, this version has no such setting"))
-
-
-def _value(kind: Any, value: Any, what: str) -> Any:
-    """`value`, as TOML gives it, for a field of type `kind`."""
-    if get_origin(kind) is Literal:
-        if value in get_args(kind):
-            return value
-        raise InputError(f"{what} is {value!r}, expected one of {', '.join(map(str, get_args(kind)))}")
-    if get_origin(kind) is tuple:
-        if isinstance(value, list):
-            return tuple(_value(get_args(kind)[0], item, what) for item in value)
-    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300:
-        return float(value)
-    elif type(value) is kind and not (kind is int and abs(value) >= 1 << 62):
-        return value
-    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
-    raise InputError(f"{what} is {value!r}, expected {words.get(kind, 'a list of whole numbers')}")
+def _warn_once(text: str) -> None:
+    """A warning, once however often a file is read."""
+    warnings.warn(text)

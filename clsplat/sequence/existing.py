@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
 from clsplat.errors import InputError, reason_of
-from clsplat.files import abandoned
-from clsplat.images import channels as layers
-from clsplat.sequence.settings_digest import SETTINGS
-from clsplat.sequence.task import RenderOptions, Task, picture_camera, settings_digest
+from clsplat.files import abandoned, is_file
+from clsplat.images.channels import attribute, is_foreign, is_whole
+from clsplat.sequence.task import SETTINGS, RenderOptions, Task, picture_camera, settings_digest
 
 MOST_WRITERS = 8
 WHAT_IT_IS = ("clsplat:model", "clsplat:colorspace")
@@ -23,11 +22,11 @@ WHAT_IT_IS = ("clsplat:model", "clsplat:colorspace")
 def check_folders(tasks: Sequence[Task]) -> None:
     """Raise InputError where a file's folder is none, cannot be made or cannot be written to; makes nothing."""
     for folder in sorted({task.path.parent for task in tasks}):
-        there = next(each for each in (folder, *folder.parents) if each.exists())
-        if not there.is_dir():
-            raise InputError(f"{there}: is a file, expected a folder to write {folder} to")
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(f"{there}: is not writable, expected a folder to write frames to")
+        nearest = next(path for path in (folder, *folder.parents) if path.exists())
+        if not nearest.is_dir():
+            raise InputError(f"{nearest}: is a file, expected a folder to write {folder} to")
+        if not os.access(nearest, os.W_OK | os.X_OK):
+            raise InputError(f"{nearest}: is not writable, expected a folder to write frames to")
     for task in tasks:
         if task.path.is_dir():
             raise InputError(f"{task.path}: is a folder, expected the name of a file")
@@ -51,33 +50,37 @@ def remove_temporaries(tasks: Sequence[Task]) -> None:
 
 def is_complete(task: Task, options: RenderOptions) -> bool:
     """True if the frame's file is there: of its size, channels, model and settings, and readable to its end."""
-    told = {name: value for name, value in options.attributes.items() if name in WHAT_IT_IS}
-    told[SETTINGS] = settings_digest(task, options)
+    attributes = {name: value for name, value in options.attributes.items() if name in WHAT_IT_IS}
+    attributes[SETTINGS] = settings_digest(task, options)
     camera, deep = picture_camera(task, options), options.deep is not None
-    return layers.is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, told, deep=deep)
+    return is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, attributes, deep=deep)
 
 
 def complete(tasks: Sequence[Task], options: RenderOptions) -> set[int]:
     """The numbers of the frames that `--skip-existing` leaves out."""
-    with ThreadPoolExecutor(MOST_WRITERS) as pool:
-        return {
-            task.number
-            for task, whole in zip(tasks, pool.map(lambda task: is_complete(task, options), tasks), strict=True)
-            if whole
-        }
+    return {task.number for task in _those(tasks, lambda task: is_complete(task, options))}
 
 
 def untold(tasks: Sequence[Task]) -> list[Path]:
     """The tasks' files that do not say with which settings they were made."""
+    return [task.path for task in _those(tasks, lambda task: attribute(task.path, SETTINGS) is None)]
+
+
+def foreign(tasks: Sequence[Task]) -> list[Path]:
+    """The tasks' files that are pictures of other programs than clsplat."""
+    return [task.path for task in _those(tasks, lambda task: is_file(task.path) and is_foreign(task.path))]
+
+
+def _those(tasks: Sequence[Task], condition: Callable[[Task], bool]) -> list[Task]:
+    """The tasks that meet a condition on their files; several files are read at once."""
     with ThreadPoolExecutor(MOST_WRITERS) as pool:
-        said = pool.map(lambda task: layers.attribute(task.path, SETTINGS), tasks)
-        return [task.path for task, value in zip(tasks, said, strict=True) if value is None]
+        return [task for task, met in zip(tasks, pool.map(condition, tasks), strict=True) if met]
 
 
 def stamp(path: Path) -> tuple[int, ...] | None:
     """Mark that tells a file from one that takes its place; None for no file."""
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return None
-    return found.st_ino, found.st_mtime_ns, found.st_size
+    return status.st_ino, status.st_mtime_ns, status.st_size

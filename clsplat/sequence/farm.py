@@ -22,9 +22,9 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.files import digest
 from clsplat.gaussians import Gaussians
 from clsplat.sequence.existing import is_complete, remove_temporaries, stamp
-from clsplat.sequence.frame_renderer import Shader, open_shader
+from clsplat.sequence.frame_renderer import FrameRenderer, open_frame_renderer
 from clsplat.sequence.task import Record, RenderOptions, Task
-from clsplat.sequence.workers import HOST_BYTES, Result, encoded, frame_bytes, record_of, video_frame, write_frame
+from clsplat.sequence.workers import HOST_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
 
 if TYPE_CHECKING:
     from clsplat.images.video import VideoWriter
@@ -38,7 +38,7 @@ PATIENCE = 20
 
 
 @dataclass(frozen=True)
-class Scene:
+class WorkerJob:
     """Everything that a worker has to load. model: an absolute path, with the SHA-256 of its content; version: of
     clsplat."""
 
@@ -60,44 +60,42 @@ class Failure:
 
 
 class _Held:
-    """The one scene that this process has open, and the right to render with it."""
+    """The renderer that this process has open, of one job, and the right to render with it."""
 
     def __init__(self) -> None:
         self.turn, self.room = threading.Lock(), threading.Semaphore(HELD)
         self.key: tuple[Any, ...] | None = None
-        self.shader: Shader | None = None
+        self.renderer: FrameRenderer | None = None
 
-    def shader_for(self, scene: Scene) -> Shader:
-        key = (scene.model, scene.digest, scene.device, scene.memory_limit, repr(scene.options), repr(scene.rasterizer))
-        if self.shader is None or key != self.key:
-            self.key = self.shader = None  # its memory is free before the next takes some
-            gaussians = Gaussians.load(scene.model)
-            if (found := digest(scene.model)) != scene.digest:
-                raise InputError(f"{scene.model}: has SHA-256 {found[:12]} on a worker, expected {scene.digest[:12]}")
-            self.shader = open_shader(
-                gaussians, scene.options, scene.rasterizer, device=scene.device, memory_limit=scene.memory_limit
+    def renderer_for(self, job: WorkerJob) -> FrameRenderer:
+        key = (job.model, job.digest, job.device, job.memory_limit, repr(job.options), repr(job.rasterizer))
+        if self.renderer is None or key != self.key:
+            self.key = self.renderer = None  # its memory is free before the next takes some
+            gaussians = Gaussians.load(job.model)
+            if (content := digest(job.model)) != job.digest:
+                raise InputError(f"{job.model}: has SHA-256 {content[:12]} on a worker, expected {job.digest[:12]}")
+            self.renderer = open_frame_renderer(
+                gaussians, job.options, job.rasterizer, device=job.device, memory_limit=job.memory_limit
             )
             self.key = key
-        return self.shader
+        return self.renderer
 
 
 _HELD = _Held()
 
 
-def render_frame(task: Task, scene: Scene) -> Result | Failure:
+def render_frame(task: Task, job: WorkerJob) -> Result | Failure:
     """Render a frame in a worker and write its file, unless a worker that was lost since has finished it; a frame of a
     video is returned, for the process that encodes it."""
     try:
-        if scene.version != clsplat.__version__:
-            raise InputError(f"a worker has clsplat {clsplat.__version__}, expected {scene.version}")
+        if job.version != clsplat.__version__:
+            raise InputError(f"a worker has clsplat {clsplat.__version__}, expected {job.version}")
         with _HELD.room:
             with _HELD.turn:
-                if not task.is_video and stamp(task.path) != task.before and is_complete(task, scene.options):
-                    return record_of(task, scene.options), None
-                shaded = _HELD.shader_for(scene)(task)
-            if task.is_video:
-                return video_frame(task, shaded, scene.options)
-            return write_frame(task, shaded, scene.options), None
+                if not task.is_video and stamp(task.path) != task.before and is_complete(task, job.options):
+                    return record_of(task, job.options), None
+                frame = _HELD.renderer_for(job)(task)
+            return encode_frame(task, frame, job.options)
     except (ClsplatError, OSError, MemoryError) as error:
         message = " ".join(str(error).split()) or type(error).__name__
         return Failure(message, isinstance(error, InputError))
@@ -105,7 +103,7 @@ def render_frame(task: Task, scene: Scene) -> Result | Failure:
 
 def render_on_farm(
     tasks: Sequence[Task],
-    scene: Scene,
+    job: WorkerJob,
     on_done: Callable[[Record], None],
     *,
     scheduler: str | None = None,
@@ -121,35 +119,35 @@ def render_on_farm(
     """
     if not tasks:
         return
-    if not scene.options.channels:
+    if not job.options.channels:
         raise ValueError("no channels")
     placed = [replace(task, path=task.path.absolute(), before=stamp(task.path)) for task in tasks]
     names = {task.number: str(task.path) for task in tasks}
     with _client(scheduler, workers) as client:
-        results = _results(client, placed, scene, video)
+        results = _results(client, placed, job, video)
         for record in encoded(placed, results, video):
             on_done(replace(record, path=names[record.frame]))
     # A worker that was killed while it wrote has left a file; none writes any more.
     remove_temporaries(tasks)
 
 
-def _results(client: Any, tasks: Sequence[Task], scene: Scene, video: VideoWriter | None = None) -> Iterator[Result]:
+def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWriter | None = None) -> Iterator[Result]:
     """Results of `render_frame` as the frames are done; a window of tasks is with the scheduler, and not a million. For
     a video the window begins with the frame that is to be encoded next, as those that come early wait here."""
     from distributed import CancelledError, KilledWorker, as_completed
 
-    job, left = uuid.uuid4().hex[:12], iter(tasks)
+    prefix, left = f"clsplat-{uuid.uuid4().hex[:12]}", iter(tasks)
 
     def submit(count: int) -> list[Any]:
         return [
-            client.submit(render_frame, task, scene, key=f"clsplat-{job}-{task.number}", pure=False)
+            client.submit(render_frame, task, job, key=f"{prefix}-{task.number}", pure=False)
             for task in islice(left, count)
         ]
 
     threads = sum(client.nthreads().values())
     window = max(64, 4 * threads)
     if video is not None:
-        window = max(threads + 1, min(window, HOST_BYTES // frame_bytes(tasks[0], scene.options)))
+        window = max(threads + 1, min(window, HOST_BYTES // frame_bytes(tasks[0], job.options)))
     with client.as_current():
         pending = as_completed(submit(window))
     sent = window
@@ -173,7 +171,7 @@ def _results(client: Any, tasks: Sequence[Task], scene: Scene, video: VideoWrite
 
 
 def dask_setup(_: Any) -> None:
-    """Called by Dask in a local worker: Ctrl-C, which a terminal sends to it as well, is for the job to deal with."""
+    """Leave Ctrl-C, which a terminal sends to a local worker as well, to the job. Dask calls this in the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -187,7 +185,7 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         raise InputError(
             f"{flag}: needs the package distributed, install it with: pip install 'clsplat[farm]'"
         ) from None
-    # Dask tells of every worker that it loses, in many lines; what matters is raised.
+    # Dask logs every worker that it loses in many lines. What matters is raised.
     for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler is not None:

@@ -1,26 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame to be rendered, and what all frames of a job have in common."""
+"""The frames of a shot as tasks: where they go, and the options that all of a job share."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig
+from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
+from clsplat.errors import InputError
 from clsplat.files import digest, is_file
-from clsplat.frame.shutter_and_lens import shutter_middle
 from clsplat.frame.window import framed
 from clsplat.images.channels import VIDEO
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.images.exr_header import Header, camera_matrices
-from clsplat.sequence.settings_digest import SETTINGS, digest_of, encoding_of
+from clsplat.shots import Shot
+from clsplat.shots.frame_numbers import output_paths
+from clsplat.shots.motion import Stretch, stretches
+from clsplat.shots.motion import camera_after as following
 
-if TYPE_CHECKING:
-    from clsplat.shots.motion import Stretch
+SETTINGS = "clsplat:settings"
+"""The attribute of EXR and PNG files that holds it."""
+_ENCODED = {".exr": ("depth", "parts", "compression"), ".png": ("bits",)}
+"""Settings of the encoding that a file of that extension depends on."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +84,42 @@ class Task:
         return self.path.suffix.lower() == VIDEO
 
 
+def make_tasks(
+    chosen: Shot,
+    whole: Shot,
+    pattern: str,
+    resize: Callable[[Camera], Camera],
+    channels: Sequence[str],
+    sampling: SamplingConfig | None = None,
+) -> list[Task]:
+    """The frames of `chosen`, which are of the shot `whole`. Raises InputError for files that would be one, unless it
+    is a video, and for cameras that these channels, or the lens, are not defined for."""
+    sampling = sampling or SamplingConfig()
+    motion = "motion" in channels
+    whole.check(channels)
+    indices = {frame.number: index for index, frame in enumerate(whole.frames)}
+    if Path(pattern).suffix.lower() == VIDEO:
+        paths = [Path(pattern)] * len(chosen.frames)
+    else:
+        paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
+    stretch = stretches(whole, resize, *sampling.shutter, motion=motion) if sampling.moves else lambda number: None
+    tasks = []
+    for frame, path in zip(chosen.frames, paths, strict=True):
+        camera = resize(frame.camera)
+        if sampling.has_lens and camera.projection != "perspective":
+            raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
+        after = None
+        if motion:
+            after = resize(following(whole, indices[frame.number])).resized(camera.width, camera.height)
+        tasks.append(Task(frame.number, frame.name, camera, path, after, stretch(frame.number)))
+    return tasks
+
+
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options that all frames of a job share. channels: of `images.channels.LAYERS`; attributes: of the file's header;
-    pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a deep
-    picture, or None; drawn: digest of the rasterizer's settings."""
+    """Options that all frames of a job share. channels: of the table, `config.channels`; attributes: of the file's
+    header; pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a
+    deep picture, or None; drawn: digest of the rasterizer's settings."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -96,14 +136,43 @@ def picture_camera(task: Task, options: RenderOptions) -> Camera:
 
     Raises InputError for a region that is not in the frame.
     """
-    middle = task.at(shutter_middle(options.pictures.sampling))
-    return framed(middle, options.pictures.framing)
+    return framed(task.at(options.pictures.sampling.middle), options.pictures.framing)
 
 
 def camera_after(task: Task, options: RenderOptions) -> Camera | None:
     """The camera of the whole frame that motion goes to: a frame later than the middle of the shutter."""
-    middle = shutter_middle(options.pictures.sampling)
+    middle = options.pictures.sampling.middle
     return task.after if middle == 0 or task.after is None else task.at(middle + 1)
+
+
+def plain(value: Any) -> Any:
+    """A value in the form of JSON. A dataclass becomes its differences from the defaults, so that a setting that is
+    added later changes nothing. Floats have 12 digits, as processors differ in the last ones."""
+    if is_dataclass(value) and not isinstance(value, type):
+        changes = {}
+        for setting in fields(value):
+            given = getattr(value, setting.name)
+            usual = setting.default_factory() if setting.default_factory is not MISSING else setting.default
+            if isinstance(given, np.ndarray) or usual is MISSING or given != usual:
+                changes[setting.name] = plain(given)
+        return changes
+    if isinstance(value, float | np.floating):
+        return f"{value + 0.0:.12g}"  # + 0.0: no -0
+    if isinstance(value, np.ndarray):
+        return [plain(float(item)) for item in value.ravel()]
+    if isinstance(value, tuple | list):
+        return [plain(item) for item in value]
+    return value
+
+
+def encoding_of(encoding: Encoding, extension: str) -> dict[str, Any]:
+    """The settings that a file of that extension depends on."""
+    return {name: getattr(encoding, name) for name in _ENCODED.get(extension, ())}
+
+
+def digest_of(*parts: Any) -> str:
+    """128 bits of SHA-256, in hexadecimal, of values that `plain` takes."""
+    return hashlib.sha256(json.dumps(plain(parts), sort_keys=True).encode()).hexdigest()[:32]
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:

@@ -6,18 +6,18 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, get_args
 
 import numpy as np
 
-from clsplat.arrays import Float64, numbers
-from clsplat.camera import LARGEST_FOCAL, Camera, Projection, focal_length
+from clsplat.arrays import Float64
+from clsplat.camera import LARGEST_FOCAL, Camera, Projection
 from clsplat.errors import InputError
 from clsplat.rotations import rotation_from_quaternion
-from clsplat.scenes.transforms import Keys, short
+from clsplat.scenes.transforms import short
+from clsplat.shots.entries import Entry, objects, whole_frames
 from clsplat.shots.keys import Key, interpolate
-from clsplat.shots.nerfstudio import image_side
-from clsplat.shots.shot import MOST_FRAMES, Frame, Shot
+from clsplat.shots.shot import Shot, numbered
 
 VERSION_KEY, VERSION = "clsplat_cameras", 1
 FOCAL = ("fx", "fy", "fov_x", "fov_y", "pixel_size")
@@ -38,29 +38,22 @@ def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
             "newer clsplat"
         )
     _known(str(path), document, FILE)
-    entries = document.get("keys")
-    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+    if not (entries := objects(document, "keys")):
         raise InputError(f"{path}: has no keys, expected 'keys' to be a list of at least one")
-    whole = Keys(path, None, {}, document)
+    whole = Entry(path, None, {}, document)
     fps, first, loop = whole.number("fps"), whole.number("first_frame"), whole.number("loop_frames")
     if fps is not None and fps <= 0:
         raise InputError(f"{path}: 'fps' is {fps:g}, expected more than 0")
     first = 1.0 if first is None else first
     keys = []
     for index, entry in enumerate(entries):
-        reader = Keys(path, f"key {index}", entry, document)
+        reader = Entry(path, f"key {index}", entry, document)
         _known(reader.where, entry, KEY)
-        keys.append(Key(_frame(reader, fps, first), _camera(reader), math.radians(reader.number("roll") or 0.0)))
+        camera = _camera(reader, whole)
+        keys.append(Key(_frame(reader, fps, first), camera, math.radians(reader.number("roll") or 0.0)))
     keys.sort(key=lambda key: key.frame)
-    numbers = _numbers(path, [key.frame for key in keys], loop)
-    cameras = interpolate(keys, numbers, loop=loop)
-    return Shot(
-        tuple(
-            Frame(number, camera, f"{number:04d}", None if fps is None else (number - numbers[0]) / fps)
-            for number, camera in zip(numbers, cameras, strict=True)
-        ),
-        fps=fps,
-    )
+    frames = _frames(path, [key.frame for key in keys], loop)
+    return Shot(numbered(interpolate(keys, frames, loop=loop), frames[0], fps), fps=fps)
 
 
 def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
@@ -69,7 +62,7 @@ def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
             raise InputError(f"{where}: '{name}' is not known here, expected one of {', '.join(names)}")
 
 
-def _frame(keys: Keys, fps: float | None, first: float) -> float:
+def _frame(keys: Entry, fps: float | None, first: float) -> float:
     frame, seconds = keys.frame.get("frame"), keys.frame.get("seconds")
     if (frame is None) == (seconds is None):
         raise InputError(f"{keys.where}: expected 'frame' or 'seconds', and one of them only")
@@ -80,7 +73,7 @@ def _frame(keys: Keys, fps: float | None, first: float) -> float:
     return round(first + keys.require("seconds") * fps, 6)  # 0.1 s at 30 is frame 3
 
 
-def _numbers(path: Path, frames: list[float], loop: float | None) -> list[int]:
+def _frames(path: Path, frames: list[float], loop: float | None) -> list[int]:
     """Whole frames."""
     for before, after in pairwise(frames):
         if before == after:
@@ -93,22 +86,16 @@ def _numbers(path: Path, frames: list[float], loop: float | None) -> list[int]:
                 "the first key comes again after so many"
             )
         end = math.ceil(begin + loop) - 1
-    if end - begin >= MOST_FRAMES:
-        raise InputError(f"{path}: has the frames {begin:g} to {end:g}, expected at most {MOST_FRAMES:,}")
-    numbers = list(range(math.ceil(begin), math.floor(end) + 1))
-    if not numbers:
-        raise InputError(f"{path}: has no whole frame between its keys at {begin:g} and {end:g}, expected at least one")
-    return numbers
+    return whole_frames(str(path), "frame", begin, end)
 
 
-def _camera(keys: Keys) -> Camera:
-    projection = keys.document.get("projection", "perspective")
+def _camera(keys: Entry, whole: Entry) -> Camera:
+    projection = whole.document.get("projection", "perspective")
     if projection not in get_args(Projection):
         raise InputError(
             f"{keys.path}: 'projection' is {short(projection)}, expected one of {', '.join(get_args(Projection))}"
         )
-    whole = Keys(keys.path, None, {}, keys.document)
-    width, height = image_side(whole, "width"), image_side(whole, "height")
+    width, height = whole.side("width"), whole.side("height")
     near, far = whole.number("near"), whole.number("far")
     near, far = 0.01 if near is None else near, math.inf if far is None else far
     if not 0 < near < far:
@@ -118,14 +105,12 @@ def _camera(keys: Keys) -> Camera:
         raise InputError(f"{keys.where}: a focal length of {max(fx, fy):g}, expected at most {LARGEST_FOCAL:g}")
     cx, cy = _principal(keys, width, height)
     rotation = _rotation(keys).T
-    position = _vector(keys, "position", 3)
-    return Camera(
-        width, height, fx, fy, cx, cy, rotation, -rotation @ position, near, far, cast("Projection", projection)
-    )
+    position = keys.vector("position", 3)
+    return Camera(width, height, fx, fy, cx, cy, rotation, -rotation @ position, near, far, projection)
 
 
-def _rotation(keys: Keys) -> Float64:
-    quaternion = _vector(keys, "world_from_cam", 4)
+def _rotation(keys: Entry) -> Float64:
+    quaternion = keys.vector("world_from_cam", 4)
     norm = float(np.linalg.norm(quaternion))
     if not 0.5 < norm < 2:
         raise InputError(
@@ -134,20 +119,11 @@ def _rotation(keys: Keys) -> Float64:
     return rotation_from_quaternion(quaternion / norm)
 
 
-def _vector(keys: Keys, name: str, size: int) -> Float64:
-    given = keys.get(name)
-    vector = numbers(given)
-    if vector.shape != (size,) or not np.isfinite(vector).all():
-        found = f"has no '{name}'" if given is None else f"'{name}' is {short(given)}"
-        raise InputError(f"{keys.where}: {found}, expected a list of {size} numbers")
-    return vector
-
-
-def _focal(keys: Keys, projection: str, width: int, height: int) -> tuple[float, float]:
+def _focal(keys: Entry, projection: Projection, width: int, height: int) -> tuple[float, float]:
     """Pixels a unit, from what the key has of FOCAL, or the file where it has none of them."""
     source = keys.frame if any(name in keys.frame for name in FOCAL) else keys.document
     given = [name for name in FOCAL if name in source]
-    values = Keys(keys.path, None, source, {})
+    values = Entry(keys.path, None, source, {})
     values.where = keys.where
     if projection == "equirectangular":
         across, down = values.number("fov_x"), values.number("fov_y")
@@ -164,18 +140,14 @@ def _focal(keys: Keys, projection: str, width: int, height: int) -> tuple[float,
             f"{keys.where}: has {_listed(source, given)}, expected one of 'fx' (with 'fy' if that differs), "
             + " or ".join(f"'{angle}'" for angle in angles)
         )
-    numbers = [values.require(name) for name in given]
-    if min(numbers) <= 0:
+    lengths = [values.require(name) for name in given]
+    if min(lengths) <= 0:
         raise InputError(f"{keys.where}: has {_listed(source, given)}, expected more than 0")
     if given[0] == "fx":
-        return numbers[0], numbers[-1]
+        return lengths[0], lengths[-1]
     if projection == "orthographic":
-        return 1 / numbers[0], 1 / numbers[0]
-    try:
-        size = width if given[0] == "fov_x" else height
-        focal = focal_length(math.radians(numbers[0]), size, cast("Projection", projection))
-    except ValueError as error:
-        raise InputError(f"{keys.where}: '{given[0]}': {error}") from None
+        return 1 / lengths[0], 1 / lengths[0]
+    focal = values.focal(given[0], width if given[0] == "fov_x" else height, projection)
     return focal, focal
 
 
@@ -183,11 +155,11 @@ def _listed(source: dict[str, Any], given: list[str]) -> str:
     return ", ".join(f"'{name}' {short(source[name])}" for name in given) or "no focal length"
 
 
-def _principal(keys: Keys, width: int, height: int) -> tuple[float, float]:
+def _principal(keys: Entry, width: int, height: int) -> tuple[float, float]:
     cx, cy = keys.number("cx"), keys.number("cy")
     if keys.get("shift") is None:
         return width / 2 if cx is None else cx, height / 2 if cy is None else cy
     if cx is not None or cy is not None:
         raise InputError(f"{keys.where}: has 'shift' and 'cx' or 'cy', expected one or the other")
-    right, up = _vector(keys, "shift", 2)
+    right, up = keys.vector("shift", 2)
     return width * (0.5 - float(right)), height * (0.5 + float(up))

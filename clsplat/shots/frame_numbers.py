@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from clsplat.errors import InputError
@@ -57,52 +56,29 @@ def ranges(frames: Sequence[int]) -> str:
     return ",".join(words[:8]) + (",..." if len(words) > 8 else "")
 
 
-@dataclass(frozen=True)
-class Pattern:
-    """A pattern for the names of files.
+def path_of(pattern: str, frame: int, name: str) -> Path:
+    """The file of a frame. Raises InputError for a name that leads out of the output folder.
 
     `####` and `%04d` are the frame's number in at least four digits, `{frame}` and `%d` in as few as it has,
     `{frame:04}` in four again; `{name}` is its name without extension, with its folders.
     """
 
-    text: str
+    def fill(match: re.Match[str]) -> str:
+        if match[3] == "name":
+            return _stem(name)
+        width = len(match[1]) if match[1] else int(match[2] or match[4] or 0)
+        return f"{frame:0{width}d}"
 
-    def __post_init__(self) -> None:
-        for match in FIELD.finditer(self.text):
-            if match[3] not in (None, "frame") and not (match[3] == "name" and match[4] is None):
-                raise InputError(f"{self.text}: {match[0]} is not known, expected {KNOWN}")
-        if odd := ODD.search(FIELD.sub("", Path(self.text).name)):
-            raise InputError(f"{self.text}: {odd[0]} is not known, expected {KNOWN}")
-
-    @property
-    def has_frame(self) -> bool:
-        """True if it tells frames apart by their numbers."""
-        return any(match[3] != "name" for match in FIELD.finditer(self.text))
-
-    @property
-    def has_name(self) -> bool:
-        """True if it tells frames apart by their names."""
-        return any(match[3] == "name" for match in FIELD.finditer(self.text))
-
-    def path(self, frame: int, name: str) -> Path:
-        """The file of a frame. Raises InputError for a name that leads out of the output folder."""
-
-        def fill(match: re.Match[str]) -> str:
-            if match[3] == "name":
-                return _stem(name)
-            width = len(match[1]) if match[1] else int(match[2] or match[4] or 0)
-            return f"{frame:0{width}d}"
-
-        # one pass: a name may have # or % in it
-        return Path(FIELD.sub(fill, self.text))
+    # one pass: a name may have # or % in it
+    return Path(FIELD.sub(fill, pattern))
 
 
 def _stem(name: str) -> str:
     if not PurePosixPath(name).name:
         raise InputError(f"image name {name!r} is empty, expected a name for the file")
     stem = str(PurePosixPath(name).with_suffix(""))
-    for each in (name, stem):
-        if trouble := name_trouble(each):
+    for text in (name, stem):
+        if trouble := name_trouble(text):
             raise InputError(f"image name {name!r} {trouble}, expected one for a file in the output folder")
     return stem
 
@@ -110,8 +86,12 @@ def _stem(name: str) -> str:
 def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
     """The file of every frame (number, name). Raises InputError where two would be one, or one would leave the
     folder, or the pattern is none."""
-    parsed = Pattern(pattern)
-    if len(frames) > 1 and not (parsed.has_name or parsed.has_frame):
+    for match in FIELD.finditer(pattern):
+        if match[3] not in (None, "frame") and not (match[3] == "name" and match[4] is None):
+            raise InputError(f"{pattern}: {match[0]} is not known, expected {KNOWN}")
+    if odd := ODD.search(FIELD.sub("", Path(pattern).name)):
+        raise InputError(f"{pattern}: {odd[0]} is not known, expected {KNOWN}")
+    if len(frames) > 1 and not FIELD.search(pattern):
         raise InputError(
             f"{pattern}: has no {{name}} in it, expected one to tell {len(frames)} cameras apart, or a frame number "
             "such as ####"
@@ -119,7 +99,7 @@ def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
     paths: list[Path] = []
     taken: dict[str, str] = {}
     for frame, name in frames:
-        path = parsed.path(frame, name)
+        path = path_of(pattern, frame, name)
         if (key := identity(path)) in taken:
             raise InputError(f"{path}: would be both {taken[key]} and {name}")
         taken[key] = name

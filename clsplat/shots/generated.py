@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,9 +17,11 @@ from clsplat.shots.viewpoints import WIDEST_GAP, covered_arc, focus_point, look_
 
 @dataclass(frozen=True, eq=False)
 class _Ring:
-    """The cameras about the point that they look at. up, east (towards the first camera), north and focus (3,); offsets
-    (N, 3) from the focus, of which heights (N,) along up and radii (N,) from its axis; azimuths (N,), radians."""
+    """The cameras about the point that they look at. first: of the cameras; up, east (towards the first), north and
+    focus (3,); offsets (N, 3) from the focus, of which heights (N,) along up and radii (N,) from its axis; azimuths
+    (N,), radians."""
 
+    first: Camera
     up: Float64
     east: Float64
     north: Float64
@@ -29,6 +30,20 @@ class _Ring:
     heights: Float64
     radii: Float64
     azimuths: Float64
+
+    def outwards(self, angle: float) -> Float64:
+        """The level direction from the axis at an azimuth, (3,)."""
+        return np.asarray(np.cos(angle) * self.east + np.sin(angle) * self.north)
+
+    def facing(self, positions: Iterable[Float64]) -> list[Camera]:
+        """The first camera at each of the positions (3,), turned to the focus."""
+        poses = [look_at(position, self.focus, self.up) for position in positions]
+        return [replace(self.first, rotation=rotation, translation=translation) for rotation, translation in poses]
+
+
+def _check(name: str, cameras: Sequence[Camera], frames: int) -> None:
+    if not cameras or frames < 1:
+        raise ValueError(f"{name}: {frames} frames from {len(cameras)} cameras, expected at least one of each")
 
 
 def _ring(cameras: Sequence[Camera]) -> _Ring:
@@ -41,7 +56,7 @@ def _ring(cameras: Sequence[Camera]) -> _Ring:
     east = first / np.linalg.norm(first)
     north = np.cross(up, east)
     azimuths = np.arctan2(level @ north, level @ east)
-    return _Ring(up, east, north, focus, offsets, heights, np.linalg.norm(level, axis=1), azimuths)
+    return _Ring(cameras[0], up, east, north, focus, offsets, heights, np.linalg.norm(level, axis=1), azimuths)
 
 
 def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -51,14 +66,12 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     wide gap it swings to and fro over the arc that they cover, as no camera has seen the rest. It begins near the first
     camera. Raises ValueError for no cameras or no frames.
     """
-    if not cameras or frames < 1:
-        raise ValueError(f"a turntable of {frames} frames from {len(cameras)} cameras: expected at least one of each")
+    _check("turntable", cameras, frames)
     ring = _ring(cameras)
-    up, focus, azimuths = ring.up, ring.focus, ring.azimuths
     radius, height = float(np.median(ring.radii)), float(np.median(ring.heights))
 
     time = np.arange(frames) / frames
-    begin, width = covered_arc(azimuths)
+    begin, width = covered_arc(ring.azimuths)
     if 2 * np.pi - width <= WIDEST_GAP:
         angles = 2 * np.pi * time
     else:
@@ -67,15 +80,8 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         off = (-middle + np.pi) % (2 * np.pi) - np.pi
         phase = np.arcsin(np.clip(off / half, -1, 1)) if half > 1e-6 else 0.0
         angles = middle + half * np.sin(2 * np.pi * time + phase)
-    path = []
-    for angle in angles:
-        position = focus + height * up + radius * (np.cos(angle) * ring.east + np.sin(angle) * ring.north)
-        rotation, translation = look_at(position, focus, up)
-        path.append(replace(cameras[0], rotation=rotation, translation=translation))
-    return path
+    return ring.facing(ring.focus + height * ring.up + radius * ring.outwards(angle) for angle in angles)
 
-
-PathName = Literal["turntable", "spiral", "through"]
 
 SPIRAL_TURNS = 2
 STEEPEST = np.deg2rad(85.0)
@@ -89,18 +95,17 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
     In spherical coordinates about `focus_point`: at the cameras' median distance, the elevation from their 10th to
     their 90th percentile and back. Where they leave a wide gap, the azimuth swings over the arc that they cover, once a
-    turn, a quarter of a turn behind the elevation: an ellipse before the scene, over which the distance goes from its
-    10th to its 90th percentile and back. Intrinsics of the first camera. Raises ValueError for no cameras or frames.
+    turn, a quarter of a turn behind the elevation. That is an ellipse before the scene; on it the distance goes from
+    its 10th to its 90th percentile and back. Intrinsics are the first camera's. Raises ValueError for no cameras or
+    frames.
     """
-    if not cameras or frames < 1:
-        raise ValueError(f"a spiral of {frames} frames from {len(cameras)} cameras: expected at least one of each")
+    _check("spiral", cameras, frames)
     ring = _ring(cameras)
-    up, focus, azimuths = ring.up, ring.focus, ring.azimuths
     elevations = np.clip(np.arctan2(ring.heights, ring.radii), -STEEPEST, STEEPEST)
     distances = np.linalg.norm(ring.offsets, axis=1)
 
     turn = 2 * np.pi * np.arange(frames) / frames
-    begin, width = covered_arc(azimuths)
+    begin, width = covered_arc(ring.azimuths)
     if 2 * np.pi - width <= WIDEST_GAP:
         azimuth = SPIRAL_TURNS * turn
         elevation = _between(elevations, -np.cos(turn))
@@ -109,12 +114,10 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         azimuth = begin + width / 2 * (1 + np.sin(SPIRAL_TURNS * turn))
         elevation = _between(elevations, np.cos(SPIRAL_TURNS * turn))
         distance = _between(distances, np.sin(turn))
-    path = []
-    for angle, height, radius in zip(azimuth, elevation, distance, strict=True):
-        outwards = np.cos(height) * (np.cos(angle) * ring.east + np.sin(angle) * ring.north) + np.sin(height) * up
-        rotation, translation = look_at(focus + radius * outwards, focus, up)
-        path.append(replace(cameras[0], rotation=rotation, translation=translation))
-    return path
+    return ring.facing(
+        ring.focus + radius * (np.cos(height) * ring.outwards(angle) + np.sin(height) * ring.up)
+        for angle, height, radius in zip(azimuth, elevation, distance, strict=True)
+    )
 
 
 def _between(values: Float64, wave: Float64) -> Float64:
@@ -127,13 +130,12 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A path from the first camera to the last in their order, smoothed, at an even speed, with the first one's
     intrinsics.
 
-    Positions and rotations are those of a parabola fitted to a camera and three neighbours on each side (fewer towards
-    the ends, which stay where they are), which keeps an arc where it is; a spline goes through these. Speed counts
-    distances and angles, each in steps of the median camera, so a camera that only turns takes its time as well. Raises
-    ValueError for no cameras or no frames.
+    Positions and rotations are those of a parabola fitted to a camera and three neighbours on each side, which keeps an
+    arc where it is. Towards the ends there are fewer neighbours, so that the ends stay. A spline goes through these.
+    Speed counts distances and angles, each in steps of the median camera, so a camera that only turns takes its time as
+    well. Raises ValueError for no cameras or no frames.
     """
-    if not cameras or frames < 1:
-        raise ValueError(f"a path of {frames} frames through {len(cameras)} cameras: expected at least one of each")
+    _check("through", cameras, frames)
     smooth = _smoothed(cameras)
     positions = np.stack([camera.position for camera in smooth])
     rotations = Rotation.from_matrix(np.stack([camera.rotation.T for camera in smooth]))
@@ -149,8 +151,8 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 def _in_medians(lengths: Float64, rounding: float) -> Float64:
     """lengths (n,) over the median of those that are more than rounding."""
-    there = lengths[lengths > rounding]
-    return lengths / np.median(there) if len(there) else np.zeros_like(lengths)
+    clear = lengths[lengths > rounding]
+    return lengths / np.median(clear) if len(clear) else np.zeros_like(lengths)
 
 
 def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:
@@ -174,8 +176,4 @@ def parabola_weights(reach: int) -> Float64:
     return np.asarray(scale * (3 * reach * reach + 3 * reach - 1 - 5 * offsets**2))
 
 
-PATHS: dict[str, Callable[[Sequence[Camera], int], list[Camera]]] = {
-    "turntable": turntable,
-    "spiral": spiral,
-    "through": through,
-}
+PATHS = {"turntable": turntable, "spiral": spiral, "through": through}

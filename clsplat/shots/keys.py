@@ -6,9 +6,9 @@ neighbours (Catmull-Rom for keys that are not evenly spaced in time), and never 
 two average speeds beside it. So the path and its speed are continuous, it stays within a chord's length of both keys,
 a hold (two equal keys) holds, and moving a key changes two segments on each side at most. A spline with a continuous
 second derivative has none of the last three; a centripetal one takes its knots from distances, and the times of keys
-are the user's. Rotations: the same construction on angular velocities, and cumulative Bezier curves of quaternions
+are the user's. Rotations have the same construction on angular velocities, with cumulative Bezier curves of quaternions
 (Kim, Kim, Shin 1995, "A general construction scheme for unit quaternion curves with simple high order derivatives").
-Scalars: monotone cubics (Fritsch and Carlson 1980), focal lengths in their logarithm.
+Scalars go along monotone cubics (Fritsch and Carlson 1980), focal lengths in their logarithm.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
     exact = {key.frame: key.camera for key in keys if key.roll == 0}
     cameras = []
     for index, (rotation, position) in enumerate(zip(cam_from_world, path, strict=True)):
-        if (own := exact.get(float(at[index]))) is not None:
-            cameras.append(own)
+        if (camera := exact.get(float(at[index]))) is not None:
+            cameras.append(camera)
             continue
         fx, fy = np.exp(values[index, 1:3])
         cameras.append(

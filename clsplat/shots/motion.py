@@ -25,9 +25,6 @@ class Stretch:
 
     def at(self, time: float) -> Camera:
         """The camera at a time in frames from the frame; that of a key as it is."""
-        for key in self.keys:
-            if key.frame == time:
-                return key.camera
         return interpolate(self.keys, [time])[0]
 
 
@@ -69,7 +66,7 @@ def stretches(
     if len(frames) == 1:
         return lambda number: None
     for (number, camera), (earlier, before) in zip(frames[1:], frames, strict=False):
-        kinds = [f"{each.width}x{each.height} {each.projection}" for each in (before, camera)]
+        kinds = [f"{shown.width}x{shown.height} {shown.projection}" for shown in (before, camera)]
         if kinds[0] != kinds[1]:
             raise InputError(
                 f"an open shutter: frame {earlier} is {kinds[0]} and frame {number} {kinds[1]}, expected one camera"
@@ -84,9 +81,9 @@ def stretches(
         last, following = following, continued(last, following)
     numbers = [number for number, _ in frames]
 
-    def of(number: int) -> Stretch:
+    def stretch(number: int) -> Stretch:
         begin = max(bisect_right(numbers, number + min(opens, 0)) - AROUND, 0)
         end = bisect_left(numbers, number + max(closes, 0)) + AROUND
         return Stretch(tuple(Key(at - number, camera) for at, camera in frames[begin:end]))
 
-    return of
+    return stretch

@@ -35,11 +35,12 @@ def read_shot(path: Path, *, size: tuple[int | None, int | None] = (None, None),
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such folder or file, expected {EXPECTED}")
-    if usd_camera is not None and not _is_usd(path):
+    is_usd = path.suffix.lower() in USD
+    if usd_camera is not None and not is_usd:
         raise InputError(f"--usd-camera {usd_camera}: {path} is no USD stage, expected it with one only")
     if path.is_dir():
         return _read_folder(path, size)
-    if _is_usd(path):
+    if is_usd:
         return read_usd(path, size, usd_camera)
     if path.suffix.lower() == ".json":
         return _read_json(path, size)
@@ -51,14 +52,13 @@ def choose_shot(
     *,
     path: str | None = None,
     count: int | None = None,
-    frames: str | None = None,
     size: tuple[int | None, int | None] = (None, None),
     usd_camera: str | None = None,
 ) -> Shot:
-    """The shot that --cameras, --path, --count and --frames ask for together.
+    """The shot that --cameras, --path and --count ask for together.
 
     path: turntable, spiral or through: `count` frames of that path, made from the cameras; else the cameras themselves.
-    frames: of these, the ones listed. Raises InputError.
+    Raises InputError.
     """
     if count is not None and path is None:
         raise InputError(f"--count {count}: expected --path with it, the files of cameras have their own frames")
@@ -70,7 +70,6 @@ def choose_shot(
             raise InputError(f"{cameras}: its cameras are {kind}, --path needs perspective or orthographic ones")
         made = numbered(PATHS[path](shot.cameras, COUNT if count is None else count))
         shot = Shot(made, shot.warnings, unapplied=shot.unapplied)
-    shot = shot if frames is None else shot.only(frames)
     far = min(frame.camera.far for frame in shot.frames)
     unapplied = (*((f"far plane ({far:g})",) if far < math.inf else ()), *shot.unapplied)
     if unapplied:
@@ -78,12 +77,8 @@ def choose_shot(
     return shot
 
 
-def _is_usd(path: Path) -> bool:
-    return path.suffix.lower() in USD
-
-
 def _read_folder(path: Path, size: tuple[int | None, int | None]) -> Shot:
-    listed = sorted(each.name for each in path.glob("transforms*.json"))
+    listed = sorted(file.name for file in path.glob("transforms*.json"))
     if listed:
         # a model below colmap/ beside a transforms.json is nerfstudio's, in a world that is not the file's
         model = find_model(path)

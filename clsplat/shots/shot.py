@@ -49,9 +49,9 @@ class Shot:
         Raises InputError for a text that `parse_frames` refuses, and where the shot has none of its frames.
         """
         wanted = parse_frames(text)
-        there = {frame.number for frame in self.frames}
-        missing = [number for number in wanted if number not in there]
-        have = f"there are the frames {ranges(sorted(there))}"
+        numbers = {frame.number for frame in self.frames}
+        missing = [number for number in wanted if number not in numbers]
+        have = f"there are the frames {ranges(sorted(numbers))}"
         if len(missing) == len(wanted):
             raise InputError(f"--frames {text}: holds none of the frames to render, expected some; {have}")
         asked = set(wanted)
@@ -73,7 +73,7 @@ class Shot:
 
     def at(self, frame: float) -> Camera:
         """The camera at a frame that need not be whole, such as within a shutter's time: interpolated as keys are."""
-        return interpolate([Key(each.number, each.camera) for each in self.frames], [frame])[0]
+        return interpolate([Key(key.number, key.camera) for key in self.frames], [frame])[0]
 
 
 def numbered(cameras: Iterable[Camera], first: int = 1, fps: float | None = None) -> tuple[Frame, ...]:

@@ -8,6 +8,7 @@ own axes (x right, y up, looking along -z) become ours.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from clsplat.errors import InputError, examples
 from clsplat.files import native_name
 from clsplat.models.formats.usd import readable, survive
 from clsplat.scenes.transforms import opengl_pose, short
-from clsplat.shots.shot import MOST_FRAMES, Frame, Shot
+from clsplat.shots.entries import whole_frames
+from clsplat.shots.shot import Shot, numbered
 
 ORTHOGRAPHIC_UNIT = 0.1
 """USD measures apertures in tenths of a world unit; only of an orthographic camera that is more than a ratio."""
@@ -56,21 +58,19 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
             f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more"
         ) from None
     with readable(path):
-        camera = _find(path, [UsdGeom.Camera(each) for each in stage.Traverse() if each.IsA(UsdGeom.Camera)], prim)
+        camera = _find(path, [UsdGeom.Camera(item) for item in stage.Traverse() if item.IsA(UsdGeom.Camera)], prim)
         where = f"{path}: {camera.GetPath()}"
         codes = _time_codes(where, stage, camera)
         horizontal, vertical = _aperture(where, camera, codes[0])
         width, height = _size(path, stage, size, horizontal / vertical)
-        start, per_second = codes[0], float(stage.GetTimeCodesPerSecond())
-        frames = []
-        for code in codes:
-            time = None if len(codes) == 1 or per_second <= 0 else (code - start) / per_second
-            frames.append(Frame(code, _camera(f"{where} at {code}", camera, code, width, height), f"{code:04d}", time))
+        per_second = float(stage.GetTimeCodesPerSecond())
+        cameras = [_camera(f"{where} at {code}", camera, code, width, height) for code in codes]
+        frames = numbered(cameras, codes[0], None if len(codes) == 1 or per_second <= 0 else per_second)
     # without the end of the line, where USD has the stage's address in memory
     unapplied = _unapplied(stage, camera, codes)
-    told = [each.commentary.split(" (instantiating")[0] for each in diagnostics.TakeUncoalescedDiagnostics()]
-    warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in told[:3])
-    return Shot(tuple(frames), warnings, per_second if 0 < per_second < math.inf else None, unapplied)
+    lines = [message.commentary.split(" (instantiating")[0] for message in diagnostics.TakeUncoalescedDiagnostics()]
+    warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in lines[:3])
+    return Shot(frames, warnings, per_second if 0 < per_second < math.inf else None, unapplied)
 
 
 def _unapplied(stage: Any, camera: Any, codes: list[int]) -> tuple[str, ...]:
@@ -78,19 +78,13 @@ def _unapplied(stage: Any, camera: Any, codes: list[int]) -> tuple[str, ...]:
     applied: their names, with the first value."""
     from pxr import UsdGeom, UsdRender
 
-    usual: dict[str, Any] = {
-        "fStop": 0.0,
-        "focusDistance": 0.0,
-        "shutter:open": 0.0,
-        "shutter:close": 0.0,
-        "exposure": 0.0,
-    }
+    usual: dict[str, Any] = dict.fromkeys(("fStop", "focusDistance", "shutter:open", "shutter:close", "exposure"), 0.0)
     usual |= {"clippingPlanes": (), "stereoRole": UsdGeom.Tokens.mono}
-    found = [_authored(camera.GetPrim(), name, value, codes) for name, value in usual.items()]
+    authored = [_authored(camera.GetPrim(), name, value, codes) for name, value in usual.items()]
     if settings := UsdRender.Settings.GetStageRenderSettings(stage):
         usual = {"pixelAspectRatio": 1.0, "aspectRatioConformPolicy": None, "dataWindowNDC": (0, 0, 1, 1)}
-        found += [_authored(settings.GetPrim(), name, value, codes) for name, value in usual.items()]
-    return tuple(filter(None, found))
+        authored += [_authored(settings.GetPrim(), name, value, codes) for name, value in usual.items()]
+    return tuple(filter(None, authored))
 
 
 def _authored(prim: Any, name: str, usual: Any, codes: list[int]) -> str:
@@ -111,47 +105,37 @@ def _find(path: Path, cameras: list[Any], prim: str | None) -> Any:
     paths = [str(camera.GetPath()) for camera in cameras]
     if not cameras:
         raise InputError(f"{path}: has no camera in it, expected at least one")
-    matching = [
-        camera for camera, name in zip(cameras, paths, strict=True) if prim in (name, camera.GetPrim().GetName())
-    ]
-    if prim is None:
-        matching = cameras
+    matching = [camera for camera in cameras if prim in (None, str(camera.GetPath()), camera.GetPrim().GetName())]
     if len(matching) != 1:
-        found = "has no such camera" if not matching else f"has {len(matching)} cameras"
+        problem = "has no such camera" if not matching else f"has {len(matching)} cameras"
         asked = "" if prim is None else f"--usd-camera {prim}: "
-        raise InputError(f"{path}: {asked}{found}, expected --usd-camera with one of {examples(paths)}")
+        raise InputError(f"{path}: {asked}{problem}, expected --usd-camera with one of {examples(paths)}")
     return matching[0]
 
 
-def _samples(camera: Any) -> list[float]:
-    """The time codes at which the camera, or something that moves it, has values."""
+def _moved(camera: Any) -> Iterator[Any]:
+    """The camera and what it is in, as far as they have a transform."""
     from pxr import UsdGeom
 
-    times: set[float] = set()
-    for attribute in camera.GetPrim().GetAttributes():
-        times.update(attribute.GetTimeSamples())
     prim = camera.GetPrim()
     while prim and not prim.IsPseudoRoot():
         if prim.IsA(UsdGeom.Xformable):
-            times.update(UsdGeom.Xformable(prim).GetTimeSamples())
+            yield UsdGeom.Xformable(prim)
         prim = prim.GetParent()
-    return sorted(times)
 
 
 def _time_codes(where: str, stage: Any, camera: Any) -> list[int]:
-    samples = _samples(camera)
+    """The whole time codes of the stage's range, or from the first to the last at which the camera, or something that
+    moves it, has values."""
+    timed = (*camera.GetPrim().GetAttributes(), *_moved(camera))
+    samples = sorted({time for source in timed for time in source.GetTimeSamples()})
     if stage.HasAuthoredTimeCodeRange():
         begin, end = float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())
     elif samples:
         begin, end = samples[0], samples[-1]
     else:
         begin = end = 1.0
-    if not (math.isfinite(begin) and math.isfinite(end) and end - begin < MOST_FRAMES):
-        raise InputError(f"{where}: time codes {begin:g} to {end:g}, expected at most {MOST_FRAMES:,}")
-    codes = list(range(math.ceil(begin), math.floor(end) + 1))
-    if not codes:
-        raise InputError(f"{where}: no whole time code from {begin:g} to {end:g}, expected at least one frame")
-    return codes
+    return whole_frames(where, "time code", begin, end)
 
 
 def _number(where: str, attribute: Any, code: int) -> float:
@@ -205,13 +189,13 @@ def _check_turns(where: str, camera: Any, code: int) -> None:
     """Raise InputError for a quaternion without a length, of the camera or of what it is in: USD takes it for none."""
     from pxr import UsdGeom
 
-    prim = camera.GetPrim()
-    while prim and not prim.IsPseudoRoot():
-        for op in UsdGeom.Xformable(prim).GetOrderedXformOps() if prim.IsA(UsdGeom.Xformable) else ():
+    for moved in _moved(camera):
+        for op in moved.GetOrderedXformOps():
             turn = op.Get(code) if op.GetOpType() == UsdGeom.XformOp.TypeOrient else None
             if turn is not None and not 1e-6 < turn.GetLength() < math.inf:
-                raise InputError(f"{where}: {op.GetOpName()} of {prim.GetPath()} is {turn}, expected a unit quaternion")
-        prim = prim.GetParent()
+                raise InputError(
+                    f"{where}: {op.GetOpName()} of {moved.GetPath()} is {turn}, expected a unit quaternion"
+                )
 
 
 def _camera(where: str, camera: Any, code: int, width: int, height: int) -> Camera:

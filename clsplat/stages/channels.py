@@ -5,9 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clsplat.config.channels import floats_of
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups, launch_items
@@ -19,8 +23,10 @@ from clsplat.stages.duplicate import Band
 from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists
 
-WIDTHS = {"depth": 1, "normal": 3, "position": 3, "motion": 2}
+WIDTHS = floats_of("features")
 """Floats of each feature."""
+DEPTHS, WHOLE = tuple(floats_of("depths")), tuple(floats_of("whole"))
+"""Planes behind the blended features, and those of whole numbers, in the order of channels.cl."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +46,8 @@ class Features:
     @property
     def offsets(self) -> dict[str, int]:
         """Offset of each feature in a row."""
-        found, at = {}, 0
-        for name in self.names:
-            found[name] = at
-            at += WIDTHS[name]
-        return found
+        ends = accumulate(WIDTHS[name] for name in self.names)
+        return {name: end - WIDTHS[name] for name, end in zip(self.names, ends, strict=True)}
 
     @property
     def floats(self) -> int:
@@ -56,11 +59,18 @@ class Features:
         """Defines for both kernels."""
         return {"FEATURES": self.floats, **{f"FEATURE_{name.upper()}": at for name, at in self.offsets.items()}}
 
+    def named(self, means: NDArray[Any], whole: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """The channels of `Channels`' planes on the host, which are last here: (H, W), or (H, W, floats) of several."""
+        planes = {name: means[:, :, at : at + WIDTHS[name]] for name, at in self.offsets.items()}
+        planes = {name: plane if plane.shape[2] > 1 else plane[:, :, 0] for name, plane in planes.items()}
+        planes |= {name: means[:, :, at] for at, name in enumerate(DEPTHS, self.floats)}
+        return planes | {name: whole[:, :, at] for at, name in enumerate(WHOLE)}
+
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Planes padded to whole tiles: means (fields, rows, stride) of the features and, behind them, the depths at which
-    half of the light is stopped and at which the first Gaussian is; whole (2, rows, stride): count and index."""
+    """Planes padded to whole tiles: means (floats + 2, rows, stride) of the features and, behind them, DEPTHS; whole
+    (2, rows, stride): WHOLE. `Features.named` takes them apart."""
 
     features: Features
     means: DeviceArray
@@ -80,7 +90,7 @@ def features(
     """Features of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to."""
     rows = work.array("features", (gaussians.count, wanted.floats))
     for start, stop, (part,) in parts(work, gaussians):
-        own = projected.rows(start, stop)
+        splats = projected.rows(start, stop)
         launch_items(
             device,
             device.kernels("features", LANES=1, **wanted.defines).features,
@@ -88,11 +98,11 @@ def features(
             part.count,
             camera_array,
             after,
-            own.tile_counts,
+            splats.tile_counts,
             part["means"],
             part["quaternions"],
             part["log_scales"],
-            own.splats,
+            splats.splats,
             rows.rows(start, stop),
         )
     return rows
@@ -114,8 +124,8 @@ def channels(
     """Blend the features with the weights of `blended`, which is of the same lists; the band's tiles, or all.
     camera_array: for pixels that are rays."""
     plane_rows, stride = blended.stops.shape
-    means = work.array("channel_means", (wanted.floats + 2, plane_rows, stride))
-    whole = work.array("channel_whole", (2, plane_rows, stride), np.int32)
+    means = work.array("channel_means", (wanted.floats + len(DEPTHS), plane_rows, stride))
+    whole = work.array("channel_whole", (len(WHOLE), plane_rows, stride), np.int32)
     items = tile_items(device)
     launch_groups(
         device,

@@ -103,7 +103,7 @@ class Patience:
 
     def note(self, step: int, *, lost: bool = False) -> None:
         """Step number `step` had trouble; lost: too much of the model is gone to go on with it."""
-        self.troubled = [*(each for each in self.troubled if step - WINDOW < each < step), step]
+        self.troubled = [*(earlier for earlier in self.troubled if step - WINDOW < earlier < step), step]
         self.lost = self.lost or lost
 
     @property

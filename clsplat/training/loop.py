@@ -7,8 +7,8 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -66,8 +66,8 @@ class StepReport:
 
 
 class _Interruption:
-    """Inside, the first Ctrl-C, or another signal to end, is noted, and the loop stops between two steps; after it a
-    Ctrl-C is Python's own, and the others do what they did before."""
+    """Inside, the first Ctrl-C or other signal to end is noted, and the loop stops between two steps. After it a Ctrl-C
+    is Python's own, and the other signals do what they did before."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -75,13 +75,13 @@ class _Interruption:
 
     def __call__(self) -> bool:
         if not self.number:  # again, as compilers of kernels install handlers of their own
-            for each in self._previous:
-                signal.signal(each, self._ask)
+            for number in self._previous:
+                signal.signal(number, self._ask)
         return self.number != 0
 
     def __enter__(self) -> _Interruption:  # noqa: PYI034  # Self came with 3.11
         if threading.current_thread() is threading.main_thread():
-            self._previous = {each: signal.signal(each, self._ask) for each in (signal.SIGINT, *endings())}
+            self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, *endings())}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -90,23 +90,39 @@ class _Interruption:
 
     def _ask(self, number: int, _frame: FrameType | None) -> None:
         self.number = number
-        for each in self._previous:
-            signal.signal(each, signal.default_int_handler if each == signal.SIGINT else self._previous[each])
+        for other, handler in self._previous.items():
+            signal.signal(other, signal.default_int_handler if other == signal.SIGINT else handler)
 
 
 class _Session:
     """One call of `train`: a trainer, the run that it writes to, and the seconds that it has trained."""
 
-    def __init__(self, trainer: Trainer, run: Run | None, on_plan: Callable[[Plan], None] | None = None) -> None:
-        self.trainer, self.run, self.on_plan = trainer, run, on_plan
-        self.told: Plan | None = None
+    def __init__(
+        self,
+        trainer: Trainer,
+        run: Run | None,
+        on_step: Callable[[StepReport], None] | None,
+        on_plan: Callable[[Plan], None] | None,
+    ) -> None:
+        self.trainer, self.run, self.on_step, self.on_plan = trainer, run, on_step, on_plan
+        self.announced: Plan | None = None
         self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
         self.began = time.perf_counter()
-        self.noted, self.first_step = False, 0
+        self.recorded, self.first_step = False, 0
         self.saved = 0
-        self.told_stages: set[str] = set()
+        self.warned_stages: set[str] = set()
         self.untold = 0
+
+    def __enter__(self) -> _Session:  # noqa: PYI034  # Self came with 3.11
+        return self
+
+    def __exit__(self, _kind: object, error: BaseException | None, _where: object) -> None:
+        """Write a checkpoint if a driver's trial ends the training, so that nothing is lost."""
+        if isinstance(error, DriverError | TrialInterrupted):
+            written = self.rescue()
+            if written and isinstance(error, DriverError):
+                raise DriverError(f"{error}{written}") from error
 
     def resume(self) -> None:
         """Go on from the latest checkpoint, if there is one."""
@@ -127,8 +143,8 @@ class _Session:
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
-        """After a trial that failed or was interrupted: a checkpoint of the state that the step began with, if that is
-        whole. What was written, for the end of a sentence, or nothing."""
+        """Write a checkpoint of the state that the step began with, if that is whole, after a trial that failed or was
+        interrupted. The end of a sentence that says so, or nothing."""
         if self.run is None or not self.trainer.step_back():
             return ""
         try:
@@ -142,7 +158,7 @@ class _Session:
 
     def go_back(self) -> bool:
         """Tell what trouble there was; after too much of it go back to the last checkpoint, with smaller steps, and
-        after too much of that raise ClsplatError. Whether it went back."""
+        after too much of that raise ClsplatError. True if it went back."""
         trainer, patience = self.trainer, self.trainer.watch.patience
         self.tell_trouble()
         if not patience.over:
@@ -169,11 +185,11 @@ class _Session:
     def tell_trouble(self) -> None:
         """A warning for the first trouble of each stage; the rest is counted."""
         for incident in self.trainer.watch.incidents:
-            if incident.stage in self.told_stages:
+            if incident.stage in self.warned_stages:
                 self.untold += 1
             else:
                 warnings.warn(f"{incident} (more of this kind will be counted only)")
-            self.told_stages.add(incident.stage)
+            self.warned_stages.add(incident.stage)
         self.trainer.watch.incidents.clear()
 
     def tell_the_rest(self) -> None:
@@ -187,18 +203,18 @@ class _Session:
         """Raise ClsplatError, with what reproduces the trouble in the run's folder."""
         incident = self.trainer.watch.latest
         assert incident is not None, "patience is over only after trouble"
-        told = f"{incident}, and {RETURNS} returns with smaller steps did not help"
+        trouble = f"{incident}, and {RETURNS} returns with smaller steps did not help"
         if self.run is None:
-            raise ClsplatError(f"{told}: give a run, and what reproduces it is written there")
+            raise ClsplatError(f"{trouble}: give a run, and what reproduces it is written there")
         path = write_bundle(self.run.path, self.trainer, incident)
-        raise ClsplatError(f"{told}: {path} reproduces it (python -m clsplat.training.repro)")
+        raise ClsplatError(f"{trouble}: {path} reproduces it (python -m clsplat.training.repro)")
 
     def tell_plan(self) -> None:
         """Tell how the device's memory is used, at first and when more is done in pieces, or less."""
-        plan, told = self.trainer.plan, self.told
-        if self.on_plan is not None and (told is None or plan.pieces != told.pieces):
+        plan, announced = self.trainer.plan, self.announced
+        if self.on_plan is not None and (announced is None or plan.pieces != announced.pieces):
             self.on_plan(plan)
-        self.told = plan
+        self.announced = plan
 
     def report(self, result: Loss) -> StepReport | None:
         """Read the loss of the step just made; None where it is not finite."""
@@ -229,17 +245,10 @@ class _Session:
             space=photos_space(view.path for view in trainer.scene.views),
         )
 
-    def record(
-        self,
-        report: StepReport,
-        on_step: Callable[[StepReport], None] | None,
-        *,
-        evaluating: bool,
-        stages: dict[str, float] | None,
-    ) -> None:
+    def record(self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None) -> None:
         """Hand the report on, and write it down with what clsplat.report asks for."""
-        if on_step is not None:
-            on_step(report)
+        if self.on_step is not None:
+            self.on_step(report)
         record = asdict(report)
         if evaluating:
             record["eval"] = self.evaluate(keep=False)
@@ -248,16 +257,16 @@ class _Session:
         trainer = self.trainer
         if stages is not None:
             record["stages"] = stages
-        if not self.noted:
+        if not self.recorded:
             record["session"] = telemetry.session(trainer.device, self.first_step)
-            self.noted = True
+            self.recorded = True
         last = trainer.step == trainer.config.iterations
-        if last and trainer.config.report and (found := telemetry.contributions(trainer)) is not None:
-            record["contributions"] = found
+        if last and trainer.config.report and (histogram := telemetry.contributions(trainer)) is not None:
+            record["contributions"] = histogram
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """A warning where the pictures are none. Nothing where the memory is too little for a look."""
+        """A warning if the renders show nothing; no look at them if the memory is too small for one."""
         trainer, renderer = self.trainer, self.renderer
         background = background_colour(trainer.config.background)
 
@@ -276,7 +285,7 @@ class _Session:
             return False
         return step == config.iterations or (step % config.stages_every == 0 and step % REPORT_EVERY == 0)
 
-    def step(self, on_step: Callable[[StepReport], None] | None) -> None:
+    def step(self) -> None:
         """One step, and what is due after it."""
         trainer, config = self.trainer, self.trainer.config
         start, stages = time.perf_counter(), None
@@ -297,44 +306,13 @@ class _Session:
         if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
             report = self.report(result)
             if report is not None:
-                self.record(report, on_step, evaluating=evaluating, stages=stages)
+                self.record(report, evaluating=evaluating, stages=stages)
         if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
             self.save()
 
 
-@contextmanager
-def _rescued(session: _Session) -> Iterator[None]:
-    """Nothing is lost of what was trained where a driver's trial ends it."""
-    try:
-        yield
-    except DriverError as error:
-        if written := session.rescue():
-            raise DriverError(f"{error}{written}") from error
-        raise
-    except TrialInterrupted:
-        session.rescue()
-        raise
-
-
-def train(
-    scene: Scene,
-    config: TrainConfig,
-    *,
-    device: Device | str | None = None,
-    max_device_mem: str | int | None = None,
-    run: Run | None = None,
-    resume: bool = False,
-    on_step: Callable[[StepReport], None] | None = None,
-    on_plan: Callable[[Plan], None] | None = None,
-    between: Between | None = None,
-) -> Gaussians:
-    """Train like `clsplat.train`, for arguments that are `checked` and a run that is locked, and write no report."""
-    limit = parse_bytes(max_device_mem)
-    opened = device if isinstance(device, Device) else open_device(device, limit)
-    if isinstance(device, Device) and limit is not None:
-        opened = device.with_memory_limit(limit)
-    if run is None:
-        return _train(scene, config, opened, None, on_step=on_step, on_plan=on_plan, between=between)
+def _begin(run: Run, scene: Scene, config: TrainConfig, *, resume: bool) -> None:
+    """Record in a run what is trained. Raises InputError where it has been trained already, or on another scene."""
     if not resume and (run.checkpoints() or run.read_metrics()):
         raise InputError(
             f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
@@ -344,7 +322,6 @@ def train(
     if resume:
         scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
     scene_record.keep(run, scene, resuming=resume)
-    return _train(scene, config, opened, run, resume=resume, on_step=on_step, on_plan=on_plan, between=between)
 
 
 def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
@@ -383,37 +360,44 @@ def _tell_idle_settings(trainer: Trainer) -> None:
         )
 
 
-def _train(
+def train(
     scene: Scene,
     config: TrainConfig,
-    opened: Device,
-    run: Run | None,
     *,
+    device: Device | str | None = None,
+    max_device_mem: str | int | None = None,
+    run: Run | None = None,
     resume: bool = False,
-    on_step: Callable[[StepReport], None] | None,
-    on_plan: Callable[[Plan], None] | None,
-    between: Between | None,
+    on_step: Callable[[StepReport], None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
+    between: Between | None = None,
 ) -> Gaussians:
-    """Do the work of `train`, alone in the run's folder."""
+    """Train like `clsplat.train`, for arguments that are `checked` and a run that is locked, and write no report."""
+    limit = parse_bytes(max_device_mem)
+    opened = device if isinstance(device, Device) else open_device(device, limit)
+    if isinstance(device, Device) and limit is not None:
+        opened = device.with_memory_limit(limit)
+    if run is not None:
+        _begin(run, scene, config, resume=resume)
     if not (resume and run is not None and run.checkpoints()):
         for text in doubts.of_scene(scene, config.background):
             warnings.warn(text)
         if is_colourless(scene):
             warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
             scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
-    session = _Session(Trainer(scene, config, opened), run, on_plan)
+    session = _Session(Trainer(scene, config, opened), run, on_step, on_plan)
     trainer = session.trainer
     if resume:
         session.resume()
     session.first_step = trainer.step
     _tell_idle_settings(trainer)
     session.tell_plan()
-    with _rescued(session), _Interruption() as interrupted:
+    with session, _Interruption() as interrupted:
         while True:
             while trainer.step < config.iterations and not interrupted():
                 if between is not None:
                     between(trainer, interrupted)
-                session.step(on_step)
+                session.step()
             session.save()
             if trainer.step < config.iterations or not session.go_back():
                 break

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches over a training: notices that `adam` has refused steps, finds out why, and says what is to be done."""
+"""Watch over a training: notices that `adam` has refused steps, finds the stage at fault, and returns a remedy."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ class _Last:
 
 @dataclass(frozen=True, eq=False)
 class Remedy:
-    """rows: those to keep, or None for all; moments: what to put in place of those there are, by "first" and "second"
-    and by group, or None."""
+    """rows: those to keep, or None for all; moments: new values of all rows, by "first" and "second" and by group,
+    where they change."""
 
     rows: NDArray[np.uint32] | None
-    moments: Mapping[str, Mapping[str, NDArray[np.float32]]] | None
+    moments: Mapping[str, Mapping[str, NDArray[np.float32]]]
 
 
 class Watch:
-    """found: what a pass reads back, in the last four what `adam` counts (`Rasterizer.found`); names: of the views.
+    """readback: what a pass reads back, in the last four what `adam` counts (`Rasterizer.found`); names: of the views.
 
     incidents: those not told yet; patience: the count of trouble.
     """
 
-    def __init__(self, found: DeviceArray, names: Sequence[str]) -> None:
-        self.found, self.names = found, names
+    def __init__(self, readback: DeviceArray, names: Sequence[str]) -> None:
+        self.readback, self.names = readback, names
         self.patience = Patience()
         self.incidents: list[Incident] = []
         self.latest: Incident | None = None
@@ -54,7 +54,7 @@ class Watch:
     def forget(self) -> None:
         """Forget the last step and its trouble: the model is a new one."""
         self._last = self._noticed = None
-        self.found.fill(0)
+        self.readback.fill(0)
 
     def follow(self, step: int, view: int, background: NDArray[np.float32], sums: DeviceArray) -> None:
         """A step is under way, and has its loss."""
@@ -72,20 +72,19 @@ class Watch:
 
     def look(self) -> None:
         """Read the counts now, rather than wait for the next pass."""
-        self.notice([int(value) for value in self.found.get()[-len(REFUSED) :]])
+        self.notice([int(value) for value in self.readback.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:
         """A loss was read that is not finite; where no Gaussian is, `adam` has nothing to refuse."""
         if self._last is not None and self._noticed is None:
             self._noticed = (self._last, "loss", 0)
 
-    def examine(self, parameters: AnyGaussians, first: AnyGaussians, second: AnyGaussians) -> Remedy | None:
-        """The remedy for what was noticed, or None if nothing was."""
+    def examine(self, models: Mapping[str, AnyGaussians]) -> Remedy | None:
+        """The remedy for what was noticed, or None if nothing was; models: parameters, first and second moments."""
         if self._noticed is None:
             return None
         (last, stage, elements), self._noticed = self._noticed, None
-        self.found.fill(0)
-        models = {"parameters": parameters, "first": first, "second": second}
+        self.readback.fill(0)
         return self._judge(last, stage, elements, {k: {g: m[g].get() for g in GROUPS} for k, m in models.items()})
 
     def examine_all(self, arrays: Mapping[str, NDArray[np.float32]]) -> Remedy | None:
@@ -99,9 +98,9 @@ class Watch:
     def _judge(
         self, last: _Last, stage: str, elements: int, host: Mapping[str, Mapping[str, NDArray[np.float32]]]
     ) -> Remedy | None:
-        found = health.examine(**host)
-        lost = found.lost(stage)
-        concerned = np.flatnonzero(found.broken | found.refused)
+        findings = health.examine(**host)
+        lost = findings.lost(stage)
+        concerned = np.flatnonzero(findings.broken | findings.refused)
         hopeless = bool(np.mean(lost) > health.MOST_LOST)
         self.latest = Incident(
             step=last.step,
@@ -119,7 +118,7 @@ class Watch:
             return None
         moments = {k: {g: health.finite_or_zero(v) for g, v in host[k].items()} for k in ("first", "second")}
         rows = np.flatnonzero(~lost).astype(np.uint32)
-        return Remedy(rows if lost.any() else None, moments if found.refused.any() else None)
+        return Remedy(rows if lost.any() else None, moments if findings.refused.any() else {})
 
 
 def _done(stage: str, lost: int, count: int, *, hopeless: bool) -> str:

@@ -28,19 +28,20 @@ from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
-from clsplat.device.layout import SPLAT, SlotFields
+from clsplat.device.layout import SPLAT
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import atomic_writer, parse_json
 from clsplat.gaussians import GROUPS, group_shapes
-from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.runs.checkpoints import read_arrays
 from clsplat.runs.settings import config_text, parse_config
-from clsplat.stages.adam import REFUSED, adam
+from clsplat.stages.adam import REFUSED
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
-from clsplat.stages.loss import loss
-from clsplat.stages.target import target
-from clsplat.training.density import adaptive
+from clsplat.stages.loss import Loss
+from clsplat.stages.project import Slots
+from clsplat.training.density.strategies import STRATEGIES
 from clsplat.training.health import Incident, finite_or_zero
+from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
 
 if TYPE_CHECKING:
     from clsplat.training.trainer import Trainer
@@ -97,8 +98,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
         _forget_marks(models)
         alone = bool(first_trouble(replay(bundle(), device)))
     if not alone:
-        whole = {"parameters": trainer.parameters, "first": trainer.first, "second": trainer.second}
-        models = {kind: {g: model[g].get() for g in GROUPS} for kind, model in whole.items()}
+        models = {kind: {g: model[g].get() for g in GROUPS} for kind, model in trainer.models().items()}
         _forget_marks(models)
     record["of"] = len(models["parameters"]["means"]), trainer.parameters.count
     record["reproduced"] = alone or bool(first_trouble(replay(bundle(), device)))
@@ -130,10 +130,8 @@ def read_bundle(path: Path) -> Bundle:
 
 def _bundle_of(arrays: dict[str, NDArray[Any]], path: Path) -> Bundle:
     record = parse_json(arrays[RECORD].tobytes())
-    size = record["camera"]
-    lens = (size["width"], size["height"], size["fx"], size["fy"], size["cx"], size["cy"])
-    config, _ = parse_config(record["settings"], path, tell=False)
-    camera = Camera(*lens, arrays["rotation"], arrays["translation"], near=size["near"])
+    config, _ = parse_config(record["settings"], path)
+    camera = Camera(**record["camera"], rotation=arrays["rotation"], translation=arrays["translation"])
     models = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS}
     return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
 
@@ -163,35 +161,45 @@ def _checked(bundle: Bundle) -> Bundle:
     return bundle
 
 
+class _Counts(StepProbe):
+    """After each stage of a step: how many numbers are not finite."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.seen = (slice(None), slice(camera.height), slice(camera.width))
+        self.counts: dict[str, int] = {}
+
+    def forward(self, frame: Frame) -> None:
+        """Count in the splats that are drawn, and in the image."""
+        drawn = frame.projected.tile_counts.get() > 0
+        written = [column for column, name in enumerate(SPLAT) if name != "UNUSED"]
+        self.counts["project"] = _wrong(frame.projected.splats.get()[drawn][:, written])
+        self.counts["blend"] = _wrong(frame.blended.image.get()[self.seen])
+
+    def loss(self, result: Loss) -> None:
+        """Count in the loss's gradient."""
+        self.counts["loss"] = _wrong(result.gradient.get()[self.seen])
+
+    def pair_gradients(self, slots: Slots) -> None:
+        """Count in the gradients of pairs."""
+        self.counts["blend_grad"] = _wrong(slots.values.get())
+
+    def row_gradients(self, rows: StepRows) -> None:
+        """Count in the gradients of Gaussians."""
+        self.counts["project_grad"] = _wrong_in(rows.gradients)
+
+
 def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     """Make the step once more: after each stage how many numbers are not finite, and how many steps `adam` refuses."""
-    config, camera = bundle.config, bundle.camera
-    rasterizer = Rasterizer(device, config.rasterizer)
+    config, record = bundle.config, bundle.record
+    rasterizer, probe = Rasterizer(device, config.rasterizer), _Counts(bundle.camera)
     parameters, first, second = (_upload(device, bundle.models[kind]) for kind in _KINDS)
-    count, coefficients = parameters.count, parameters.coefficients
-    gradients = allocate_gaussians(device, count, coefficients, zero=True)
+    gradients = allocate_gaussians(device, parameters.count, parameters.coefficients, zero=True)
+    probe.counts["parameters"] = _wrong_in(parameters)
+    fields = slot_fields(STRATEGIES["adaptive"](config).needs(record["step"]))
+    step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
     background = upload(device, bundle.background)
-    planes = target(device, rasterizer.work, bundle.photograph, background)
-    fields = SlotFields(config.density.absolute_gradients, adaptive.wants_contributions(config.density))
-    result = {"parameters": _wrong(parameters)}
-    frame = rasterizer.forward(parameters, camera, background)
-    drawn = frame.projected.tile_counts.get() > 0
-    written = [column for column, name in enumerate(SPLAT) if name != "UNUSED"]
-    result["project"] = int(np.count_nonzero(~np.isfinite(frame.projected.splats.get()[drawn][:, written])))
-    image = frame.blended.image.get()[:, : camera.height, : camera.width]
-    result["blend"] = int(np.count_nonzero(~np.isfinite(image)))
-    lost = loss(device, rasterizer.work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight)
-    image_gradient = lost.gradient.get()[:, : camera.height, : camera.width]
-    result["loss"] = int(np.count_nonzero(~np.isfinite(image_gradient)))
-    slots = rasterizer.pair_gradients(frame, lost.gradient, fields=fields)
-    result["blend_grad"] = int(np.count_nonzero(~np.isfinite(slots.values.get())))
-    rasterizer.row_gradients(parameters, frame, frame.projected, slots, gradients, fields=fields)
-    result["project_grad"] = _wrong(gradients)
-    step, rates = bundle.record["step"], bundle.record["rates"]
-    moved = (parameters, gradients, first, second)
-    adam(device, step, rates, config.optimiser, *moved, frame.projected.tile_counts, rasterizer.found)
-    result["adam"] = int(rasterizer.found.get()[-len(REFUSED) :].sum())
-    return result
+    step.run((parameters, first, second), gradients, bundle.photograph, bundle.camera, background, probe)
+    return {**probe.counts, "adam": int(rasterizer.found.get()[-len(REFUSED) :].sum())}
 
 
 def first_trouble(counts: dict[str, int]) -> str | None:
@@ -204,8 +212,12 @@ def _upload(device: Device, arrays: dict[str, NDArray[np.float32]]) -> DeviceGau
     return DeviceGaussians(count, coefficients, {group: upload(device, arrays[group]) for group in GROUPS})
 
 
-def _wrong(gaussians: DeviceGaussians) -> int:
-    return sum(int(np.count_nonzero(~np.isfinite(gaussians[group].get()))) for group in GROUPS)
+def _wrong(values: NDArray[Any]) -> int:
+    return int(np.count_nonzero(~np.isfinite(values)))
+
+
+def _wrong_in(gaussians: DeviceGaussians) -> int:
+    return sum(_wrong(gaussians[group].get()) for group in GROUPS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -228,8 +240,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps({"counts": counts, "stage": stage, **bundle.record}, indent=2))
         return 0 if stage else 1
     print(bundle.record["message"])
-    kept, of = bundle.record["of"]
-    print(f"{kept:,} of {of:,} Gaussians, {bundle.camera.width}x{bundle.camera.height}; not finite after")
+    kept, count = bundle.record["of"]
+    print(f"{kept:,} of {count:,} Gaussians, {bundle.camera.width}x{bundle.camera.height}; not finite after")
     for name, count in counts.items():
         print(f"  {name:13}{count:>12,}")
     print(f"first in {stage}" if stage else "all is well on this device")

@@ -58,16 +58,12 @@ def spectrum_shares(image: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.array([amplitudes[highest < 0.5 / factor].sum() / total for factor in FACTORS])
 
 
-def some_of(count: int, most: int = 16) -> list[int]:
-    """At most `most` of `count` indices, evenly spread."""
-    return sorted({round(index) for index in np.linspace(0, count - 1, min(count, most))})
-
-
 def sizes_of(
     warmup: tuple[int, ...], frequency_steps: int, count: int, load: Callable[[int], NDArray[np.float32]]
 ) -> Sizes:
-    """Sizes by the spectra of some of `count` photographs, each read by `load`; by doubling where `frequency_steps` is
-    0."""
+    """Sizes by the spectra of at most 16 of `count` photographs, evenly spread and each read by `load`; by doubling
+    where `frequency_steps` is 0."""
     if frequency_steps == 0:
         return by_doubling(warmup)
-    return by_spectra((load(index) for index in some_of(count)), frequency_steps)
+    some = sorted({round(index) for index in np.linspace(0, count - 1, min(count, 16))})
+    return by_spectra((load(index) for index in some), frequency_steps)

@@ -67,8 +67,8 @@ def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
     with device.recorder.recording(device, wait=True) as stages:
         result = work()
     total = 1e3 * (time.perf_counter() - start)
-    found = {name: record.wall_ms for name, record in stages.items() if record.wall_ms > 0}
-    return result, {**found, "other": max(total - sum(found.values()), 0.0), "all": total}
+    times = {name: record.wall_ms for name, record in stages.items() if record.wall_ms > 0}
+    return result, {**times, "other": max(total - sum(times.values()), 0.0), "all": total}
 
 
 def contributions(trainer: Trainer, seconds: float = SECONDS) -> dict[str, Any] | None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,15 +16,14 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
-from clsplat.device.layout import SlotFields
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS, Gaussians, group_shapes
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.memory_needs import plan_step
-from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.initialise import from_scene
-from clsplat.stages.adam import adam, updates_sh_rest
+from clsplat.stages.adam import updates_sh_rest
 from clsplat.stages.density import (
     NO_ROW,
     DensityStatistics,
@@ -44,26 +43,21 @@ from clsplat.stages.device_gaussians import (
     download_gaussians,
     host_gaussians,
     host_zeros,
-    parts,
     to_device,
     to_host,
     upload_gaussians,
 )
-from clsplat.stages.loss import Loss, loss
-from clsplat.stages.project import Projected, Screen
-from clsplat.stages.target import target
-from clsplat.training.density import adaptive
+from clsplat.stages.loss import Loss
+from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
+from clsplat.training.density.strategies import STRATEGIES
 from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.photographs import Photographs
 from clsplat.training.resolution import sizes_of
+from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
-
-
-_Moved = tuple[DeviceGaussians, DeviceGaussians, DeviceGaussians, DeviceGaussians]
-"""Parameters, gradients, first and second moments."""
 
 
 @dataclass(frozen=True)
@@ -77,14 +71,66 @@ class _Mark:
     controlled: bool
 
 
+@dataclass(frozen=True, eq=False)
+class _Watched(StepProbe):
+    """Follows a training step: notices what is not finite, rehearses what changes the state, adds the statistics that
+    density control goes by."""
+
+    trainer: Trainer
+    step: GradientStep
+    view: int
+    camera: Camera
+    background: NDArray[np.float32]
+    needs: StatisticsNeeds
+
+    def forward(self, frame: Frame) -> None:
+        """Take the counts of the step before, which this pass has read back."""
+        self.trainer.watch.notice(frame.refused)
+
+    def loss(self, result: Loss) -> None:
+        """Remember the step, to look at if it turns out to have had trouble."""
+        self.trainer.watch.follow(self.step.step, self.view, self.background, result.sums)
+
+    def row_gradients(self, rows: StepRows) -> None:
+        """Before the first row changes, have every kernel rehearsed that changes the state: a driver may fail in
+        any."""
+        trainer, step, parameters = self.trainer, self.step, rows.parameters
+        sh_rest = updates_sh_rest(step.config.optimiser, step.step)
+        key = (parameters.count, parameters.coefficients, sh_rest, self.needs.gradients, self.needs.contributions)
+        if key not in trainer.rehearsed:
+            with only_tried(trainer.device):
+                self.add_statistics(trainer.statistics.rows(0, rows.stop - rows.start), rows)
+                step.update(rows)
+            trainer.rehearsed.add(key)
+        trainer.forget_mark()
+        self.add_statistics(trainer.statistics.rows(rows.start, rows.stop), rows)
+
+    def add_statistics(self, statistics: DensityStatistics, rows: StepRows) -> None:
+        """Add the step to the statistics of some rows, as far as density control needs them."""
+        device, camera, screen = self.trainer.device, self.camera, rows.screen
+        if self.needs.gradients:
+            add_statistics(device, statistics, camera, rows.projected, screen, self.needs.threshold)
+        if screen.contributions is not None and statistics.current is not None:
+            full = self.trainer.views[self.view].camera
+            area = full.width * full.height / (camera.width * camera.height)
+            add_contributions(device, statistics.current, rows.projected, screen.contributions, area)
+
+
 class Trainer:
     """A model in training: parameters, moments, statistics and the random state, all of which a checkpoint holds.
 
     watch: what is not finite in it, and how much of that there was.
     """
 
-    def __init__(self, scene: Scene, config: TrainConfig, device: Device, initial: Gaussians | None = None) -> None:
-        self.scene, self.config, self.device = scene, config, device
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        device: Device,
+        initial: Gaussians | None = None,
+        strategy: Callable[[TrainConfig], Strategy] = STRATEGIES["adaptive"],
+    ) -> None:
+        self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
         self.rasterizer = Rasterizer(device, config.rasterizer)
         self.photographs = Photographs(self.views)
@@ -97,39 +143,35 @@ class Trainer:
         self._start()
 
     def _start(self) -> None:
-        """Begin with the first step."""
+        """Set up the model and the state of step 0."""
         self.rng = np.random.default_rng(self.config.seed)
         self.step = 0
         self.queue: list[int] = []
         self.controlled = False
         self._mark: _Mark | None = None
-        self._second_halves: set[tuple[object, ...]] = set()
-        device, initial = self.device, self.given if self.given is not None else self._initial()
+        self.rehearsed: set[tuple[object, ...]] = set()
+        self.strategy = self._new_strategy(self.config)
+        initial = self.given
+        if initial is None:
+            initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.origin, self.near = initial.origin, self.scene.near
         self._make_plan(len(initial))
         if self.plan.streamed:
             self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
         else:
-            self._set_parameters(upload_gaussians(device, initial))
-
-    def _initial(self) -> Gaussians:
-        return from_scene(self.scene, self.config.random_points, self.rng)
+            self._set_parameters(upload_gaussians(self.device, initial))
 
     def _make_plan(self, count: int) -> None:
-        """Plan the way of `count` Gaussians through the device's memory, with all of their SH coefficients in the
-        end."""
-        settings = self.config.density
-        coefficients = (self.config.sh_degree + 1) ** 2
-        cameras = [view.camera for view in self.scene.views]
-        fields = SlotFields(settings.absolute_gradients, adaptive.wants_contributions(settings))
+        """Plan the device's memory for `count` Gaussians with all the SH coefficients that they will have."""
+        needs = self.strategy.needs()
         self.plan = plan_step(
             self.device,
             count,
-            coefficients,
-            cameras,
+            (self.config.sh_degree + 1) ** 2,
+            [view.camera for view in self.scene.views],
             self.config.rasterizer,
-            fields=fields,
-            agreement=adaptive.wants_agreement(settings),
+            fields=slot_fields(needs),
+            agreement=needs.agreement,
         )
         self.rasterizer.follow(self.plan)
 
@@ -142,12 +184,9 @@ class Trainer:
         self.first = first or self._zeros(count, coefficients)
         self.second = second or self._zeros(count, coefficients)
         self.gradients = self._new_gradients()
-        settings = self.config.density
+        needs = self.strategy.needs()
         self.statistics = new_statistics(
-            self.device,
-            count,
-            agreement=adaptive.wants_agreement(settings),
-            contributions=adaptive.wants_contributions(settings),
+            self.device, count, agreement=needs.agreement, contributions=needs.contributions
         )
 
     def _zeros(self, count: int, coefficients: int) -> AnyGaussians:
@@ -163,7 +202,7 @@ class Trainer:
 
     def _take_down(self) -> list[HostGaussians]:
         """Parameters, first and second moments on the host, and none of them on the device."""
-        models = [to_host(model) for model in (self.parameters, self.first, self.second)]
+        models = [to_host(model) for model in self.models().values()]
         del self.parameters, self.first, self.second, self.gradients
         return models
 
@@ -179,7 +218,7 @@ class Trainer:
         Kerbl et al. 2023, algorithm 1, but for where the loop is cut: a model is looked at, kept or finished before
         its Gaussians are split or made transparent, not just after.
         """
-        config, device, work = self.config, self.device, self.rasterizer.work
+        config = self.config
         self._note()
         self.mend()
         if not self.controlled:
@@ -192,37 +231,16 @@ class Trainer:
         image = self.photographs.load(view, factor)
         camera = self.local(self.views[view].camera.resized(image.shape[1], image.shape[0]))
         self.background.set(colour := self._background_colour())
-
-        planes = target(device, work, image, self.background)
-        frame = self.rasterizer.forward(self.parameters, camera, self.background)
-        self.watch.notice(frame.refused)
-        channels, settings = self.plan.channels, config.density
-        fields = SlotFields(settings.absolute_gradients, adaptive.wants_contributions(settings, self.step))
-        result = loss(
-            device, work, frame.blended.image, planes, camera.width, camera.height, config.dssim_weight, channels
+        needs = self.strategy.needs(self.step)
+        step = GradientStep(
+            self.device, self.rasterizer, config, self.step, self.rates(), slot_fields(needs), self.plan.channels
         )
-        self.watch.follow(self.step, view, colour, result.sums)
-        slots = self.rasterizer.pair_gradients(frame, result.gradient, fields=fields)
+        probe = _Watched(self, step, view, camera, colour, needs)
         model = (self.parameters, self.first, self.second)
-        for start, stop, (parameters, first, second) in parts(work, *model, keep=True):  # one, if the model fits
-            projected = frame.projected.rows(start, stop)
-            screen = self.rasterizer.row_gradients(
-                parameters,
-                frame,
-                projected,
-                slots.rows(start, stop),
-                self.gradients,
-                fields=fields,
-                sh_rest=updates_sh_rest(config.optimiser, self.step),
-            )
-            moved = (parameters, self.gradients, first, second)
-            counted = (projected.tile_counts, self.rasterizer.found)
-            self._try_second_half(view, camera, projected, screen, moved)
-            self._mark = None
-            self._add_statistics(self.statistics.rows(start, stop), view, camera, projected, screen)
-            adam(device, self.step, self.rates(), config.optimiser, *moved, *counted)
+        result = step.run(model, self.gradients, image, camera, self.background, probe)
         self.controlled = False
         self._note()
+        self._rearrange(self.strategy.after_gradient(self._state()))
         return result
 
     def _note(self, *, begun: bool = False) -> None:
@@ -230,9 +248,13 @@ class Trainer:
         number has risen."""
         self._mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
 
+    def forget_mark(self) -> None:
+        """From here on the state changes: `step_back` leads nowhere."""
+        self._mark = None
+
     def step_back(self) -> bool:
-        """After an error within a step: make the state that of its beginning, or of after its density control. Returns
-        whether that can be."""
+        """After an error within a step, make the state that of its beginning, or of after its density control. False
+        if that cannot be."""
         mark = self._mark
         if mark is None:
             return False
@@ -240,53 +262,24 @@ class Trainer:
         self.rng.bit_generator.state = mark.rng
         return True
 
-    def _try_second_half(self, view: int, camera: Camera, projected: Projected, screen: Screen, moved: _Moved) -> None:
-        """Have every kernel rehearsed that changes the state, before the first does: a driver may fail in any."""
-        parameters, settings = moved[0], self.config.optimiser
-        key = (
-            parameters.count,
-            parameters.coefficients,
-            updates_sh_rest(settings, self.step),
-            self.step < self.config.density.stop,
-            screen.contributions is not None,
-        )
-        if key in self._second_halves:
-            return
-        with only_tried(self.device):
-            self._add_statistics(
-                self.statistics.rows(0, projected.tile_counts.shape[0]), view, camera, projected, screen
-            )
-            adam(self.device, self.step, self.rates(), settings, *moved, projected.tile_counts, self.rasterizer.found)
-        self._second_halves.add(key)
-
-    def _add_statistics(
-        self, statistics: DensityStatistics, view: int, camera: Camera, projected: Projected, screen: Screen
-    ) -> None:
-        """Add the step to the statistics that density control goes by, as long as it needs them."""
-        settings = self.config.density
-        if self.step < settings.stop:
-            add_statistics(self.device, statistics, camera, projected, screen, settings.gradient_threshold)
-        if screen.contributions is not None and statistics.current is not None:
-            full = self.views[view].camera
-            area = full.width * full.height / (camera.width * camera.height)
-            add_contributions(self.device, statistics.current, projected, screen.contributions, area)
-
     def mend(self, *, look: bool = False) -> None:
-        """See to the Gaussians in which something was not finite, if that has been noticed; look: read whether there
-        is something to notice."""
+        """Mend the Gaussians in which something was not finite, if that has been noticed; look: read the counts
+        first."""
         if look:
             self.watch.look()
-        self._apply(self.watch.examine(self.parameters, self.first, self.second))
+        self._apply(self.watch.examine(self.models()))
+
+    def models(self) -> dict[str, AnyGaussians]:
+        """Parameters, first and second moments, by the names that they have in a checkpoint."""
+        return {"parameters": self.parameters, "first": self.first, "second": self.second}
 
     def _apply(self, remedy: Remedy | None) -> None:
         if remedy is None:
             return
-        for kind, groups in (remedy.moments or {}).items():
+        for kind, groups in remedy.moments.items():
             for group, values in groups.items():
-                (self.first if kind == "first" else self.second)[group].set(values)
-        if remedy.rows is not None:
-            none = np.zeros(len(remedy.rows), bool)
-            self._rearrange(adaptive.Plan(remedy.rows, none, none), densified=False)
+                self.models()[kind][group].set(values)
+        self._rearrange(RowPlan(remedy.rows))
 
     def rates(self) -> dict[str, float]:
         """Learning rate of each group at this step. The means' falls exponentially; all fall in the cooldown, and with
@@ -319,91 +312,56 @@ class Trainer:
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
         coefficients = (degree + 1) ** 2
         if coefficients > self.parameters.coefficients:
-            models = [self.parameters, self.first, self.second] if self.plan.gathers else self._take_down()
-            self.parameters, self.first, self.second = (
-                self._placed(widen(self.device, model, coefficients)) for model in models
-            )
+            models = [*self.models().values()] if self.plan.gathers else self._take_down()
+            wider = (self._placed(widen(self.device, model, coefficients)) for model in models)
+            self.parameters, self.first, self.second = wider
             self.gradients = self._new_gradients()
 
     def _control_density(self) -> None:
-        config = self.config.density
-        if self.step == 0:
+        if self.step > 0 and self.strategy.is_due(self.step):
+            self.mend(look=True)
+            self._note()
+            self._rearrange(self.strategy.before_step(self._state()))
+
+    def _state(self) -> ModelState:
+        model, statistics = self.parameters, self.statistics.named()
+        return ModelState(model.count, self.step, self.scene.extent, model.arrays, statistics, self.rng)
+
+    def _rearrange(self, plan: RowPlan | None) -> None:
+        """Carry out what density control, or a repair, has planned for the rows of everything."""
+        if plan is None:
             return
-        due, prunes = adaptive.is_due(config, self.step), adaptive.is_pruning_due(config, self.step)
-        resets = adaptive.is_reset_due(config, self.step, white=self.config.background == "white")
-        self.mend(look=due or prunes or resets)
-        self._note()
-        if due:
-            self._densify()
-        elif prunes:
-            self._prune()
-        if resets:
-            logits = self.parameters["opacity_logits"]
-            logits.set(adaptive.reset_opacities(config, logits.get()))
-            self.first["opacity_logits"].fill(0.0)
-            self.second["opacity_logits"].fill(0.0)
+        if plan.rows is not None:
+            self._move(plan.rows, plan.fresh, new_statistics=plan.new_statistics)
+        self._mark = None
+        for group, (rows, values) in plan.values.items():
+            changed = self.parameters[group].get()
+            changed[rows] = values
+            self.parameters[group].set(changed)
+        for group in plan.restarted:
+            self.first[group].fill(0.0)
+            self.second[group].fill(0.0)
+        if plan.forget_contributions:
             self.statistics.forget_contributions()
 
-    def _contributions(self) -> adaptive.Contributions | None:
-        current, whole = self.statistics.current, self.statistics.whole
-        if current is None or whole is None:
-            return None
-        return adaptive.Contributions(whole.totals.get(), np.maximum(current.largest.get(), whole.largest.get()))
-
-    def _prune(self) -> None:
-        plan = adaptive.plan_pruning(
-            self.config.density,
-            self.step,
-            opacity_logits=self.parameters["opacity_logits"].get(),
-            contributions=self._contributions(),
-        )
-        self._rearrange(plan, densified=False)
-
-    def _densify(self) -> None:
-        config, agreeing = self.config.density, self.statistics.agreeing
-        plan = adaptive.plan(
-            config,
-            self.step,
-            self.scene.extent,
-            gradient_sums=self.statistics.gradient_sums.get(),
-            seen=self.statistics.seen.get(),
-            radii=self.statistics.radii.get(),
-            log_scales=self.parameters["log_scales"].get(),
-            opacity_logits=self.parameters["opacity_logits"].get(),
-            agreeing=agreeing.get() if agreeing is not None else None,
-            contributions=self._contributions(),
-        )
-        self._rearrange(plan, densified=True)
-
-    def _rearrange(self, plan: adaptive.Plan, *, densified: bool) -> None:
-        """Move the rows of everything to their places in the plan."""
-        config, device = self.config.density, self.device
-        if len(plan.rows) == 0:
-            raise ClsplatError(
-                f"step {self.step}: every Gaussian was pruned; lower --density.min-opacity"
-                + (" or --density.min-contribution" if config.min_contribution > 0 else "")
-            )
-        gathers = self.plan.gathers
+    def _move(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_] | None, *, new_statistics: bool) -> None:
+        """Make row j of everything what row rows[j] was, with moments of zero where it is fresh."""
+        device, gathers = self.device, self.plan.gathers
+        fresh = np.zeros(len(rows), bool) if fresh is None else fresh
         with only_tried(device):
-            try_gather(device, len(plan.rows), self.parameters)
+            try_gather(device, len(rows), self.parameters)
         self._mark = None
-        self._make_plan(len(plan.rows))
-        models = [self.parameters, self.first, self.second] if gathers and self.plan.gathers else self._take_down()
-        statistics = self.statistics.moved(plan.rows, plan.fresh, densified=densified)
+        self._make_plan(len(rows))
+        models = [*self.models().values()] if gathers and self.plan.gathers else self._take_down()
+        statistics = self.statistics.moved(rows, fresh, densified=new_statistics)
         del self.statistics
-        moment_rows = np.where(plan.fresh, NO_ROW, plan.rows)
-        rows_of = (plan.rows, moment_rows, moment_rows)
+        moment_rows = np.where(fresh, NO_ROW, rows)
+        rows_of = (rows, moment_rows, moment_rows)
         parameters, first, second = (gather(device, r, model) for r, model in zip(rows_of, models, strict=True))
         del models
-        if plan.split.any():
-            host = {name: parameters[name].get() for name in ("means", "quaternions", "log_scales")}
-            halves = {name: values[plan.split] for name, values in host.items()}
-            means, log_scales = adaptive.split_halves(config, **halves, rng=self.rng)
-            host["means"][plan.split], host["log_scales"][plan.split] = means, log_scales
-            parameters["means"].set(host["means"])
-            parameters["log_scales"].set(host["log_scales"])
         self._set_parameters(*(self._placed(model) for model in (parameters, first, second)))
         self.statistics.load(statistics)
+        self.strategy.rearranged(rows, fresh)
 
     def local(self, camera: Camera) -> Camera:
         """A camera in the world as one for the model in training: see `Gaussians.local`."""
@@ -430,8 +388,8 @@ class Trainer:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
-        for kind, source in (("parameters", self.parameters), ("first", self.first), ("second", self.second)):
-            arrays.update({f"{kind}/{group}": source[group].get() for group in GROUPS})
+        arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
+        arrays |= {f"{kind}/{group}": model[group].get() for kind, model in self.models().items() for group in GROUPS}
         return arrays
 
     def restart(self) -> None:
@@ -460,12 +418,12 @@ class Trainer:
         del self.parameters, self.first, self.second, self.gradients, self.statistics
         self._make_plan(loaded[0].count)
         self._set_parameters(*(self._placed(model) for model in loaded))
-        prefix = "statistics/"
-        found = {name[len(prefix) :]: each for name, each in checkpoint.arrays.items() if name.startswith(prefix)}
+        statistics = _named(checkpoint, "statistics/")
         for name, array in self.statistics.named().items():
-            if name in found and (found[name].shape, found[name].dtype) != (array.shape, array.dtype):
-                raise unusable(checkpoint, f"{prefix}{name} has shape {found[name].shape}")
-        self.statistics.load(found)  # what the settings did not ask for before the checkpoint is not known
+            if name in statistics and (statistics[name].shape, statistics[name].dtype) != (array.shape, array.dtype):
+                raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
+        self.statistics.load(statistics)  # what the settings did not ask for before the checkpoint is not known
+        self.strategy.load(_named(checkpoint, "strategy/"))
 
     def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
         for group in GROUPS:
@@ -484,6 +442,11 @@ class Trainer:
             )
         arrays = {group: HostArray(values) for group, values in host.items()}
         return HostGaussians(count, coefficients, arrays, count)
+
+
+def _named(checkpoint: Checkpoint, prefix: str) -> dict[str, NDArray[Any]]:
+    """Arrays of a checkpoint whose names begin so, by the rest of their names."""
+    return {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)}
 
 
 def unusable(checkpoint: Checkpoint, why: str) -> InputError:

@@ -132,7 +132,7 @@ def render_picture(
     if look.mode in ("depth", "count"):
         frame, channels = renderer.render_channels(model, camera, background=background, contiguous=False)
         if look.mode == "depth":
-            return depth_picture(channels.depth, frame.alpha)
-        return count_picture(channels.count)
+            return depth_picture(channels["depth"], frame.alpha)
+        return count_picture(channels["count"])
     frame = renderer.render(model, camera, background, contiguous=False)
     return (alpha_picture(frame.alpha) if look.mode == "alpha" else colour_picture(frame.image)), ""

@@ -10,7 +10,7 @@ from pipeline import BACKGROUND, Pipeline
 from quick import quick
 from scenes import NAMED, SHAPE_MATTERS, overlap, random_cloud
 
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
@@ -72,7 +72,7 @@ def test_in_every_shape(shaped_device: Device, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["random_cloud", "overlap", "many_per_tile"])
 def test_bands_of_squares_whose_pairs_are_sorted(default_device: Device, name: str) -> None:
-    check(default_device, name, config=RasterizerConfig(tile_test="square", depth_sort="pairs", key_bits="all"))
+    check(default_device, name, config=BenchSwitches(tile_test="square", depth_sort="pairs", key_bits="all"))
 
 
 def test_absolute_gradients(default_device: Device) -> None:

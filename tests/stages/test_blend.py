@@ -11,7 +11,7 @@ import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
 from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.reference import render as reference
@@ -165,7 +165,7 @@ def check_skip(device: Device, name: str) -> None:
     """As good as visiting them, but for the sign of zeros; some pairs lie in such cells alone."""
     runs = [
         Pipeline.run(device.with_switches(kernel_defines(config)), scenes.NAMED[name]())
-        for config in (RasterizerConfig(), RasterizerConfig(gradient_skip=False))
+        for config in (RasterizerConfig(), BenchSwitches(gradient_skip=False))
     ]
     values = np.random.default_rng(0).standard_normal(runs[0].frame.blended.image.shape).astype(np.float32)
     values[:, :, : values.shape[2] // 2] = 0.0

@@ -9,7 +9,7 @@ import scenes
 from pipeline import Pipeline
 from quick import quick
 
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
@@ -87,7 +87,7 @@ def test_equal_depths_go_by_index(device: Device) -> None:
 @pytest.mark.parametrize("name", quick(NAMES, *IN_EVERY_SHAPE))
 def test_squares_are_those_of_the_longest_half_axis(device: Device, name: str) -> None:
     scene = make(name)
-    run = Pipeline.run(device, scene, config=RasterizerConfig(tile_test="square"))
+    run = Pipeline.run(device, scene, config=BenchSwitches(tile_test="square"))
     projected, camera = reference.forward(*scene).projected, run.camera
     size = camera.width, camera.height
     # A hair inside the threshold as above; TILE_SLACK is 0.01 pixels, and float32 loses a part in 1e5 of wide squares.
@@ -103,7 +103,7 @@ def test_squares_are_those_of_the_longest_half_axis(device: Device, name: str) -
 @pytest.mark.parametrize("key_bits", ["needed", "all"])
 def test_sorting_all_pairs_makes_the_same_lists(shaped_device: Device, key_bits: str, name: str) -> None:
     wanted = Pipeline.run(shaped_device, make(name)).frame
-    config = RasterizerConfig(depth_sort="pairs", key_bits=key_bits)  # type: ignore[arg-type]  # one of them
+    config = BenchSwitches(depth_sort="pairs", key_bits=key_bits)  # type: ignore[arg-type]  # one of them
     got = Pipeline.run(shaped_device, make(name), config=config).frame
     for array in ("ranges", "gaussian_from_sorted", "slot_from_sorted"):
         np.testing.assert_array_equal(getattr(got.lists, array).get(), getattr(wanted.lists, array).get(), array)
@@ -149,7 +149,7 @@ def test_fewer_bits_are_fewer_launches(default_device: Device) -> None:
     gaussians.means[:] = scenes.world_from_pixels(camera, pixels, rng.uniform(2, 3, len(gaussians)))
     launches = {}
     for key_bits in ("needed", "all"):
-        config = RasterizerConfig(key_bits=key_bits)  # type: ignore[arg-type]  # one of them
+        config = BenchSwitches(key_bits=key_bits)  # type: ignore[arg-type]  # one of them
         run = Pipeline.run(device, (gaussians, camera), config=config)
         assert run.visible.sum() > BITONIC_WINS["cpu"]
         with device.recorder.recording(device, wait=False) as stages:

@@ -15,11 +15,12 @@ from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 
 from clsplat.camera import Camera
 from clsplat.config.pictures import DeepConfig
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep
-from clsplat.frame.window import crop, on_tiles
+from clsplat.frame.draw import on_tiles
+from clsplat.frame.window import crop
 from clsplat.reference import deep as deep_twin
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
@@ -80,7 +81,7 @@ def test_against_the_twin(device: Device, name: str) -> None:
     solid = (wanted.alpha > 0.5) & ~unsure
     assert solid.any()
     # The bound, relative to what a value is made of.
-    for field, plane in {"depth": found.depth, **found.fields}.items():
+    for field, plane in {name: found[name] for name in ("depth", *FEATURES)}.items():
         of, got = (values.reshape(*solid.shape, -1)[solid] for values in (getattr(wanted, field), plane))
         size = np.abs(of).max(axis=1, keepdims=True)
         assert_close(got / size, of / size, absolute=1e-4, name=field)
@@ -137,19 +138,18 @@ def test_the_same_bits_on_every_driver() -> None:
 
 
 def assert_same_pictures(got: tuple[RenderResult, ChannelResult], wanted: tuple[RenderResult, ChannelResult]) -> None:
-    for one, of in zip(got, wanted, strict=True):
-        for name, values in vars(of).items():
-            if name != "fields":
-                assert_same_bits(getattr(one, name), values)
-    for name in FEATURES:
-        assert_same_bits(got[1].fields[name], wanted[1].fields[name])
+    assert_same_bits(got[0].image, wanted[0].image)
+    assert_same_bits(got[0].alpha, wanted[0].alpha)
+    assert got[1].keys() == wanted[1].keys()
+    for name, values in wanted[1].items():
+        assert_same_bits(got[1][name], values)
 
 
 @pytest.mark.parametrize("change", [{"frustum_cull": False}, {"opacity_cull": False}, {"tile_test": "square"}])
 def test_exact_switches_change_no_bit(default_device: Device, change: dict[str, bool]) -> None:
     gaussians, camera = orthographic(scenes.off_frustum())
     plain = Renderer(default_device).render(gaussians, camera, BACKGROUND)
-    other = Renderer(default_device, config=RasterizerConfig(**change)).render(gaussians, camera, BACKGROUND)  # type: ignore[arg-type]
+    other = Renderer(default_device, config=BenchSwitches(**change)).render(gaussians, camera, BACKGROUND)  # type: ignore[arg-type]
     assert_same_bits(other.image, plain.image)
     assert_same_bits(other.alpha, plain.alpha)
 
@@ -199,11 +199,11 @@ def test_a_wall(device: Device) -> None:
     after = replace(camera, translation=np.array([0.25, 0.5, 1.0]))
     for view, sign in ((camera, 1.0), (replace(camera, cy=6 - 30.0, projection="perspective"), -1.0)):
         found = Renderer(device).render_channels(gaussians, view, ("normal",))[1]
-        assert_close(found.fields["normal"][6, 10], [0.0, sign * half, -sign * half], absolute=1e-6)
+        assert_close(found["normal"][6, 10], [0.0, sign * half, -sign * half], absolute=1e-6)
     found = Renderer(device).render_channels(gaussians, camera, FEATURES, after=after)[1]
-    assert_close(found.depth[6, 10], 2.0, relative=1e-6)
-    assert_close(found.fields["position"][6, 10], [0.0, 30.0, 2.0], relative=1e-6)
-    assert_close(found.fields["motion"][6, 10], [0.5, 1.0], absolute=1e-5)
+    assert_close(found["depth"][6, 10], 2.0, relative=1e-6)
+    assert_close(found["position"][6, 10], [0.0, 30.0, 2.0], relative=1e-6)
+    assert_close(found["motion"][6, 10], [0.5, 1.0], absolute=1e-5)
 
 
 def test_windows_and_little_memory_change_no_bit() -> None:
@@ -215,7 +215,7 @@ def test_windows_and_little_memory_change_no_bit() -> None:
     cut = np.s_[21:81, 37:137]
     assert_same_bits(np.ascontiguousarray(image.image[rows, columns]), np.ascontiguousarray(whole[0].image[cut]))
     for name in FEATURES:
-        got, wanted = found.fields[name][rows, columns], whole[1].fields[name][cut]
+        got, wanted = found[name][rows, columns], whole[1][name][cut]
         assert_same_bits(np.ascontiguousarray(got), np.ascontiguousarray(wanted))
     limit = 8 << 20
     device = open_device(None, limit)

@@ -95,7 +95,7 @@ def assert_close_channels(found: ChannelResult, wanted: every_pixel.Picture) -> 
     """The issue's bound where alpha is over one half, relative to what a value is made of."""
     solid = (wanted.alpha > 0.5) & (wanted.margin > 3e-4)
     assert solid.mean() > 0.2
-    fields = {"depth": found.depth, **found.fields}
+    fields = {name: plane for name, plane in found.items() if name not in ("median", "first", "count", "index")}
     assert set(fields) == {"depth", *FEATURES}
     for name, plane in fields.items():
         of, got = (values.reshape(*solid.shape, -1)[solid] for values in (getattr(wanted, name), plane))
@@ -115,7 +115,7 @@ def test_the_same_bits_in_every_shape(device: Device, every: bool, name: str) ->
         assert_same_bits(image.image, first[0].image)
         assert_same_bits(image.alpha, first[0].alpha)
         for feature in FEATURES:
-            assert_same_bits(found.fields[feature], first[1].fields[feature])
+            assert_same_bits(found[feature], first[1][feature])
 
 
 def one_at(direction: list[float]) -> Gaussians:
@@ -128,7 +128,7 @@ def one_at(direction: list[float]) -> Gaussians:
 def motion_of(device: Device, direction: list[float], camera: Camera, after: Camera) -> np.ndarray:
     """Of the pixel that has most of it."""
     image, found = Renderer(device).render_channels(one_at(direction), camera, ("motion",), after=after)
-    motion: np.ndarray = found.fields["motion"][np.unravel_index(np.argmax(image.alpha), image.alpha.shape)]
+    motion: np.ndarray = found["motion"][np.unravel_index(np.argmax(image.alpha), image.alpha.shape)]
     return motion
 
 
@@ -228,10 +228,10 @@ def test_what_is_not_finite_is_left_out_alone(default_device: Device, name: str,
     clean.opacity_logits[7] = -20.0
     getattr(broken, group)[7] = value
     wanted, got = (renderer.render_channels(gaussians, camera, ("normal", "position")) for gaussians in (clean, broken))
-    for planes in (got[0].image, got[0].alpha, got[1].depth, *got[1].fields.values()):
+    for planes in (got[0].image, got[0].alpha, *got[1].values()):
         assert np.isfinite(planes).all()
     # Opaque, black and scaled to a point are Gaussians as good as any.
     drawn = (group, np.sign(value)) in (("opacity_logits", 1.0), ("sh", -1.0), ("log_scales", -1.0))
     if not drawn:
         assert_same_bits(got[0].image, wanted[0].image)
-        assert_same_bits(got[1].index, wanted[1].index)
+        assert_same_bits(got[1]["index"], wanted[1]["index"])

@@ -206,10 +206,8 @@ class _Meta:
             raise InputError(f"{self.path}: {section} in {META} has no file {index}")
         least = self.count if least is None else least
         file = self.files.file(names[index], FREE_BYTES + 8 * least)
-        hints = oiio.ImageSpec()
-        hints.attribute("oiio:UnassociatedAlpha", 1)
         try:
-            source = open_image(file, hints)
+            source = open_image(file, straight=True)
             spec = source.spec()
             pixels = spec.width * spec.height
             if pixels < least or spec.nchannels < channels:

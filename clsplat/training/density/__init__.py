@@ -1,2 +1,98 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Density control: policy only, without OpenCL."""
+"""Density control: strategies decide which Gaussians are copied, dropped and changed. Policy only, without OpenCL."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
+
+
+@dataclass(frozen=True, eq=False)
+class StatisticsNeeds:
+    """Statistics that a strategy goes by.
+
+    gradients: sums of the gradients on the screen, views and radii; absolute: sums of the gradients' absolute values by
+    pixel (AbsGS); agreement: the number of views with a gradient of at least `threshold`; contributions: shares in the
+    pictures of an epoch.
+    """
+
+    gradients: bool = False
+    absolute: bool = False
+    agreement: bool = False
+    threshold: float = 0.0
+    contributions: bool = False
+
+
+class HostCopy(Protocol):
+    """An array on the device or the host."""
+
+    def get(self) -> NDArray[Any]:
+        """A copy on the host."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelState:
+    """The model of `count` Gaussians after `step` steps, as a strategy sees it. extent: the scene's, in world units;
+    parameters by group; statistics by the names that they have in a checkpoint."""
+
+    count: int
+    step: int
+    extent: float
+    parameters: Mapping[str, HostCopy]
+    statistics: Mapping[str, HostCopy]
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, eq=False)
+class RowPlan:
+    """The rows of the model as they are to become.
+
+    rows (m,) uint32: the row that each is a copy of, None if all stay; fresh (m,) bool: rows whose moments start at
+    zero and whose contributions are not known; values: by parameter group, the indices of rows that change, counted as
+    they are then, and what they become (k, ...); restarted: groups whose moments start at zero in every row.
+    new_statistics: all but contributions start from zero; forget_contributions: of no row they are known.
+    """
+
+    rows: NDArray[np.uint32] | None = None
+    fresh: NDArray[np.bool_] | None = None
+    values: Mapping[str, tuple[NDArray[Any], Float32]] = field(default_factory=dict)
+    restarted: tuple[str, ...] = ()
+    new_statistics: bool = False
+    forget_contributions: bool = False
+
+
+class Strategy:
+    """Density control of one training. A strategy defines `needs`, `is_due` and `before_step`, and of the others what
+    it has a use for."""
+
+    def needs(self, step: int = 0) -> StatisticsNeeds:
+        """Statistics that this step, from 1, has to gather; of step 0: that any step has to."""
+        raise NotImplementedError
+
+    def is_due(self, step: int) -> bool:
+        """True if `before_step` may have a plan after `step` steps: then the model is looked through first."""
+        raise NotImplementedError
+
+    def before_step(self, model: ModelState) -> RowPlan | None:
+        """The plan after `model.step` steps, which is carried out as the next one begins."""
+        raise NotImplementedError
+
+    def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002  # most have none
+        """The plan at the end of step number `model.step`, behind Adam's."""
+        return None
+
+    def rearranged(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]) -> None:
+        """Row j of the model is now what row rows[j] was, by a plan of this strategy or because others were broken."""
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The strategy's own state by name, for a checkpoint."""
+        return {}
+
+    def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Take the state that a checkpoint has."""

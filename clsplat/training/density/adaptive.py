@@ -4,12 +4,80 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.config.training import DensityConfig
+from clsplat.config.training import DensityConfig, TrainConfig
+from clsplat.errors import ClsplatError
+from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
+
+
+class Adaptive(Strategy):
+    """The strategy of Kerbl et al., with what `DensityConfig` adds to it."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        self.config, self.white = config.density, config.background == "white"
+
+    def needs(self, step: int = 0) -> StatisticsNeeds:
+        """Gradients as long as Gaussians are densified, the others where some pruning at the end of this step or later
+        goes by them."""
+        config = self.config
+        densifies = config.every > 0 and step < config.stop
+        prunes = config.min_contribution > 0 and (config.prune_every > 0 or densifies)
+        prunes_a_share = config.prune_fraction > 0 and step <= max(config.prune_at, default=-1)
+        return StatisticsNeeds(
+            gradients=step < config.stop,
+            absolute=config.absolute_gradients,
+            agreement=config.every > 0 and config.views_agree > 1,
+            threshold=config.gradient_threshold,
+            contributions=prunes or prunes_a_share,
+        )
+
+    def is_due(self, step: int) -> bool:
+        """True if Gaussians are densified or pruned, or opacities are reset."""
+        rows_change = is_due(self.config, step) or is_pruning_due(self.config, step)
+        return rows_change or is_reset_due(self.config, step, white=self.white)
+
+    def before_step(self, model: ModelState) -> RowPlan:
+        """Densify or prune, then reset opacities, whichever is due."""
+        config, step = self.config, model.step
+        chosen: Plan | None = None
+        if densifies := is_due(config, step):
+            chosen = plan(config, model)
+        elif is_pruning_due(config, step):
+            chosen = plan_pruning(config, model)
+        logits, values = model.parameters["opacity_logits"].get(), {}
+        if chosen is not None:
+            if len(chosen.rows) == 0:
+                raise ClsplatError(
+                    f"step {step}: every Gaussian was pruned; lower --density.min-opacity"
+                    + (" or --density.min-contribution" if config.min_contribution > 0 else "")
+                )
+            logits, values = logits[chosen.rows], _halves(config, chosen, model)
+        if resets := is_reset_due(config, step, white=self.white):
+            values["opacity_logits"] = np.arange(len(logits)), reset_opacities(config, logits)
+        return RowPlan(
+            rows=chosen.rows if chosen is not None else None,
+            fresh=chosen.fresh if chosen is not None else None,
+            values=values,
+            restarted=("opacity_logits",) if resets else (),
+            new_statistics=densifies,
+            forget_contributions=resets,
+        )
+
+
+def _halves(config: DensityConfig, chosen: Plan, model: ModelState) -> dict[str, tuple[NDArray[Any], Float32]]:
+    """Rows of the halves of what is split, and their means and log scales."""
+    halves = np.flatnonzero(chosen.split)
+    if len(halves) == 0:
+        return {}
+    names = ("means", "quaternions", "log_scales")
+    origins = {name: model.parameters[name].get()[chosen.rows[halves]] for name in names}
+    means, log_scales = split_halves(config, **origins, rng=model.rng)
+    return {"means": (halves, means), "log_scales": (halves, log_scales)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,124 +113,79 @@ def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
     )
 
 
-def wants_contributions(config: DensityConfig, step: int = 0) -> bool:
-    """True if the Gaussians' contributions have to be known in this step: some pruning at its end or later goes by
-    them."""
-    last_fraction = max(config.prune_at) if config.prune_fraction > 0 and config.prune_at else -1
-    if step <= last_fraction:
-        return True
-    return config.min_contribution > 0 and (config.prune_every > 0 or (config.every > 0 and step < config.stop))
-
-
-def wants_agreement(config: DensityConfig) -> bool:
-    """True if the views over the threshold are to be counted."""
-    return config.every > 0 and config.views_agree > 1
-
-
-@dataclass(frozen=True, eq=False)
-class Contributions:
-    """Contributions of each Gaussian to the pictures, in pixels; (n,), infinite where they are not known yet.
-
-    totals: over the views of the last whole epoch; largest: of any view in that epoch and the one under way.
-    """
-
-    totals: Float32
-    largest: Float32
-
-
-def plan(
-    config: DensityConfig,
-    step: int,
-    extent: float,
-    *,
-    gradient_sums: Float32,
-    seen: Float32,
-    radii: Float32,
-    log_scales: Float32,
-    opacity_logits: Float32,
-    agreeing: Float32 | None = None,
-    contributions: Contributions | None = None,
-) -> Plan:
+def plan(config: DensityConfig, model: ModelState) -> Plan:
     """Clone the small and split the large among those with a large mean gradient; prune the transparent, the oversized
-    and what hardly contributes.
-
-    gradient_sums, seen, radii, opacity_logits (n,); log_scales (n, 3); extent: the scene's, in world units; agreeing
-    (n,): views over the threshold, where the settings ask for it; contributions: likewise.
-    """
-    n = len(seen)
-    useless = _useless(config, step, contributions, n)
+    and what hardly contributes."""
+    gradient_sums, seen, radii = (model.statistics[name].get() for name in ("gradient_sums", "seen", "radii"))
+    useless = _useless(config, model)
     with np.errstate(invalid="ignore"):
         gradients = np.asarray(gradient_sums / np.maximum(seen, 1), np.float32)
     gradients[~np.isfinite(gradients)] = 0  # statistics that something has spoilt ask for nothing
-    wanted = _wanted(config, step, gradients, agreeing, useless)
-    sizes = np.exp(log_scales.max(axis=1))
-    large = sizes > config.dense_fraction * extent
+    wanted = _wanted(config, model, gradients, useless)
+    sizes = np.exp(model.parameters["log_scales"].get().max(axis=1))
+    large = sizes > config.dense_fraction * model.extent
     to_clone, to_split = np.flatnonzero(wanted & ~large), np.flatnonzero(wanted & large)
     kept = np.flatnonzero(~(wanted & large))
 
     rows = np.concatenate([kept, to_clone, to_split, to_split])
     origin = np.repeat([0, 1, 2], [len(kept), len(to_clone), 2 * len(to_split)])
     sizes_after = np.where(origin == 2, sizes[rows] / config.split_factor, sizes[rows])
-    prune = _transparent(config, opacity_logits)[rows] | useless[rows]
-    if config.opacity_reset_every > 0 and step > config.opacity_reset_every:
-        prune |= sizes_after > config.max_world_fraction * extent
+    prune = _transparent(config, model)[rows] | useless[rows]
+    if config.opacity_reset_every > 0 and model.step > config.opacity_reset_every:
+        prune |= sizes_after > config.max_world_fraction * model.extent
         if config.max_screen_radius > 0:
             prune |= (radii[rows] > config.max_screen_radius) & (origin == 0)
     rows, origin = rows[~prune], origin[~prune]
     return Plan(rows.astype(np.uint32), origin > 0, origin == 2)
 
 
-def plan_pruning(
-    config: DensityConfig, step: int, *, opacity_logits: Float32, contributions: Contributions | None = None
-) -> Plan:
-    """Prune the transparent and what hardly contributes, and nothing else; arguments as of `plan`."""
-    gone = _transparent(config, opacity_logits) | _useless(config, step, contributions, len(opacity_logits))
-    rows = np.flatnonzero(~gone).astype(np.uint32)
+def plan_pruning(config: DensityConfig, model: ModelState) -> Plan:
+    """Prune the transparent and what hardly contributes, and nothing else."""
+    rows = np.flatnonzero(~(_transparent(config, model) | _useless(config, model))).astype(np.uint32)
     none = np.zeros(len(rows), bool)
     return Plan(rows, none, none)
 
 
-def _transparent(config: DensityConfig, opacity_logits: Float32) -> NDArray[np.bool_]:
-    transparent: NDArray[np.bool_] = opacity_logits < np.log(config.min_opacity / (1 - config.min_opacity))
+def _transparent(config: DensityConfig, model: ModelState) -> NDArray[np.bool_]:
+    logits = model.parameters["opacity_logits"].get()
+    transparent: NDArray[np.bool_] = logits < np.log(config.min_opacity / (1 - config.min_opacity))
     return transparent
 
 
-def _useless(config: DensityConfig, step: int, contributions: Contributions | None, count: int) -> NDArray[np.bool_]:
-    """Gaussians that no view needs, and at the steps of `prune_at` a fraction of those whose use is known."""
-    useless = np.zeros(count, bool)
-    if contributions is None:
-        return useless
-    if config.min_contribution > 0:
-        useless |= contributions.largest < config.min_contribution
-    if step in config.prune_at:
-        known = np.flatnonzero(np.isfinite(contributions.totals))
-        least = np.argsort(contributions.totals[known], kind="stable")[: int(config.prune_fraction * len(known))]
+def _useless(config: DensityConfig, model: ModelState) -> NDArray[np.bool_]:
+    """Gaussians that no view needs, and at the steps of `prune_at` a fraction of those whose use is known.
+
+    Contributions are in pixels, and infinite where they are not known yet. Totals are over the views of the last whole
+    epoch, the largest are of any view in that epoch and the one under way.
+    """
+    if "whole_totals" not in model.statistics:
+        return np.zeros(model.count, bool)
+    totals, whole, current = (
+        model.statistics[name].get() for name in ("whole_totals", "whole_largest", "current_largest")
+    )
+    useless: NDArray[np.bool_] = (config.min_contribution > 0) & (np.maximum(current, whole) < config.min_contribution)
+    if model.step in config.prune_at:
+        known = np.flatnonzero(np.isfinite(totals))
+        least = np.argsort(totals[known], kind="stable")[: int(config.prune_fraction * len(known))]
         useless[known[least]] = True
     return useless
 
 
 def _wanted(
-    config: DensityConfig,
-    step: int,
-    gradients: Float32,
-    agreeing: Float32 | None,
-    useless: NDArray[np.bool_],
+    config: DensityConfig, model: ModelState, gradients: Float32, useless: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Gaussians to clone or split, by mean gradients (n,)."""
-    n = len(gradients)
-    room = config.max_gaussians - n
+    room = config.max_gaussians - len(gradients)
     if config.growth == "budget":
         wanted = (gradients > 0) & ~useless
-        room = budget(config, step, n) - n
+        room = budget(config, model.step, len(gradients)) - len(gradients)
     else:
         wanted = (gradients >= config.gradient_threshold) & ~useless
-    if config.views_agree > 1 and agreeing is not None:
-        wanted &= agreeing >= config.views_agree
+    if config.views_agree > 1 and "agreeing" in model.statistics:
+        wanted &= model.statistics["agreeing"].get() >= config.views_agree
     if wanted.sum() > room:
         strongest = np.argsort(-np.where(wanted, gradients, -1), kind="stable")[: max(room, 0)]
-        allowed = np.zeros(n, bool)
-        allowed[strongest] = True
-        wanted &= allowed
+        wanted = wanted & np.isin(np.arange(len(gradients)), strongest)
     return wanted
 
 

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples that a frame is the mean of: over a pixel (supersampling), the shutter's time and the lens's area.
+
+Samples have fixed places, and those of shutter and lens equal weights: the same frame again has the same bits, wherever
+a single frame has. Light is added up in linear values alone. Channels that have no mean come from one sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import Camera
+from clsplat.config.pictures import Filter, FramingConfig, SamplingConfig
+from clsplat.errors import InputError
+from clsplat.frame.draw import Draw, Planes, in_two
+from clsplat.frame.window import crop, reframed
+
+_RADII: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
+GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
+
+
+def filter_taps(config: FramingConfig) -> NDArray[np.float32]:
+    """Weights of the samples across a pixel and its margins, symmetric; they add up to 1."""
+    samples, radius = config.supersample, _RADII[config.filter]
+    margin = samples * _margin(config)
+    at = (np.arange(-margin, samples + margin) + 0.5) / samples - 0.5
+    if config.filter == "box":
+        weights = np.ones(len(at))
+    else:
+        turn = np.pi * (at / radius + 1)
+        weights = 0.35875 - 0.48829 * np.cos(turn) + 0.14128 * np.cos(2 * turn) - 0.01168 * np.cos(3 * turn)
+    return np.asarray(weights / weights.sum(), np.float32)
+
+
+def _margin(config: FramingConfig) -> int:
+    """Pixels beyond the picture that its filter looks at."""
+    return int(np.ceil(_RADII[config.filter] - 0.5))
+
+
+def finer(camera: Camera, config: FramingConfig) -> Camera:
+    """The camera that a supersampled picture is drawn with: larger, with the margin that its filter looks at.
+
+    Raises InputError for a panorama, which has nothing around it, where the filter looks beyond a pixel.
+    """
+    margin, samples = _margin(config), config.supersample
+    if margin == 0:
+        return camera.resized(camera.width * samples, camera.height * samples)
+    if camera.projection == "equirectangular":
+        raise InputError(f"--filter {config.filter}: needs pixels beyond a panorama's edges, expected box")
+    padded = crop(camera, -margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
+    return padded.resized(padded.width * samples, padded.height * samples)
+
+
+def supersampled(draw: Draw, config: FramingConfig) -> Draw:
+    """rgb and alpha from a frame `supersample` times larger, filtered; other channels as without.
+
+    `draw` has to give rgb in linear light: what falls on a pixel adds up in that alone. The sums are in the same order
+    wherever the picture is in its frame.
+    """
+    samples = config.supersample
+    if samples == 1:
+        return draw
+    taps = filter_taps(config)
+
+    def shrunk(plane: Float32, axis: int, size: int) -> Float32:
+        parts = [slice(None)] * plane.ndim
+        total: Float32 | None = None
+        for at, weight in enumerate(taps):
+            parts[axis] = slice(at, at + samples * (size - 1) + 1, samples)
+            part = weight * plane[tuple(parts)]
+            total = part if total is None else total + part
+        assert total is not None
+        return total
+
+    def filtered(camera: Camera, names: Collection[str]) -> Planes:
+        planes = draw(finer(camera, config), names)
+        return {name: shrunk(shrunk(plane, 0, camera.height), 1, camera.width) for name, plane in planes.items()}
+
+    return in_two(filtered, draw)
+
+
+def sample_times(count: int) -> Float64:
+    """`count` times in (0, 1), each in an interval of its own, in an order that has nothing to do with the lens's
+    (ranks of van der Corput's sequence)."""
+    index, radical, digit = np.arange(count), np.zeros(count), 0.5
+    while index.any():
+        radical += digit * (index & 1)
+        index, digit = index >> 1, digit / 2
+    return np.asarray((np.argsort(np.argsort(radical)) + 0.5) / count)
+
+
+def lens_points(count: int) -> Float64:
+    """(count, 2) on the unit disc, each for as much of its area (Vogel's spiral)."""
+    index = np.arange(count)
+    radius, angle = np.sqrt((index + 0.5) / count), GOLDEN_ANGLE * index
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
+def lens_radius(camera: Camera, config: SamplingConfig) -> float:
+    """Radius of the lens in the scene's units; camera: of a whole frame."""
+    if config.f_stop is None:
+        return config.aperture
+    focal_length = camera.fx * config.sensor_width / camera.width / 1000 / config.metres
+    return focal_length / (2 * config.f_stop)
+
+
+def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
+    """The camera from the point (x, y) of its lens, in the scene's units, sheared so that what is at the depth `focus`
+    stays where it is in the picture. Raises InputError for a camera without an image plane."""
+    if camera.projection != "perspective":
+        raise InputError(f"depth of field is not defined for {camera.projection} cameras, expected a perspective one")
+    return replace(
+        camera,
+        translation=camera.translation - np.array([x, y, 0.0]),
+        cx=camera.cx + camera.fx * x / focus,
+        cy=camera.cy + camera.fy * y / focus,
+    )
+
+
+def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tuple[Camera, list[Camera]]:
+    """(the camera in the middle of shutter and lens, one for each sample), of whole frames.
+
+    at: the camera at a time in frames from the frame, such as `Shot.at` gives; one sample is the middle itself.
+    """
+    begin, end = config.shutter
+    middle = at(config.middle)
+    if not config.on or config.samples == 1:
+        return middle, [middle]
+    times = begin + (end - begin) * sample_times(config.samples)
+    cameras = [at(float(time)) for time in times] if config.moves else [middle] * config.samples
+    if config.has_lens:
+        cameras = [
+            through_lens(camera, lens_radius(camera, config) * x, lens_radius(camera, config) * y, config.focus)
+            for camera, (x, y) in zip(cameras, lens_points(config.samples).tolist(), strict=True)
+        ]
+    return middle, cameras
+
+
+def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera]) -> Draw:
+    """rgb and alpha as the mean over the cameras, of whole frames; other channels, of which there is no mean, from the
+    middle one. The camera that is drawn says the size and the window alone.
+
+    `draw` has to give rgb in linear light. Sums are of float64, in the cameras' order.
+    """
+
+    def blurred(camera: Camera, names: Collection[str]) -> Planes:
+        sums: dict[str, Float64] = {}
+        for sample in cameras:
+            for name, plane in draw(reframed(sample, camera), names).items():
+                if name in sums:
+                    sums[name] += plane
+                else:
+                    sums[name] = plane.astype(np.float64)
+        return {name: (total / len(cameras)).astype(np.float32) for name, total in sums.items()}
+
+    return in_two(blurred, lambda camera, names: draw(reframed(middle, camera), names))

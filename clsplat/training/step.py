@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gradient of one view and Adam's step along it: what a training step does, and what `repro` repeats."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray
+from clsplat.device.context import Device
+from clsplat.device.layout import SlotFields
+from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.stages.adam import adam, updates_sh_rest
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
+from clsplat.stages.loss import Loss, loss
+from clsplat.stages.project import Projected, Screen, Slots
+from clsplat.stages.target import target
+from clsplat.training.density import StatisticsNeeds
+
+
+@dataclass(frozen=True, eq=False)
+class StepRows:
+    """Rows of the model that are on the device at once, from start to before stop; all of them if the model fits.
+
+    projected, screen: what the step's view shows of these rows, and the gradients on its screen.
+    """
+
+    start: int
+    stop: int
+    parameters: DeviceGaussians
+    gradients: DeviceGaussians
+    first: DeviceGaussians
+    second: DeviceGaussians
+    projected: Projected
+    screen: Screen
+
+
+class StepProbe:
+    """A look into a step. Each method is called when the kernels of its stage are launched; here none does anything."""
+
+    def forward(self, frame: Frame) -> None:
+        """The view is rendered."""
+
+    def loss(self, result: Loss) -> None:
+        """The render is compared with the photograph."""
+
+    def pair_gradients(self, slots: Slots) -> None:
+        """The gradient of blending is known."""
+
+    def row_gradients(self, rows: StepRows) -> None:
+        """The gradients of these rows are known, and Adam has not changed the rows yet."""
+
+
+@dataclass(frozen=True, eq=False)
+class GradientStep:
+    """Forward, loss, backward and Adam of one view, on a device and in the memory of a rasterizer.
+
+    fields: the fields of a slot that the step fills; channels: as of `loss`.
+    """
+
+    device: Device
+    rasterizer: Rasterizer
+    config: TrainConfig
+    step: int
+    rates: Mapping[str, float]
+    fields: SlotFields
+    channels: int = 3
+
+    def run(
+        self,
+        model: tuple[AnyGaussians, AnyGaussians, AnyGaussians],
+        gradients: DeviceGaussians,
+        photograph: NDArray[Any],
+        camera: Camera,
+        background: DeviceArray,
+        probe: StepProbe,
+    ) -> Loss:
+        """Update the model (parameters, first and second moments) by a photograph (H, W, 3 or 4) of the camera's size.
+        gradients: room for the rows that are on the device at once, zeros before and after."""
+        device, rasterizer, work = self.device, self.rasterizer, self.rasterizer.work
+        planes = target(device, work, photograph, background)
+        frame = rasterizer.forward(model[0], camera, background)
+        probe.forward(frame)
+        size = (camera.width, camera.height)
+        result = loss(device, work, frame.blended.image, planes, *size, self.config.dssim_weight, self.channels)
+        probe.loss(result)
+        slots = rasterizer.pair_gradients(frame, result.gradient, fields=self.fields)
+        probe.pair_gradients(slots)
+        sh_rest = updates_sh_rest(self.config.optimiser, self.step)
+        for start, stop, (parameters, first, second) in parts(work, *model, keep=True):
+            projected = frame.projected.rows(start, stop)
+            backward = (parameters, frame, projected, slots.rows(start, stop), gradients)
+            screen = rasterizer.row_gradients(*backward, fields=self.fields, sh_rest=sh_rest)
+            rows = StepRows(start, stop, parameters, gradients, first, second, projected, screen)
+            probe.row_gradients(rows)
+            self.update(rows)
+        return result
+
+    def update(self, rows: StepRows) -> None:
+        """Adam's step of some rows."""
+        models = (rows.parameters, rows.gradients, rows.first, rows.second)
+        shown, readback = rows.projected.tile_counts, self.rasterizer.found
+        adam(self.device, self.step, self.rates, self.config.optimiser, *models, shown, readback)
+
+
+def slot_fields(needs: StatisticsNeeds) -> SlotFields:
+    """The fields of a slot that these statistics need."""
+    return SlotFields(needs.absolute, needs.contributions)

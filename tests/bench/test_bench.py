@@ -1,0 +1,599 @@
+# SPDX-License-Identifier: Apache-2.0
+"""clsplat bench: the contract of its JSON, counts against a brute-force count, limits, the plot, wrong calls."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+from pipeline import BACKGROUND, Pipeline, shaped
+from quick import quick
+from tiny import write_scene
+
+from clsplat.bench import plots
+from clsplat.bench import settings as tradeoff
+from clsplat.bench import stages as bench_stages
+from clsplat.bench import subject as bench_subject
+from clsplat.bench.labels import LEADER, crossed, place_labels, shared
+from clsplat.cli.main import main
+from clsplat.config.presets import PRESETS
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
+from clsplat.device.context import Device
+from clsplat.device.layout import SPLAT, TILE
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.reference import render as reference
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.stages.blend import count_pairs
+from clsplat.stages.limit import Limits, measure_limits
+
+SMALL = ["--gaussians", "400", "--size", "70x50", "--repeat", "1"]
+FRAME = {"project", "duplicate", "ranges", "blend"}
+STEP = {"target", "loss", "blend_grad", "project_grad", "statistics", "adam"}
+Capture = pytest.CaptureFixture[str]
+
+quick_limits = partial(measure_limits, seconds=1e-3, repeat=1, copy_bytes=2**16)
+
+
+@pytest.fixture
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_stages, "measure_limits", quick_limits)
+
+
+@pytest.fixture(scope="session")
+def profiled(default_device: Device) -> Device:
+    """With a queue that profiles, as the verb opens it."""
+    return Device(default_device.cl_device, profile=True)
+
+
+def counted(pipeline: Pipeline) -> tuple[int, int]:
+    frame, rasterizer = pipeline.frame, pipeline.rasterizer
+    return count_pairs(
+        rasterizer.device, rasterizer.work, frame.lists, frame.projected.splats, frame.background, pipeline.camera
+    )
+
+
+def first_cell(low: float, size: float, count: int) -> int:
+    return int(np.ceil(np.clip((low - 0.01 - (size - 0.5)) / size, 0, count)))
+
+
+def end_cell(high: float, size: float, count: int) -> int:
+    return int(np.clip((high + 0.01 - 0.5) / size + 1, 0, count))
+
+
+def cell_of_pixel(lanes: int) -> np.ndarray:
+    """Of each pixel (16, 16) of a tile, the number of its cell: blocks 4 wide, of as many pixels as lanes."""
+    wide = 1 if lanes == 1 else 4
+    y, x = np.mgrid[:TILE, :TILE]
+    return (y // (lanes // wide)) * (TILE // wide) + x // wide
+
+
+def in_box(splat: np.ndarray, x: int, y: int, lanes: int) -> np.ndarray:
+    """The cells of the tile at (x, y) that the Gaussian's box reaches."""
+    of = dict(zip(SPLAT, splat.astype(np.float64), strict=True))
+    mx, my = of["PIXEL_X"] - x + of["SUB_X"], of["PIXEL_Y"] - y + of["SUB_Y"]
+    wide = 1 if lanes == 1 else 4
+    high = lanes // wide
+    rows = slice(first_cell(my - of["HALF_H"], high, TILE // high), end_cell(my + of["HALF_H"], high, TILE // high))
+    columns = slice(first_cell(mx - of["HALF_W"], wide, TILE // wide), end_cell(mx + of["HALF_W"], wide, TILE // wide))
+    inside = np.zeros((TILE // high, TILE // wide), np.bool_)
+    inside[rows, columns] = True
+    return inside.ravel()
+
+
+def in_ellipse(splat: np.ndarray, x: int, y: int, lanes: int) -> np.ndarray:
+    """The cells of the tile at (x, y) that have a pixel in the Gaussian's ellipse."""
+    of = dict(zip(SPLAT, splat.astype(np.float64), strict=True))
+    rows, columns = np.mgrid[:TILE, :TILE] + 0.5
+    dx, dy = of["PIXEL_X"] - x + of["SUB_X"] - columns, of["PIXEL_Y"] - y + of["SUB_Y"] - rows
+    power = of["LOG2O"] - (of["L11"] * dx + of["L12"] * dy) ** 2 - (of["L22"] * dy) ** 2
+    inside = np.zeros(TILE * TILE // lanes, np.bool_)
+    np.logical_or.at(inside, cell_of_pixel(lanes), power >= np.log2(1 / 255))
+    return inside
+
+
+def brute_force_evaluated(pipeline: Pipeline, lanes: int, items: int, reached: Callable[..., np.ndarray]) -> int:
+    """Lanes of the cells that each Gaussian reaches, up to where the last of the cell's pixels has ended, or, where a
+    work-item has no bits for its cells, of the item's pixels."""
+    frame = pipeline.frame
+    ranges, listed = frame.lists.ranges.get().astype(int), frame.lists.gaussian_from_sorted.get()
+    splats, stops = frame.projected.splats.get(), frame.blended.stops.get()
+    tiles_x = -(-pipeline.camera.width // TILE)
+    cells = TILE * TILE // lanes
+    owner = np.arange(cells) % (cells if (lanes, items) == (8, 1) else items)
+    total = 0
+    for tile, (begin, end) in enumerate(ranges):
+        x, y = tile % tiles_x * TILE, tile // tiles_x * TILE
+        last = np.zeros(cells, np.int32)
+        np.maximum.at(last, cell_of_pixel(lanes), stops[y : y + TILE, x : x + TILE])
+        last_of_owner = np.array([last[owner == item].max() for item in range(owner.max() + 1)])[owner]
+        for i in range(begin, end):
+            total += lanes * int((reached(splats[listed[i]], x, y, lanes) & (i <= last_of_owner)).sum())
+    return total
+
+
+@pytest.mark.parametrize("name", ["overlap", "saturating", "many_per_tile", "random_cloud"])
+def test_contributing_pairs_are_those_of_the_reference(default_device: Device, name: str) -> None:
+    scene = scenes.NAMED[name]()
+    wanted = reference.forward(*scene, BACKGROUND, margins=True).blended
+    got, _ = counted(Pipeline.run(shaped(default_device, 8, 1), scene))
+    doubtful = wanted.margin < 1e-5  # pixels where a threshold may fall the other way, by one Gaussian or so
+    assert abs(got - wanted.count.sum()) <= doubtful.sum()
+    assert got > 0
+
+
+def test_contributing_pairs_exactly(default_device: Device) -> None:
+    scene = scenes.NAMED["one"]()
+    wanted = reference.forward(*scene, BACKGROUND, margins=True).blended
+    assert wanted.margin.min() > 1e-5
+    assert counted(Pipeline.run(default_device, scene))[0] == wanted.count.sum()
+
+
+@pytest.mark.parametrize("name", ["overlap", "saturating", "random_cloud"])
+@pytest.mark.parametrize("shape", quick([(1, 1), (1, 64), (8, 16)], (1, 64)), ids=str)
+def test_evaluated_pairs_are_those_of_a_brute_force_count(
+    default_device: Device, shape: tuple[int, int], name: str
+) -> None:
+    pipeline = Pipeline.run(shaped(default_device, *shape), scenes.NAMED[name]())
+    contributing, evaluated = counted(pipeline)
+    assert evaluated == brute_force_evaluated(pipeline, *shape, in_box)
+    assert contributing == counted(Pipeline.run(shaped(default_device, 8, 1), scenes.NAMED[name]()))[0]
+
+
+@pytest.mark.parametrize("name", ["overlap", "saturating", "random_cloud", "needles"])
+def test_evaluated_pairs_on_a_cpu_are_those_in_the_ellipse(default_device: Device, name: str) -> None:
+    pipeline = Pipeline.run(shaped(default_device, 8, 1), scenes.NAMED[name]())
+    _, evaluated = counted(pipeline)
+    wanted = brute_force_evaluated(pipeline, 8, 1, in_ellipse)
+    # The ellipse is taken a hundredth of a pixel and 0.2 % too wide; what lies between two rows' chords counts.
+    assert wanted <= evaluated <= 1.02 * wanted
+    assert evaluated < brute_force_evaluated(pipeline, 8, 1, in_box)
+
+
+def test_switches_show_in_the_counts(default_device: Device) -> None:
+    scene = scenes.random_cloud(1000, 8, 100, 70)
+    counts = {}
+    for name, config in {"default": RasterizerConfig(), "rows": BenchSwitches(row_skip=False)}.items():
+        pipeline = Pipeline.run(shaped(default_device, 8, 1), scene)
+        pipeline.rasterizer = Rasterizer(pipeline.rasterizer.device, config)
+        counts[name] = counted(pipeline)
+    assert counts["rows"][0] == counts["default"][0]
+    assert counts["rows"][1] > counts["default"][1]
+
+
+def test_limits_are_finite_in_every_shape(shaped_device: Device) -> None:
+    limits = quick_limits(shaped_device)
+    for value in (limits.pairs_per_second, limits.gradient_pairs_per_second, limits.copy_bytes_per_second):
+        assert np.isfinite(value)
+        assert value > 0
+    assert limits.lanes == shaped_device.shape.lanes
+
+
+@pytest.mark.parametrize("shape", [None, (1, 64)], ids=str)
+def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
+    device = profiled.with_shape(lanes=shape[0], items=shape[1]) if shape else profiled
+    result = bench_stages.bench(
+        bench_subject.synthetic(300, 50, 40), device, repeat=2, limits=Limits(1e9, 5e8, 1e10, 8, 1)
+    )
+    assert set(result["stages"]) >= FRAME | STEP
+    assert result["timer"] == "events"
+    for name in FRAME | STEP:
+        row = result["stages"][name]
+        assert row["ms"] > 0
+        assert row["wall_ms"] > 0
+        assert row["launches"] > 0
+        assert row["bytes"] > 0
+        assert sum(row["kernels"].values()) == pytest.approx(row["ms"], rel=0.5)  # medians of each, and of the sums
+    blend = result["stages"]["blend"]
+    assert blend["pairs_per_second"] == pytest.approx(1e3 * result["pairs"]["contributing"] / blend["ms"])
+    assert blend["share_of_arithmetic"] == pytest.approx(blend["pairs_per_second"] / 1e9)
+    gradient = result["stages"]["blend_grad"]
+    assert gradient["share_of_arithmetic"] == pytest.approx(gradient["pairs_per_second"] / 5e8)
+    adam = result["stages"]["adam"]
+    # Parameters, gradients and both moments of 59 floats, read and written.
+    assert adam["bytes"] == 300 * 59 * 4 * 4 * 2
+
+
+def test_wall_time_where_events_have_none(default_device: Device) -> None:
+    result = bench_stages.bench(
+        bench_subject.synthetic(200, 40, 30), default_device, repeat=1, limits=Limits(1e9, 5e8, 1e10, 8, 1)
+    )
+    assert result["timer"] == "wall"
+    assert all(result["stages"][name]["ms"] == result["stages"][name]["wall_ms"] for name in FRAME | STEP)
+
+
+def test_nothing_is_recorded_unless_asked(profiled: Device) -> None:
+    assert not profiled.recorder.on
+    with profiled.recorder.recording(profiled, wait=False) as stages:
+        pass
+    assert stages == {}
+    assert not profiled.recorder.on
+
+
+def test_measuring_leaves_the_model_as_it_is(profiled: Device) -> None:
+    subject = bench_subject.synthetic(200, 40, 30)
+    trainer = bench_stages.trainer_of(subject, profiled, RasterizerConfig())
+    for _ in range(3):
+        trainer.train_step()
+    after = trainer.gaussians()
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(subject.gaussians, name))
+    assert trainer.first["means"].get().any(), "there was a gradient"
+
+
+def test_synthetic_scene_is_the_same_every_time() -> None:
+    first, second = bench_subject.synthetic(50, 40, 30), bench_subject.synthetic(50, 40, 30)
+    np.testing.assert_array_equal(first.gaussians.means, second.gaussians.means)
+    first.gaussians.check()
+
+
+@pytest.mark.usefixtures("_quick")
+def test_json_has_the_contract(capsys: Capture) -> None:
+    assert main(["bench", *SMALL, "--json", "--preset", "fast", "--rasterizer.sh-degree-limit", "1"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert {"device", "driver", "stages", "frame_ms", "iteration_ms", "gaussians", "width", "height", "pairs"} <= set(
+        result
+    )
+    assert (result["gaussians"], result["width"], result["height"]) == (400, 70, 50)
+    assert all("ms" in stage for stage in result["stages"].values())
+    assert {"contributing", "evaluated"} <= set(result["pairs"])
+    assert 0 < result["pairs"]["contributing"] <= result["pairs"]["evaluated"]
+    assert result["limit"]["pairs_per_second"] > 0
+    fast = PRESETS["fast"]
+    assert result["rasterizer"]["alpha_min"] == fast.alpha_min
+    assert result["rasterizer"]["sh_degree_limit"] == 1, "a flag goes before the preset"
+
+
+@pytest.mark.usefixtures("_quick")
+def test_table(capsys: Capture) -> None:
+    assert main(["bench", *SMALL]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert {line.split()[0] for line in lines if line} >= FRAME | STEP
+    assert "synthetic: 400 Gaussians" in "\n".join(lines)
+
+
+@pytest.mark.usefixtures("_quick")
+def test_scene_run_and_model(tmp_path: Path, capsys: Capture) -> None:
+    scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
+    assert main(["train", str(scene), "-o", str(run), "--iterations", "2"]) == 0
+    loose = tmp_path / "loose.ply"
+    Gaussians.load(run / "model.ply").save(loose)
+    capsys.readouterr()
+    for source, size in ((scene, (48, 40)), (run, (48, 40)), (run / "model.ply", (48, 40)), (loose, (24, 20))):
+        extra = ["--size", "24x20"] if source == loose else []
+        assert main(["bench", str(source), "--repeat", "1", "--json", *extra]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert (result["width"], result["height"]) == size
+        assert result["pairs"]["contributing"] > 0
+        assert result["source"] == str(source)
+
+
+def test_facing_camera_sees_the_model() -> None:
+    gaussians = bench_subject.synthetic(500, 64, 48).gaussians
+    _, camera = bench_subject.facing(gaussians, 80, 60)
+    p = gaussians.means @ camera.rotation.T + camera.translation
+    pixels = p[:, :2] / p[:, 2:] * camera.fx + (camera.cx, camera.cy)
+    seen = (p[:, 2] > camera.near) & (pixels > 0).all(axis=1) & (pixels < (80, 60)).all(axis=1)
+    assert seen.mean() > 0.8
+
+
+@pytest.mark.parametrize("crop", [(0, 0, 70, 50), (13, 9, 30, 20)], ids=str)
+def test_crop_of_the_reference_is_part_of_it(crop: tuple[int, int, int, int]) -> None:
+    gaussians, camera = scenes.NAMED["random_cloud"]()
+    whole, _ = reference.render(gaussians, camera)
+    x, y, width, height = crop
+    part = tradeoff.reference_crop(gaussians, camera, crop)
+    np.testing.assert_allclose(part, whole[y : y + height, x : x + width], atol=1e-12)
+
+
+def test_settings_hold_every_switch_and_preset() -> None:
+    named = tradeoff.settings()
+    assert "preset exact = default" in named
+    assert {config.switches() for config in PRESETS.values()} <= set(named.values())
+    for field in BenchSwitches.__dataclass_fields__:
+        assert any(getattr(config, field) != getattr(BenchSwitches(), field) for config in named.values()), field
+
+
+@pytest.mark.slow
+def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tradeoff, "CROP", 48)
+    candidates = {
+        "exact": PRESETS["exact"],
+        "no row-skip": BenchSwitches(row_skip=False),
+        "coarse": RasterizerConfig(alpha_min=8 / 255),
+    }
+    result = tradeoff.compare(bench_subject.synthetic(300, 70, 50), profiled, candidates, repeat=1)
+    exact, rows, coarse = result["points"]
+    assert result["error_is_against"] == "the exact preset's frame"
+    assert result["crop"] == [11, 1, 48, 48]
+    assert exact["max_abs"] == rows["max_abs"] == 0.0
+    assert exact["psnr"] == tradeoff.PSNR_MAX
+    assert 0 < coarse["max_abs"] < 0.3
+    assert 20 < coarse["psnr"] < 80
+    assert result["exact_against_float64"]["max_abs"] < 2e-5
+    assert any(point["on_front"] for point in result["points"])
+    assert all(point["iteration_ms"] > 0 for point in result["points"])
+    assert result["exact_switches_faster"] is None, "nothing has them off"
+
+
+def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tradeoff, "CROP", 48)
+    every = tradeoff.settings()
+    off = every[tradeoff.ALL_OFF]
+    for field, value in asdict(off).items():
+        if isinstance(value, bool | str) and field != "sh_storage":  # it and the numbers are approximations
+            assert value != getattr(BenchSwitches(), field), field
+    assert (off.tile_test, off.alpha_min) == ("square", BenchSwitches().alpha_min)
+    times = iter([50.0, 100.0, 150.0, 210.0])  # of a frame and of a step, on and off
+    monkeypatch.setattr(tradeoff, "wall_ms", lambda _device, work: (work(), next(times))[1])
+    candidates = {"preset exact = default": PRESETS["exact"], tradeoff.ALL_OFF: off}
+    result = tradeoff.compare(bench_subject.synthetic(300, 70, 50), profiled, candidates, repeat=1)
+    assert [(point["frame_ms"], point["iteration_ms"]) for point in result["points"]] == [(50, 100), (150, 210)]
+    assert result["points"][1]["max_abs"] == 0.0
+    assert result["exact_switches_faster"] == {"frame": 3.0, "iteration": 2.1}
+    text = tradeoff.settings_table(result)
+    assert "a frame 3.00 times faster, a training step 2.10 times" in text
+    assert "step ms" in text
+
+
+@pytest.mark.usefixtures("_quick")
+def test_a_held_model_is_what_frames_are_measured_of(profiled: Device) -> None:
+    subject = bench_subject.synthetic(300, 50, 40)
+    limits = Limits(1e9, 5e8, 1e10, 8, 1)
+    sizes = []
+    for storage in ("float", "half"):
+        config = RasterizerConfig(sh_storage=storage)
+        result = bench_stages.bench(subject, profiled, config, repeat=1, limits=limits)
+        sizes.append(result["stages"]["project"]["bytes"])
+    assert sizes[0] - sizes[1] == 300 * 90
+
+
+def test_small_frames_are_compared_with_float64(profiled: Device) -> None:
+    result = tradeoff.compare(bench_subject.synthetic(200, 40, 30), profiled, {"exact": PRESETS["exact"]}, repeat=1)
+    assert result["error_is_against"] == "the float64 reference"
+    assert result["crop"] == [0, 0, 40, 30]
+    assert 90 < result["points"][0]["psnr"] < tradeoff.PSNR_MAX
+
+
+def test_front() -> None:
+    assert tradeoff.front([(1, 1), (2, 2), (3, 1), (1, 0), (2, 2)]) == [True, True, False, False, True]
+
+
+def test_what_approximates() -> None:
+    exact = asdict(PRESETS["exact"])
+    off = asdict(tradeoff.settings()[tradeoff.ALL_OFF])
+    for field in exact:  # a new setting is one or the other
+        assert (field in tradeoff.MAY_CHANGE_BITS) != (off[field] != exact[field]), field
+    named = {name for name, config in tradeoff.settings().items() if tradeoff.approximate(config)}
+    for name in ("preset fast", "extent 3sigma", "sh-storage half", "alpha-min 2/255"):
+        assert name in named
+    assert tradeoff.ALL_OFF not in named
+    assert not any(name.startswith(("no ", "tile", "key", "depth", "preset exact")) for name in named)
+
+
+def a_point(name: str, ms: float, psnr: float, error: float, *, approximate: bool = True) -> dict[str, object]:
+    """As `compare` has them, with steps of twice the time."""
+    against = {"psnr": psnr, "max_abs": error}
+    return {
+        "name": name,
+        "approximate": approximate,
+        "frame_ms": ms,
+        "iteration_ms": 2 * ms,
+        "against_exact": against,
+        **against,
+    }
+
+
+@pytest.fixture
+def result() -> dict[str, object]:
+    points = [
+        a_point("exact", 40.0, 160.0, 0.0, approximate=False),
+        a_point("no early-stop", 42.0, 160.0, 0.0, approximate=False),
+        a_point("tile-test square", 60.0, 160.0, 0.0, approximate=False),
+        a_point(tradeoff.ALL_OFF, 170.0, 160.0, 0.0, approximate=False),
+        a_point("fast", 30.0, 50.0, 0.02),
+        a_point("fast again", 30.1, 50.1, 0.021),
+        a_point("slow", 80.0, 40.0, 0.03),
+        a_point("in vain", 41.0, 160.0, 0.0),
+    ]
+    return {
+        "exact": "exact",
+        "exact_switches_faster": {"frame": 4.25, "iteration": 4.126},
+        "error_is_against": "the exact preset's frame",
+        "crop": [1, 2, 3, 4],
+        "exact_against_float64": {"psnr": 120.0, "max_abs": 1e-6},
+        "points": points,
+    }
+
+
+def words_of(path: Path) -> list[str]:
+    """The texts of an SVG, from top to bottom as they were written; letters are outlines, the text is beside them."""
+    return [html.unescape(text) for text in re.findall(r"<!-- (.*?) -->", path.read_text("utf-8"))]
+
+
+@pytest.mark.needs("matplotlib")
+@pytest.mark.parametrize("name", quick(["plot.svg", "plot.PNG"], "plot.svg"))
+def test_plots_are_written(tmp_path: Path, result: dict[str, object], name: str) -> None:
+    path, again = tmp_path / name, tmp_path / f"again_{name}"
+    first, second = (plots.plot_settings(file, result, "a title") for file in (path, again))
+    kind = path.suffix
+    assert first == plots.plot_files(path) == (tmp_path / f"plot-switches{kind}", tmp_path / f"plot-error{kind}")
+    for one, other in zip(first, second, strict=True):
+        assert one.read_bytes().startswith(b"\x89PNG" if kind == ".PNG" else b"<?xml")
+        assert one.read_bytes() == other.read_bytes()
+    assert not path.exists()
+    if kind == ".PNG":
+        return
+    switches, error = map(words_of, first)
+    names = [word for word in switches if word in ("no early-stop", "tile-test square", tradeoff.ALL_OFF, "fast")]
+    assert names == ["no early-stop", "tile-test square"]  # the axis runs upwards: what is worth most is on top
+    assert {"1.05", "1.50", "a frame", "a training step", "a title"} <= set(switches)
+    assert "All off: 4.25 times for a frame, 4.13 times for a step." in switches
+    assert {"fast (0.02)", "fast again (0.021)", "slow (0.03)", "exact: 40.0 ms", "a title"} <= set(error)
+    notes = " ".join(error)
+    for words in (
+        "Error against the exact preset's frame",
+        "3x4 pixels in the middle: 120.0 dB, largest error 1e-06",
+        "the same bits as exact here: in vain (41.0 ms)",
+    ):
+        assert words in notes
+    assert not any("early-stop" in word for word in error)
+
+
+@pytest.mark.needs("matplotlib")
+def test_plots_of_little(tmp_path: Path, result: dict[str, object]) -> None:
+    """Of the exact preset alone, and of settings without it."""
+    points = result["points"]
+    assert isinstance(points, list)
+    switches, error = plots.plot_settings(tmp_path / "a.svg", {**result, "points": points[:1]}, "a title")
+    assert "no exact switch was measured" in words_of(switches)
+    assert "no approximate setting differs" in words_of(error)
+    others = {**result, "exact": None, "exact_switches_faster": None, "points": points[4:]}
+    switches, error = plots.plot_settings(tmp_path / "b.svg", others, "a title")
+    assert "no exact switch was measured" in words_of(switches)
+    assert not any(word.startswith("exact: ") for word in words_of(error))
+
+
+def test_labels_cover_nothing() -> None:
+    rng = np.random.default_rng(5)
+    frame = np.array([0.0, 0.0, 700.0, 450.0])
+    crowds = [rng.uniform((50, 50), (650, 400), (20, 2)), rng.normal((300, 100), (12, 40), (12, 2))]
+    for points in [*crowds, np.full((4, 2), 200.0), np.array([[1.0, 1.0], [699.0, 449.0]])]:
+        sizes = np.array([(rng.uniform(60, 170), 16.0) for _ in points])
+        line = np.array([[(300.0, 0.0), (300.0, 450.0)]])
+        places, again = place_labels(points, sizes, frame, line), place_labels(points, sizes, frame, line)
+        boxes = np.array([place.box for place in places])
+        leaders = np.array([place.leader for place in places if place.leader is not None]).reshape(-1, 2, 2)
+        np.testing.assert_array_equal(boxes, [place.box for place in again])
+        np.testing.assert_allclose(boxes[:, 2:] - boxes[:, :2], sizes)
+        assert ((boxes[:, :2] >= frame[:2]) & (boxes[:, 2:] <= frame[2:])).all()
+        np.testing.assert_array_equal(shared(boxes, boxes) > 0, np.eye(len(points), dtype=bool))
+        inside = (boxes[:, None, :2] < points) & (points < boxes[:, None, 2:])
+        assert not inside.all(axis=2).any()
+        assert not crossed(boxes, leaders).any()
+        apart = np.linalg.norm(points.clip(boxes[:, :2], boxes[:, 2:]) - points, axis=1) > LEADER
+        assert [place.leader is not None for place in places] == apart.tolist()
+
+
+def test_too_many_labels_have_a_place_each() -> None:
+    points, sizes = np.full((6, 2), (50.0, 20.0)), np.full((6, 2), (60.0, 16.0))
+    places = place_labels(points, sizes, np.array([0.0, 0.0, 100.0, 40.0]))
+    assert len(places) == 6
+
+
+@pytest.mark.parametrize(
+    ("segment", "goes_through"),
+    [
+        (((0, 0), (4, 3)), True),
+        (((0, 2), (5, 2)), True),
+        (((2, 2), (2.5, 2.5)), True),
+        (((0, 0), (0, 9)), False),
+        (((0, 0), (1, 1)), False),  # ends at the corner
+        (((0, 3), (5, 3)), False),  # along the edge
+        (((0, 3), (3, 6)), False),
+    ],
+)
+def test_segments_through_a_box(segment: tuple[tuple[float, float], ...], goes_through: bool) -> None:
+    assert crossed(np.array([[1.0, 1.0, 4.0, 3.0]]), np.array([segment], float)).item() is goes_through
+
+
+@pytest.mark.needs("matplotlib")
+@pytest.mark.usefixtures("_quick")
+def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    some = {"exact": PRESETS["exact"], "fast": PRESETS["fast"]}
+    monkeypatch.setattr(tradeoff, "settings", lambda: some)
+    path = tmp_path / "plot.svg"
+    files = tmp_path / "plot-switches.svg", tmp_path / "plot-error.svg"
+    assert main(["bench", *SMALL, "--plot", str(path), "--json"]) == 0
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)["settings"]
+    assert [(point["name"], point["approximate"]) for point in result["points"]] == [("exact", False), ("fast", True)]
+    assert result["exact"] == "exact"
+    for file in files:
+        assert file.exists()
+        assert f"plot in {file}\n" in printed.err
+    assert not path.exists()
+    for file, other in (files, files[::-1]):
+        other.unlink(missing_ok=True)
+        file.write_bytes(b"precious")
+        assert main(["bench", *SMALL, "--plot", str(path)]) == 2
+        said = f"clsplat: error: {file}: is there already; name another file, or give --overwrite to replace it\n"
+        assert capsys.readouterr() == ("", said)
+        assert file.read_bytes() == b"precious"
+        assert not other.exists()
+    assert main(["bench", *SMALL, "--plot", str(path), "--overwrite"]) == 0
+    assert all(file.read_bytes().startswith(b"<?xml") for file in files)
+
+
+def test_plot_without_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(InputError, match=r"pip install 'clsplat\[plot\]'"):
+        plots.check_plot(tmp_path / "a.svg")
+    assert main(["bench", *SMALL, "--plot", str(tmp_path / "a.svg")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--size", "100"], "--size 100"),
+        (["--size", "0x5"], "--size 0x5"),
+        (["--gaussians", "0"], "--gaussians 0"),
+        (["--gaussians", "99999999999"], "--gaussians 99999999999: expected at most "),
+        (["--repeat", "0"], "--repeat 0"),
+        (["nowhere.ply"], "nowhere.ply"),
+        (["--plot", "a.pdf"], "a.pdf"),
+        (["--plot", "nowhere/a.svg"], "nowhere"),
+        (["--rasterizer.alpha-min", "0"], "--rasterizer.alpha-min 0.0"),
+        (["--preset", "quick"], "quick"),
+        (["--device", "no such device"], "no such device"),
+    ],
+    ids=str,
+)
+def test_wrong_calls_are_one_line(arguments: list[str], named: str, capsys: Capture) -> None:
+    assert main(["bench", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert named in captured.err
+    assert captured.err.startswith("clsplat: error: ")
+
+
+@pytest.mark.slow
+def test_preset_in_training(tmp_path: Path, capsys: Capture) -> None:
+    scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
+    assert main(["train", str(scene), "-o", str(run), "--iterations", "1", "--preset", "fast"]) == 0
+    assert "alpha_min = 0.0078" in (run / "config.toml").read_text()
+    assert main(["train", "-o", str(run), "--resume", "--preset", "fast"]) == 2
+    assert "--preset fast and --resume" in capsys.readouterr().err
+
+
+@pytest.mark.needs("matplotlib")
+def test_plot_of_training(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    scene = write_scene(tmp_path / "scene")
+    assert main(["train", str(scene), "-o", str(run), "--iterations", "4", "--eval-at", "2"]) == 0
+    tool = Path(__file__).parents[2] / "tools" / "plot_training.py"
+    output = tmp_path / "training.svg"
+    done = subprocess.run(
+        [sys.executable, str(tool), str(run), "-o", str(output)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("run  ")
+    assert done.stdout.count(" dB") == 2
+    assert "run" in output.read_text()
+    wrong = subprocess.run(
+        [sys.executable, str(tool), str(scene), "-o", str(output)], capture_output=True, text=True, check=False
+    )
+    assert wrong.returncode == 2
+    assert wrong.stderr.count("\n") == 1

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals in the middle of a training, and two processes in one run folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from calls import Capture, error_line
+from tiny import short, write_scene
+
+from clsplat import process
+from clsplat.api import train
+from clsplat.cli.main import main
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.runs import locks
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.trainer import Trainer
+
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+posix = pytest.mark.skipif(os.name != "posix", reason="sends signals as POSIX has them")
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from clsplat.runs.locks import locked
+with locked(Path(sys.argv[1]), "train"):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+@contextmanager
+def holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that has the folder locked."""
+    other = subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        yield other
+    finally:
+        other.kill()
+        other.wait()
+        assert other.stdout is not None
+        other.stdout.close()
+
+
+# Signals
+
+
+@posix
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_writes_a_checkpoint_first(
+    number: signal.Signals, views: Scene, default_device: Device, tmp_path: Path
+) -> None:
+    config = short(iterations=9, report=False, density={"every": 0})
+    run = Run.create(tmp_path / "run", config)
+
+    def ask(trainer: Trainer, _interrupted: object) -> None:
+        if trainer.step == 4:
+            signal.raise_signal(number)
+
+    before = signal.getsignal(number)
+    with process.terminable(), pytest.raises(KeyboardInterrupt) as caught:
+        train(views, config, device=default_device, run=run, between=ask)
+    assert process.status_of(caught.value) == 128 + number
+    assert signal.getsignal(number) == before
+    assert [step for step, _ in run.checkpoints()] == [5], "the step that was begun is finished"
+    assert not (run.path / locks.NAME).exists()
+
+
+@posix
+def test_a_second_signal_does_not_wait(views: Scene, default_device: Device, tmp_path: Path) -> None:
+    config = short(iterations=9, report=False, density={"every": 0})
+    run = Run.create(tmp_path / "run", config)
+
+    def ask(trainer: Trainer, _interrupted: object) -> None:
+        if trainer.step == 4:
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
+
+    with process.terminable(), pytest.raises(process.Interrupted):
+        train(views, config, device=default_device, run=run, between=ask)
+    assert not run.checkpoints()
+
+
+@posix
+def test_what_is_ignored_stays_so() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with process.terminable():
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@posix
+def test_every_verb_ends_with_the_signals_number(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    from clsplat.cli import verbs
+
+    monkeypatch.setattr(verbs, "run", lambda _verb: signal.raise_signal(signal.SIGTERM))
+    assert main(["devices"]) == 143
+    assert capsys.readouterr().err == "clsplat: interrupted\n"
+
+
+@posix
+def test_a_signal_waits_where_nobody_may_be_disturbed() -> None:
+    done = []
+    with process.terminable(), pytest.raises(process.Interrupted) as caught:
+        with process.undisturbed():
+            os.kill(os.getpid(), signal.SIGTERM)
+            signal.signal(signal.SIGTERM, lambda *_: done.append("the library's"))
+            done.append("the work")
+        done.append("what follows")
+    assert caught.value.number == signal.SIGTERM
+    assert done == ["the work"]
+
+
+@posix
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_while_pyopencl_is_imported(number: signal.Signals) -> None:
+    """An exception that is raised in the import of its binary part aborts the process."""
+    code = (
+        "import os, sys\n"
+        "def hook(event, arguments):\n"
+        "    inside = event == 'object.__setattr__' and arguments[0].__module__ == 'pyopencl._cl'\n"
+        "    if inside and 'sent' not in sys.__dict__:\n"
+        "        sys.sent = True\n"
+        f"        os.kill(os.getpid(), {int(number)})\n"
+        "sys.addaudithook(hook)\n"
+        "sys.argv = ['clsplat', 'devices']\n"
+        "from clsplat.__main__ import main\n"
+        "sys.exit(main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
+
+
+@posix
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
+    """pycolmap takes a Ctrl-C for a sign that it is not installed."""
+    code = (
+        "import os, sys, types, importlib.abc, importlib.util\n"
+        "class Slow(importlib.abc.MetaPathFinder, importlib.abc.Loader):\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        return importlib.util.spec_from_loader(name, self) if name == 'pycolmap' else None\n"
+        "    def create_module(self, spec): return types.ModuleType(spec.name)\n"
+        "    def exec_module(self, module):\n"
+        "        try:\n"
+        f"            os.kill(os.getpid(), {int(number)})\n"
+        "            [None for _ in range(1000)]\n"
+        "        except BaseException as error: raise RuntimeError('not installed') from error\n"
+        "sys.meta_path.insert(0, Slow())\n"
+        "sys.argv = ['clsplat', 'train', '.', '-o', 'nowhere']\n"
+        "from clsplat.__main__ import main\n"
+        "from clsplat.process import terminable\n"
+        "from clsplat.cli import main as cli\n"
+        "from clsplat.cli import verbs\n"
+        "def work(verb):\n"
+        "    import clsplat.scenes.lens\n"
+        "verbs.run = work\n"
+        "sys.exit(main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
+
+
+# Two processes
+
+
+def test_the_second_process_is_told_of_the_first(tmp_path: Path) -> None:
+    with holder(tmp_path) as other, pytest.raises(InputError) as caught, locks.locked(tmp_path, "eval"):
+        pass
+    assert str(caught.value) == (
+        f"{tmp_path}: is being written by clsplat train (process {other.pid}); wait until that has ended, or choose "
+        "another folder"
+    )
+
+
+def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
+    with holder(tmp_path):
+        pass
+    assert (tmp_path / locks.NAME).exists(), "its file is there, and nobody has it locked"
+    with locks.locked(tmp_path, "eval"), locks.locked(tmp_path, "report"):
+        assert json.loads((tmp_path / locks.NAME).read_text())["verb"] == "eval"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("flag", ["", "--resume", "--overwrite", "new"])
+def test_a_second_training_changes_nothing(flag: str, tmp_path: Path, capsys: Capture) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    if flag != "new":
+        Run.create(run, TrainConfig())
+    files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    with holder(run) as other:
+        assert main(["train", str(tmp_path), "-o", str(run), *([flag] if flag.startswith("--") else [])]) == 2
+        assert f"is being written by clsplat train (process {other.pid})" in error_line(capsys)
+        left = {path: path.read_bytes() for path in run.rglob("*") if path.is_file() and path.name != locks.NAME}
+    assert left == files
+
+
+@pytest.mark.parametrize("verb", ["eval", "report"])
+def test_verbs_that_write_into_a_run_are_kept_out(verb: str, tmp_path: Path, capsys: Capture) -> None:
+    run = Run.create(tmp_path / "run", TrainConfig(), scene=tmp_path)
+    with holder(run.path):
+        assert main([verb, str(run.path)]) == 2
+        assert "is being written by clsplat train" in error_line(capsys)
+        with pytest.raises(InputError, match="is being written"):
+            Run.create(run.path, TrainConfig(), overwrite=True)
+        assert main(["report", str(run.path), "-o", str(tmp_path / "a.html")]) == 0, "readers come in"
+
+
+def test_a_file_system_without_locks_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import errno
+
+    def none(_file: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(locks, "try_lock", none)
+    with pytest.warns(UserWarning, match="on a file system without locks"), locks.locked(tmp_path, "train"):
+        pass
+
+
+@pytest.mark.slow
+@posix
+def test_the_tool_makes_tables() -> None:
+    tool = [sys.executable, str(Path(__file__).parents[2] / "tools" / "interruptions.py"), "--markdown"]
+    calls = ["--verbs", "train,info", "--events", "SIGTERM,second process"]
+    done = subprocess.run([*tool, *calls], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "| `info` | 143 | `clsplat: interrupted` | - |" in done.stdout
+    assert "| `train` | 2 | `clsplat: error: OUT/run: is being written by clsplat train (process 123)" in done.stdout
+
+
+def test_threads_have_no_say_in_signals() -> None:
+    done = []
+
+    def work() -> None:
+        with process.terminable():
+            done.append(True)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert done

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deep slices against the float64 twin and the flat picture, and deep EXR files read back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import scenes
+from compare import assert_close, assert_same_bits
+from numpy.typing import NDArray
+from pipeline import EVERY_SHAPE, shaped, shapes_of
+
+from clsplat.camera import Camera, Window
+from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding
+from clsplat.device.context import Device, open_device
+from clsplat.errors import InputError
+from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep, write_deep
+from clsplat.frame.window import crop
+from clsplat.gaussians import Gaussians
+from clsplat.images.colour import LINEAR, Colours
+from clsplat.images.exr_header import Header, camera_matrices
+from clsplat.reference import deep as twin
+from clsplat.reference import render as reference
+from clsplat.rendering.renderer import Renderer
+
+SCENES = {
+    "overlap": scenes.NAMED["overlap"],
+    "saturating": scenes.NAMED["saturating"],
+    "equal_depth": scenes.NAMED["equal_depth"],
+    "cloud": lambda: scenes.random_cloud(600, 8, 70, 50),
+}
+
+
+def flattened(slices: np.ndarray) -> np.ndarray:
+    """(bins, H, W, 6) to (H, W, 4): the slices over each other, front to back."""
+    flat = np.zeros((*slices.shape[1:3], 4), np.float64)
+    for image in slices.astype(np.float64):
+        flat += (1 - flat[:, :, 3:]) * image[:, :, :4]
+    return flat.astype(np.float32)
+
+
+def read(path: Path) -> tuple[Any, list[NDArray[np.float64]]]:
+    """The specification, and of each pixel its samples (n, 6)."""
+    source = oiio.ImageInput.open(str(path))
+    assert source is not None, oiio.geterror()
+    spec = source.spec()
+    data = source.read_native_deep_image()
+    source.close()
+    pixels = [
+        np.array([[data.deep_value(pixel, channel, sample) for channel in range(6)] for sample in range(samples)])
+        for pixel, samples in ((pixel, data.samples(pixel)) for pixel in range(spec.width * spec.height))
+    ]
+    return spec, [samples.reshape(-1, 6) for samples in pixels]
+
+
+def over(pixels: list[NDArray[np.float64]], spec: Any) -> NDArray[np.float64]:
+    """(H, W, 4), by hand."""
+    flat = np.zeros((len(pixels), 4))
+    for at, samples in enumerate(pixels):
+        for sample in samples:
+            flat[at] += (1 - flat[at, 3]) * sample[:4]
+    return flat.reshape(spec.height, spec.width, 4)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_against_the_twin(shaped_device: Device, name: str) -> None:
+    gaussians, camera = SCENES[name]()
+    bounds = bin_bounds(gaussians, camera, DeepConfig(bins=5))
+    got = render_deep(Renderer(shaped_device), gaussians, camera, bounds)
+    forward = reference.forward(gaussians, camera, margins=True)
+    wanted = twin.deep(forward.projected, forward.order, camera.width, camera.height, bounds)
+    assert forward.blended.margin is not None
+    sure = forward.blended.margin > 1e-4
+    assert sure.mean() > 0.9 and got.shape == wanted.shape
+    # A depth within a float32's rounding of a bound may fall on either side: no scene has one but where all are equal.
+    if name != "equal_depth":
+        assert (wanted[:, sure, 3] > 0).any(axis=1).sum() >= 4
+    for values, of in zip(got, wanted, strict=True):
+        # Colours and alphas of a bin are sums of a few dozen float32 products; depths are single values.
+        assert_close(values[sure][:, :4], of[sure][:, :4], absolute=2e-5)
+        assert_close(values[sure][:, 4:], of[sure][:, 4:], relative=1e-6, absolute=1e-6)
+
+
+@EVERY_SHAPE
+def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
+    gaussians, camera = scenes.random_cloud(2000, 8, 150, 100)
+    bounds = bin_bounds(gaussians, camera, DeepConfig(bins=7))
+    renderers = (Renderer(shaped(device, *shape)) for shape in shapes_of(device, (4, 1), every=every))
+    first, *others = (render_deep(renderer, gaussians, camera, bounds) for renderer in renderers)
+    for other in others:
+        assert_same_bits(other, first)
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize("projection", ["perspective", "orthographic", "equirectangular", "fisheye"])
+@pytest.mark.parametrize("bins", [1, 12])
+def test_flattened_it_is_the_picture(default_device: Device, projection: str, bins: int) -> None:
+    gaussians, camera = scenes.random_cloud(3000, 8, 150, 100)
+    if projection != "perspective":
+        focal = {"orthographic": 30.0, "equirectangular": 150 / (2 * np.pi), "fisheye": 140.0}[projection]
+        camera = replace(camera, fx=focal, fy=focal, projection=projection)  # type: ignore[arg-type]
+    renderer = Renderer(default_device)
+    slices = render_deep(renderer, gaussians, camera, bin_bounds(gaussians, camera, DeepConfig(bins=bins)))
+    assert len(slices) == bins
+    flat, picture = flattened(slices), renderer.render(gaussians, camera)
+    # 1 - u of a bin and its products lose a few units of 6e-8 where the picture's own sums do.
+    assert_close(flat[:, :, :3], picture.image, absolute=2e-6)
+    assert_close(flat[:, :, 3], picture.alpha, absolute=1e-6)
+    there = slices[..., 3] > 0
+    assert (slices[..., 4][there] <= slices[..., 5][there]).all() and not slices[~there].any()
+    ends, begins = slices[:-1, :, :, 5].max(axis=(1, 2)), np.where(there, slices[..., 4], np.inf)[1:].min(axis=(1, 2))
+    assert (ends < begins).all()  # slices do not overlap
+
+
+def test_windows_and_little_memory_change_no_bit() -> None:
+    gaussians, camera = scenes.random_cloud(20_000, 4, 300, 200, degree=1)
+    bounds = bin_bounds(gaussians, camera, DeepConfig(bins=4))
+    whole = render_deep(Renderer(), gaussians, camera, bounds)
+    part = crop(camera, 37, 21, 100, 60)
+    assert_same_bits(bin_bounds(gaussians, part, DeepConfig(bins=4)), bounds)
+    assert_same_bits(render_deep(Renderer(), gaussians, part, bounds), np.ascontiguousarray(whole[:, 21:81, 37:137]))
+    limit = 14 << 20
+    renderer = Renderer(open_device(None, limit))
+    assert_same_bits(render_deep(renderer, gaussians, camera, bounds), whole)
+    assert renderer.device.memory.peak <= limit
+
+
+def test_bounds() -> None:
+    gaussians, camera = scenes.random_cloud(5000, 8, 70, 50)
+    bounds = bin_bounds(gaussians, camera, DeepConfig(bins=9))
+    assert bounds.shape == (8,) and bounds.dtype == np.float32
+    ratios = bounds[1:] / bounds[:-1]
+    assert_close(ratios, np.full(7, ratios[0]), relative=1e-5)
+    depths = depths_in_view(gaussians, camera)
+    assert depths.min() > 1.0 and depths.max() < 10.0  # the cloud's
+    assert_close([np.mean(depths < bounds[0]), np.mean(depths >= bounds[-1])], [0.01, 0.01], absolute=1e-3)
+    fixed = bin_bounds(gaussians, camera, DeepConfig(bins=4, near=2.0, far=8.0))
+    assert_close(fixed, [2.0, 4.0, 8.0], relative=1e-6)
+    assert bin_bounds(gaussians, camera, DeepConfig(bins=1)).shape == (0,)
+    behind = replace(camera, translation=camera.translation - np.array([0.0, 0.0, 1000.0]))
+    assert np.isfinite(bin_bounds(gaussians, behind, DeepConfig())).all()
+    assert bin_bounds(*scenes.equal_depth(), DeepConfig()).tolist() == [3.0]
+
+
+def made(tmp_path: Path, camera: Camera | None = None, **options: Any) -> tuple[Path, Gaussians, Camera]:
+    gaussians, own = scenes.random_cloud(600, 8, 71, 50)
+    camera = camera or own
+    write_deep(tmp_path / "a.exr", Renderer(), gaussians, camera, DeepConfig(bins=6), **options)
+    assert list(tmp_path.iterdir()) == [tmp_path / "a.exr"]
+    return tmp_path / "a.exr", gaussians, camera
+
+
+def test_a_file(tmp_path: Path) -> None:
+    header = Header({"clsplat:frame": 7}, camera_matrices(scenes.tilted_camera(71, 50)))
+    empty_at_the_left = crop(scenes.tilted_camera(71, 50), -48, 0, 119, 50)
+    path, gaussians, camera = made(tmp_path, empty_at_the_left, encoding=Encoding(depth="float"), header=header)
+    spec, pixels = read(path)
+    assert spec.deep and spec.channelnames == ("R", "G", "B", "A", "Z", "ZBack")
+    assert spec.get_string_attribute("compression") == "zips"
+    assert spec.getattribute("clsplat:frame") == 7 and spec.getattribute("worldtocamera")
+    counts = [len(samples) for samples in pixels]
+    assert max(counts) > 3 and min(counts) == 0
+    for samples in pixels:
+        assert (samples[:, 3] > 0).all() and (samples[:, 4] <= samples[:, 5]).all()
+        assert (samples[1:, 4] > samples[:-1, 5]).all()
+    picture = Renderer().render(gaussians, camera)
+    wanted = np.concatenate([picture.image, picture.alpha[:, :, None]], axis=2)
+    assert_close(over(pixels, spec), wanted, absolute=2e-6)  # as above
+    flat = oiio.ImageBufAlgo.flatten(oiio.ImageBuf(str(path)))
+    assert not flat.geterror()
+    assert_close(flat.get_pixels(oiio.FLOAT)[:, :, :4], wanted, absolute=2e-6)
+
+
+def test_halves_and_a_window(tmp_path: Path) -> None:
+    camera = crop(scenes.tilted_camera(71, 50), 5, 3, 40, 30)
+    header = Header(window=Window(5, 3, 71, 50))
+    path, gaussians, _ = made(tmp_path, camera, encoding=Encoding("half", compression="piz"), header=header)
+    spec, pixels = read(path)
+    assert (spec.x, spec.y, spec.width, spec.height, spec.full_width, spec.full_height) == (5, 3, 40, 30, 71, 50)
+    assert [str(kind) for kind in spec.channelformats] == ["half"] * 4 + ["float"] * 2
+    picture = Renderer().render(gaussians, scenes.tilted_camera(71, 50))
+    # Six samples of halves, each good to 2^-12 of its own.
+    assert_close(over(pixels, spec)[:, :, :3], picture.image[3:33, 5:45], absolute=6 * 2**-11)
+
+
+def test_strips_make_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, *_ = made(tmp_path)
+    whole = path.read_bytes()
+    monkeypatch.setattr("clsplat.frame.deep_exr.DEEP_STRIP_FLOATS", 71 * 6 * 6 * 16)
+    made(tmp_path)
+    assert path.read_bytes() == whole
+
+
+def test_files_in_little_memory(tmp_path: Path) -> None:
+    gaussians, camera = scenes.random_cloud(20_000, 4, 300, 200, degree=1)
+    limit = 14 << 20  # the slices of all of it are 23 MB
+    renderer = Renderer(open_device(None, limit))
+    write_deep(tmp_path / "little.exr", renderer, gaussians, camera)
+    assert renderer.device.memory.peak <= limit
+    write_deep(tmp_path / "plenty.exr", Renderer(), gaussians, camera)
+    assert (tmp_path / "little.exr").read_bytes() == (tmp_path / "plenty.exr").read_bytes()
+
+
+def test_colours_are_converted(tmp_path: Path) -> None:
+    colours = Colours(ColourConfig(colorspace=LINEAR))
+    path, *_ = made(tmp_path, encoding=Encoding(depth="float"))
+    _, plain = read(path)
+    _, linear = read(made(tmp_path, encoding=Encoding(depth="float"), colours=colours)[0])
+    sample, converted = (max(pixels, key=len)[0] for pixels in (plain, linear))
+    straight = sample[:3] / sample[3]
+    wanted = np.where(straight > 0.04045, ((straight + 0.055) / 1.055) ** 2.4, straight / 12.92) * sample[3]
+    assert_close(converted[:3], wanted, relative=1e-5, absolute=1e-7)
+    assert_close(converted[3:], sample[3:])
+
+
+def test_what_cannot_be(tmp_path: Path) -> None:
+    gaussians, camera = scenes.one()
+    with pytest.raises(InputError, match=r"a\.png: deep samples want an \.exr file"):
+        write_deep(tmp_path / "a.png", Renderer(), gaussians, camera)
+    for config, message in (
+        (DeepConfig(bins=0), "--deep.bins 0: expected 1 to 256"),
+        (DeepConfig(near=-1.0), "--deep.near -1.0: expected a depth"),
+        (DeepConfig(near=3.0, far=2.0), "--deep.far 2.0: expected more than --deep.near 3.0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            config.check()
+
+
+def test_a_model_that_counts_from_far_away() -> None:
+    gaussians, camera = scenes.random_cloud(600, 8, 70, 50)
+    origin = np.array([4e5, -3e5, 2e5])
+    far = replace(gaussians, origin=origin)
+    away = replace(camera, translation=camera.translation - camera.rotation @ origin)
+    bounds = bin_bounds(far, away, DeepConfig(bins=5))
+    assert_close(bounds, bin_bounds(gaussians, camera, DeepConfig(bins=5)), relative=1e-6)
+    picture = Renderer().render(far, away)
+    assert picture.alpha.max() > 0.5
+    flat = flattened(render_deep(Renderer(), far, away, bounds))
+    assert_close(flat[:, :, 3], picture.alpha, absolute=1e-6)  # as above

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work under --max-device-mem: the same bytes as without, and never more memory than allowed."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from compare import assert_same_bits
+from quick import quick
+from scenes import random_cloud
+from tiny import CONFIG, short, write_scene
+
+import clsplat
+from clsplat.api import train
+from clsplat.cli.main import main
+from clsplat.config.rasterizer import BenchSwitches
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import CapacityError
+from clsplat.rendering.memory_plan import Need, plan
+from clsplat.rendering.renderer import Renderer
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.stages.device_gaussians import HostGaussians
+from clsplat.training.trainer import Trainer
+
+KIB = 1024
+
+
+def with_limit(device: Device, limit: int | None) -> Device:
+    """The device with an account of its own; without a limit it is as large as it gets."""
+    return device.with_memory_limit(limit)
+
+
+# Frames
+
+
+@pytest.mark.parametrize("share", [0.9, 0.5, 0.4])
+def test_a_frame_in_less_memory(default_device: Device, share: float) -> None:
+    scene, camera = random_cloud(6000, 11, 100, 80)
+    free = with_limit(default_device, None)
+    wanted = Renderer(free).render(scene, camera, (0.1, 0.2, 0.3))
+    limit = int(share * free.memory.peak)
+    device = with_limit(default_device, limit)
+    renderer = Renderer(device)
+    got = renderer.render(scene, camera, (0.1, 0.2, 0.3))
+    assert device.memory.peak <= limit
+    assert_same_bits(got.image, wanted.image)
+    assert_same_bits(got.alpha, wanted.alpha)
+
+
+def test_a_frame_that_sorts_all_pairs_in_less_memory(default_device: Device) -> None:
+    config = BenchSwitches(tile_test="square", depth_sort="pairs")
+    scene, camera = random_cloud(6000, 11, 100, 80)
+    free = with_limit(default_device, None)
+    wanted = Renderer(free, config=config).render(scene, camera)
+    device = with_limit(default_device, free.memory.peak // 2)
+    assert_same_bits(Renderer(device, config=config).render(scene, camera).image, wanted.image)
+    assert device.memory.peak <= free.memory.peak // 2
+
+
+def test_frames_of_many_sizes_and_models(default_device: Device) -> None:
+    device = with_limit(default_device, 2000 * KIB)
+    renderer, plain = Renderer(device), Renderer(default_device)
+    for count, width, height in ((500, 60, 40), (3000, 200, 150), (5000, 320, 200), (500, 40, 40)):
+        gaussians, camera = random_cloud(count, 3, width, height)
+        assert_same_bits(renderer.render(gaussians, camera).image, plain.render(gaussians, camera).image)
+    assert device.memory.peak <= 2000 * KIB
+
+
+def test_too_little_says_how_much_is_needed(default_device: Device) -> None:
+    gaussians, camera = random_cloud(4000, 11, 200, 150)
+    with pytest.raises(CapacityError, match=r"4,000 Gaussians .* at least about [\d,]+ KiB of device memory"):
+        Renderer(with_limit(default_device, 300 * KIB)).render(gaussians, camera)
+
+
+# Training
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene", points=False))
+
+
+MANY = short(
+    random_points=400,
+    eval_at=(9, 22),
+    density={"gradient_threshold": 1e-4, "max_gaussians": 2500, "opacity_reset_every": 35},
+)
+"""CONFIG with Gaussians that become so many that memory is a matter of them and not of the planes."""
+
+
+def trained(scene: Scene, device: Device, folder: Path, config: TrainConfig = MANY, **options: bool) -> bytes:
+    run = Run.create(folder, config, resume=options.get("resume", False))
+    train(scene, config, device=device, run=run, **options)
+    return run.model_path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def unlimited(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, int]:
+    """model.ply of MANY, and the most memory that its training had."""
+    device = with_limit(default_device, None)
+    return trained(scene, device, tmp_path_factory.mktemp("unlimited")), device.memory.peak
+
+
+@pytest.mark.parametrize("share", quick([0.95, 0.6, 0.4, 0.22], 0.6, 0.22))
+def test_training_in_less_memory_gives_the_same_bytes(
+    scene: Scene, default_device: Device, unlimited: tuple[bytes, int], share: float, tmp_path: Path
+) -> None:
+    wanted, peak = unlimited
+    limit = int(share * peak)
+    device = with_limit(default_device, limit)
+    assert trained(scene, device, tmp_path / "run") == wanted
+    assert device.memory.peak <= limit
+
+
+def test_what_is_streamed_and_banded_and_resumed(
+    scene: Scene, default_device: Device, unlimited: tuple[bytes, int], tmp_path: Path
+) -> None:
+    """Stopped under a limit, resumed without one: the same bytes again."""
+    wanted, peak = unlimited
+    device = with_limit(default_device, int(0.22 * peak))
+    trainer = Trainer(scene, MANY, device)
+    assert not trainer.plan.streamed, "it grows into it"
+    for _ in range(32):
+        trainer.train_step()
+    assert trainer.plan.streamed
+    assert isinstance(trainer.parameters, HostGaussians)
+    assert trainer.parameters.count > 2 * trainer.parameters.rows
+    frame = trainer.rasterizer.forward(trainer.parameters, trainer.views[0].camera, trainer.background)
+    assert len(frame.bands) > 1
+    run = Run.create(tmp_path / "run", MANY)
+    arrays, state = trainer.checkpoint()
+    run.save_checkpoint(trainer.step, arrays, {**state, "seconds": 1.0})
+    assert trained(scene, default_device, tmp_path / "run", resume=True) == wanted
+
+
+def test_resumed_under_a_limit(
+    scene: Scene, default_device: Device, unlimited: tuple[bytes, int], tmp_path: Path
+) -> None:
+    trainer = Trainer(scene, MANY, default_device)
+    for _ in range(17):
+        trainer.train_step()
+    run = Run.create(tmp_path / "run", MANY)
+    arrays, state = trainer.checkpoint()
+    run.save_checkpoint(trainer.step, arrays, {**state, "seconds": 1.0})
+    device = with_limit(default_device, int(0.4 * unlimited[1]))
+    assert trained(scene, device, tmp_path / "run", resume=True) == unlimited[0]
+    assert device.memory.peak <= 0.4 * unlimited[1]
+
+
+def test_absolute_gradients_in_less_memory(scene: Scene, default_device: Device) -> None:
+    config = short(random_points=1500, iterations=8, density={"absolute_gradients": True})
+    free = with_limit(default_device, None)
+    wanted = train(scene, config, device=free)
+    device = with_limit(default_device, int(0.75 * free.memory.peak))
+    got = train(scene, config, device=device)
+    for field in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        assert_same_bits(getattr(got, field), getattr(wanted, field))
+    assert device.memory.peak <= device.memory.limit
+
+
+def test_a_small_training_that_fits_is_not_cut(scene: Scene, default_device: Device) -> None:
+    trainer = Trainer(scene, CONFIG, default_device)
+    assert not trainer.plan.streamed
+    assert (trainer.plan.channels, trainer.plan.groups, trainer.plan.gathers) == (3, 1, True)
+
+
+def test_no_buffer_is_over_the_devices_limit_of_one(
+    scene: Scene, default_device: Device, unlimited: tuple[bytes, int], tmp_path: Path
+) -> None:
+    device = with_limit(default_device, None)
+    device.max_allocation = 180 * KIB
+    assert trained(scene, device, tmp_path / "run") == unlimited[0]
+
+
+# The plan
+
+STEP = Need(gaussians=100_000, floats=59, models=4, slot=9, planes=50 * 2**20, loss=30 * 2**20, scratch=2**20)
+
+
+def planned(mebibytes: float, need: Need = STEP, largest: int = 2**31) -> str:
+    return str(plan(need, int(mebibytes * 2**20), largest, 32))
+
+
+def test_the_plan_in_words() -> None:
+    assert planned(1000) == "about 211.6 MiB of device memory needed, 1,000.0 MiB allowed: all at once"
+    assert "allowed: the image is done in about 2 groups of tiles, the loss is done by channel" in planned(190)
+    assert "allowed: parameters are streamed, 20,128 Gaussians at a time, the image" in planned(120)
+    with pytest.raises(CapacityError, match=r"need at least about 48.3 MiB of device memory, 211.6 MiB to be done"):
+        planned(45)
+    small = Need(gaussians=40, floats=59, models=4, slot=9, planes=50_000, loss=30_000, scratch=1024)
+    with pytest.raises(CapacityError, match=r"about [0-9]+ KiB .* [0-9]+ KiB to be done at once, and 4,000 bytes are"):
+        plan(small, 4000, 2**31, 32)
+
+
+def test_pieces_are_no_smaller_than_need_be() -> None:
+    for mebibytes in range(60, 400, 5):
+        made = plan(STEP, mebibytes * 2**20, 2**31, 32)
+        parameters = made.rows * STEP.model
+        rest = STEP.planes + STEP.scratch + STEP.gaussians * STEP.banded_row + made.pairs * STEP.pair
+        rest -= 0 if made.channels == 3 else STEP.loss * 2 // 3
+        assert parameters + rest <= mebibytes * 2**20
+        assert made.streamed == (made.rows < STEP.gaussians)
+        assert made.rows % 32 == 0
+
+
+def test_the_command_line_says_what_it_will_do(
+    tmp_path: Path, unlimited: tuple[bytes, int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    call = ["train", str(write_scene(tmp_path / "scene")), "-o", str(tmp_path / "run"), "--iterations", "3"]
+    assert main([*call, "--max-device-mem", "500KiB"]) == 0
+    said = capfd.readouterr().err
+    assert re.search(r"40 Gaussians: about \d+ KiB of device memory needed, 500 KiB allowed: the loss is", said), said
+    assert main([*call, "--overwrite"]) == 0
+    assert "device memory" not in capfd.readouterr().err
+    assert main(["eval", str(tmp_path / "run"), "--max-device-mem", "10KiB"]) == 1
+    assert "40 Gaussians at this size of image need at least about" in capfd.readouterr().err
+    sparse = str(tmp_path / "scene" / "sparse" / "0")
+    call = ["render", str(tmp_path / "run"), "--cameras", sparse, "-o", str(tmp_path / "{name}.exr")]
+    assert main([*call, "--max-device-mem", "1M"]) == 0
+
+
+@pytest.mark.slow
+def test_bench_under_a_limit(capsys: pytest.CaptureFixture[str]) -> None:
+    call = ["bench", "--gaussians", "2000", "--size", "96x64", "--repeat", "1", "--json"]
+    found = []
+    for limit in ([], ["--max-device-mem", "1.2MiB"]):
+        assert main([*call, *limit]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0]["pairs"] == found[1]["pairs"]
+    assert found[0]["visible"] == found[1]["visible"]
+
+
+def test_from_python(scene: Scene) -> None:
+    gaussians, camera = random_cloud(500, 3, 60, 40)
+    wanted = clsplat.render(gaussians, camera).image
+    assert_same_bits(clsplat.render(gaussians, camera, max_device_mem="400KiB").image, wanted)
+    with pytest.raises(CapacityError, match=r"[1-9][0-9]+ KiB to be done at once, and 98 KiB are allowed"):
+        clsplat.render(gaussians, camera, max_device_mem=100_000)
+    config, plans = short(iterations=2), []
+    clsplat.train(scene, config, max_device_mem="64MiB", on_plan=plans.append)
+    assert [plan.allowed for plan in plans] == [64 * 2**20]
+
+
+def test_a_device_with_little_memory_needs_no_flag(
+    scene: Scene, default_device: Device, unlimited: tuple[bytes, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = with_limit(default_device, None)
+    budget = int(0.4 * unlimited[1])
+    monkeypatch.setattr(Device, "budget", budget)
+    assert trained(scene, device, tmp_path / "run") == unlimited[0]
+    assert device.memory.peak <= budget

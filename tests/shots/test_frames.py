@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frame ranges and names of files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from clsplat.errors import InputError
+from clsplat.shots.frame_numbers import output_paths, parse_frames, path_of, ranges
+
+
+@pytest.mark.parametrize(
+    ("text", "frames"),
+    [
+        ("7", [7]),
+        ("1-5", [1, 2, 3, 4, 5]),
+        ("1-10:3", [1, 4, 7, 10]),
+        ("1-9:3", [1, 4, 7]),
+        ("5-5", [5]),
+        ("7,12,30-32", [7, 12, 30, 31, 32]),
+        ("30-32, 7 ,12", [7, 12, 30, 31, 32]),
+        ("1-5,3-7", [1, 2, 3, 4, 5, 6, 7]),
+        ("-2-1", [-2, -1, 0, 1]),
+        ("-5--1:2", [-5, -3, -1]),
+        ("-3", [-3]),
+        ("0001-0003", [1, 2, 3]),
+    ],
+)
+def test_frames(text: str, frames: list[int]) -> None:
+    assert parse_frames(text) == frames
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "'' is no frame or range"),
+        ("1,,2", "'' is no frame or range"),
+        ("1-", "'1-' is no frame or range"),
+        ("a-b", "'a-b' is no frame or range"),
+        ("1:2", "'1:2' is no frame or range"),
+        ("1.5", "'1.5' is no frame or range"),
+        ("1-10:-1", "'1-10:-1' is no frame or range"),
+        ("1-10:0", "the step 0, expected at least 1"),
+        ("10-1", "the range '10-1' is empty"),
+        ("3,-1--5", "the range '-1--5' is empty"),
+        ("1-99999999", "lists more than 10,000,000 frames"),
+    ],
+)
+def test_frames_that_are_none(text: str, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_frames(text)
+    assert str(caught.value).startswith(f"--frames {text}: ")
+    assert message in str(caught.value)
+
+
+@given(st.sets(st.integers(-50, 50), min_size=1, max_size=16))
+def test_ranges_are_read_again(frames: set[int]) -> None:
+    short = ranges(sorted(frames))
+    if short.endswith("..."):
+        assert set(parse_frames(short.removesuffix(",..."))) < frames
+    else:
+        assert parse_frames(short) == sorted(frames)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "path"),
+    [
+        ("shot/beauty.####.exr", "shot/beauty.0042.exr"),
+        ("shot/beauty.#.exr", "shot/beauty.42.exr"),
+        ("shot/beauty.######.exr", "shot/beauty.000042.exr"),
+        ("shot/beauty.%04d.exr", "shot/beauty.0042.exr"),
+        ("beauty.%d.exr", "beauty.42.exr"),
+        ("{frame}.png", "42.png"),
+        ("{frame:05}.png", "00042.png"),
+        ("{frame:05d}.png", "00042.png"),
+        ("{name}.png", "cam#1/%04d.v2.png"),
+        ("{frame}/{name}_##.png", "42/cam#1/%04d.v2_42.png"),
+        ("100%/50%%/x.png", "100%/50%%/x.png"),
+    ],
+)
+def test_patterns(pattern: str, path: str) -> None:
+    assert path_of(pattern, 42, "cam#1/%04d.v2.jpg") == Path(path)
+
+
+def test_more_digits_than_the_pattern_has_and_negative_ones() -> None:
+    assert path_of("a.###.exr", 12345, "x") == Path("a.12345.exr")
+    assert path_of("a.####.exr", -5, "x") == Path("a.-005.exr")
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    ["{nmae}.png", "{}.png", "{name:04}.png", "{frames}.png", "a.%x.png", "a.%4d.png", "{frame:4d}.png", "{a b}.png"],
+)
+def test_fields_that_are_not_known(pattern: str) -> None:
+    with pytest.raises(InputError, match=r"is not known, expected \{name\}, \{frame\}, #### or %04d"):
+        output_paths(pattern, [(1, "a")])
+
+
+def test_what_is_no_field() -> None:
+    assert path_of("{8f-2c}/100%/50%.png", 1, "a") == Path("{8f-2c}/100%/50%.png")
+
+
+def test_every_frame_has_a_file_of_its_own() -> None:
+    assert output_paths("one.png", [(1, "a.jpg")]) == [Path("one.png")]
+    assert output_paths("o/{name}.png", [(1, "a.jpg"), (2, "s/b.jpg")]) == [Path("o/a.png"), Path("o/s/b.png")]
+    assert output_paths("o/##.png", [(1, "a.jpg"), (2, "a.png")]) == [Path("o/01.png"), Path("o/02.png")]
+    with pytest.raises(InputError, match=r"would be both a\.jpg and a\.png"):
+        output_paths("o/{name}.png", [(1, "a.jpg"), (2, "a.png")])
+    with pytest.raises(InputError, match="expected one to tell 2 cameras apart, or a frame number such as ####"):
+        output_paths("one.png", [(1, "a"), (2, "b")])
+
+
+@pytest.mark.parametrize("name", ["../a.jpg", "a/../../b.jpg", "/etc/a.jpg"])
+def test_names_stay_in_the_folder(name: str) -> None:
+    with pytest.raises(InputError, match="leads out of the output folder"):
+        output_paths("out/{name}.png", [(1, name)])
+    assert output_paths("out/####.png", [(1, name)]) == [Path("out/0001.png")]
+
+
+def test_a_name_that_is_none() -> None:
+    with pytest.raises(InputError, match="is empty"):
+        output_paths("out/{name}.png", [(1, "")])

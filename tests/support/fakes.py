@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands in for scene, device, trainer, renderer and image files where only the command line is tested."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from models import random_gaussians
+
+from clsplat.camera import Camera
+from clsplat.cli import render as verb_render  # noqa: F401  # imported before fakes take their modules' places
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import TrainConfig
+from clsplat.errors import DeviceError, InputError
+from clsplat.evaluation import held_out
+from clsplat.gaussians import Gaussians
+from clsplat.images import channels as layers
+from clsplat.runs.run import Run
+from clsplat.sequence import frame_renderer
+from clsplat.shots import read
+
+
+def camera(width: int = 32, height: int = 24) -> Camera:
+    return Camera(width, height, 30.0, 31.0, width / 2, height / 2, np.eye(3), np.zeros(3))
+
+
+@dataclass
+class FakeView:
+    name: str
+    split: str
+    camera: Camera = field(default_factory=camera)
+
+    def load(self, width: int | None = None, height: int | None = None) -> np.ndarray:
+        return np.full((height or self.camera.height, width or self.camera.width, 3), 0.5, np.float32)
+
+
+@dataclass
+class FakeDevice:
+    name: str = "processor"
+    driver: str = "OpenCL 3.0 driver 1.0"
+    budget: int = 1 << 30
+    max_allocation: int = 1 << 28
+
+
+@dataclass
+class Pipeline:
+    """What the fakes were asked for, and what they are to do."""
+
+    calls: list[tuple[Any, ...]] = field(default_factory=list)
+    written: dict[str, np.ndarray] = field(default_factory=dict)
+    cameras: dict[str, Camera] = field(default_factory=lambda: {"a.jpg": camera(), "sub/b.c.jpg": camera(20, 40)})
+    training: Callable[..., None] = lambda *_: None
+
+    def write_channels(self, path: Path, made: dict[str, np.ndarray], *_: object) -> None:
+        """In place of the real one."""
+        planes = [plane if plane.ndim == 3 else plane[:, :, None] for plane in made.values()]
+        self.written[str(path)] = np.concatenate(planes, axis=2)
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, fakes: dict[str, dict[str, Any]]) -> None:
+    """Put members of modules in the places of the real ones, and where those have been imported to already."""
+    for name, members in fakes.items():
+        module = ModuleType(f"clsplat.{name}")
+        vars(module).update(members)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        for user in (frame_renderer, held_out):
+            for member in members.keys() & vars(user).keys():
+                monkeypatch.setattr(user, member, members[member])
+
+
+@pytest.fixture
+def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
+    """Stands in for scene, device, trainer, renderer and image files."""
+    pipe = Pipeline()
+
+    @dataclass
+    class Scene:
+        views: list[FakeView]
+        warnings: list[str]
+        name: str = "photos"
+        points: tuple[float, ...] = ()
+
+        @property
+        def train_views(self) -> list[FakeView]:
+            return [view for view in self.views if view.split == "train"]
+
+        @property
+        def test_views(self) -> list[FakeView]:
+            return [view for view in self.views if view.split == "test"]
+
+        def require_training_views(self) -> list[FakeView]:
+            return self.train_views
+
+        def check_pictures(self) -> None:
+            """Real pictures are cut in test_scene.py."""
+
+    @dataclass
+    class Result:
+        image: np.ndarray
+        alpha: np.ndarray
+
+    @dataclass
+    class Report:
+        step: int
+        loss: float = 0.1
+        psnr: float = 20.0
+        gaussians: int = 4
+        seconds: float = 1.0
+
+    class Renderer:
+        def __init__(self, device: object, config: object = None) -> None:
+            assert isinstance(device, FakeDevice)
+            assert config == RasterizerConfig()
+            self.device = device
+
+        def render(
+            self, gaussians: Gaussians, camera: Camera, background: tuple[float, ...] = (0, 0, 0), **_: Any
+        ) -> Result:
+            pipe.calls.append(("render", len(gaussians), camera.width, camera.height, tuple(background)))
+            size = (camera.height, camera.width)
+            return Result(np.full((*size, 3), 0.25, np.float32), np.full(size, 0.5, np.float32))
+
+    def load_scene(path: Path, *, resolution: int, test_every: int, progress: Callable[..., None]) -> Scene:
+        if not Path(path).is_dir():
+            raise InputError(f"{path}: no such folder")
+        pipe.calls.append(("load_scene", str(path), resolution, test_every))
+        views = [FakeView("0.jpg", "test"), FakeView("1.jpg", "train")]
+        return Scene(views if test_every else views[1:], ["one photo is dark"])
+
+    def train(
+        scene: Scene,
+        config: TrainConfig,
+        *,
+        device: FakeDevice,
+        run: Run,
+        resume: bool,
+        on_step: Any,
+        on_plan: Any,
+        between: Any = None,
+    ) -> Gaussians:
+        pipe.calls.append(("train", config.iterations, config.seed, resume))
+        on_step(Report(1))
+        pipe.training(run, on_step)
+        gaussians = random_gaussians(4)
+        run.save_model(gaussians)
+        run.append_metrics({"step": config.iterations, "loss": 0.1, "gaussians": 4, "seconds": 2.5})
+        run.write_eval({"step": 1, "gaussians": 4, "seconds": 2.5, "mean": {"psnr": 20.0, "ssim": 0.5}, "views": [{}]})
+        return gaussians
+
+    def open_device(selector: str | None, memory_limit: int | None = None) -> FakeDevice:
+        if selector == "nosuch":
+            raise DeviceError("--device nosuch: no such device")
+        return FakeDevice()
+
+    def write_image(path: Path, image: np.ndarray, *, alpha: str = "straight") -> None:
+        assert image.shape[2] == 3 or alpha == "associated"
+        pipe.written[str(path)] = image
+
+    monkeypatch.setattr(read, "read_cameras", lambda _: pipe.cameras)
+    monkeypatch.setattr(layers, "write_channels", pipe.write_channels)
+    fakes: dict[str, dict[str, Any]] = {
+        "scenes.scene": {"load_scene": load_scene},
+        "api": {"train": train},
+        "rendering.renderer": {"Renderer": Renderer},
+        "device.context": {"open_device": open_device},
+        "selftest.trust": {"require": lambda device, *_: device},
+        "images.writing": {"write_image": write_image},
+    }
+    stand_in(monkeypatch, fakes)
+    return pipe
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> str:
+    (tmp_path / "folder").mkdir()
+    return str(tmp_path / "folder")
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> str:
+    path = tmp_path / "some.ply"
+    random_gaussians(4).save(path)
+    return str(path)

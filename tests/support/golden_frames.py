@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames and gradients of a few tiny scenes, pictures with every channel, and a trained model: checksums for
+`golden/frames.json`, and all of it for `tools/digests.py`."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import scenes
+from numpy.typing import NDArray
+from pipeline import Pipeline, shaped
+from tiny import short, write_scene
+
+from clsplat.api import train
+from clsplat.device.context import Device
+from clsplat.gaussians import Gaussians
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.scene import load_scene
+from clsplat.sequence.frame_renderer import FrameRenderer
+from clsplat.sequence.task import RenderOptions, Task
+
+Array = NDArray[np.float32]
+
+LANES, ITEMS = 8, 1
+"""The shape of the gradients: their sums, unlike a frame, depend on it."""
+
+SCENES = {
+    "overlap": scenes.NAMED["overlap"],
+    "saturating": scenes.NAMED["saturating"],
+    "cloud": lambda: scenes.random_cloud(2000, 8, 150, 100),
+}
+
+
+def arrays_of(device: Device) -> dict[str, dict[str, list[Array]]]:
+    """By scene and name, in the device's own shape: all channels of the frame, the gradients of the parameters and of
+    the means on the image."""
+    return {name: _of(Pipeline.run(device, make())) for name, make in SCENES.items()}
+
+
+def checksums(device: Device) -> dict[str, dict[str, str]]:
+    """By scene and array, in the golden shape."""
+    found = arrays_of(shaped(device, LANES, ITEMS))
+    return {scene: {name: checksum(parts) for name, parts in arrays.items()} for scene, arrays in found.items()}
+
+
+def _of(run: Pipeline) -> dict[str, list[Array]]:
+    camera = run.camera
+    d_image = np.random.default_rng(1).random((camera.height, camera.width, 3)) - 0.5
+    gradients, screen = run.backward(d_image)
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    return {
+        "image": [run.frame.blended.image.get()],
+        "transmittance": [run.frame.blended.transmittance.get()],
+        "gradients": [getattr(gradients, name) for name in names],
+        "screen": [screen[run.visible]],
+    }
+
+
+CHANNELS = ("rgb", "alpha", "depth", "median", "first", "normals", "position", "motion", "count", "id", "deep")
+"""All that a picture can be written with (`clsplat.images.channels`), and its slices by depth."""
+BOUNDS = np.array([2.0, 3.5, 6.0], np.float32)
+
+
+def pictures_of(device: Device) -> dict[str, dict[str, str]]:
+    """Checksums by kind of camera and channel, in the device's own shape."""
+    gaussians, camera = SCENES["cloud"]()
+    found = {}
+    width = camera.width
+    focals = {"orthographic": 0.2 * width, "equirectangular": width / (2 * np.pi), "fisheye": 0.3 * width}
+    for kind in ("perspective", *focals):
+        focal = focals.get(kind)
+        view = camera if focal is None else replace(camera, fx=focal, fy=focal, projection=kind)  # type: ignore[arg-type]
+        after = replace(view, translation=view.translation + np.array([-0.0625, 0.03125, 0.125]))
+        renderer = Renderer(device)
+        render_frame = FrameRenderer(renderer, gaussians, RenderOptions(channels=CHANNELS[:-1]))
+        layers = render_frame(Task(1, "1", view, Path(), after)).planes
+        layers["deep"] = renderer.render_deep(gaussians, view, BOUNDS)
+        found[kind] = {name: checksum([np.ascontiguousarray(values)]) for name, values in layers.items()}
+    return found
+
+
+def checksum(parts: list[Array]) -> str:
+    return f"{zlib.crc32(b''.join(part.tobytes() for part in parts)):08x}"
+
+
+TRAINING = short(iterations=60, density={"every": 10, "start": 10, "stop": 55, "opacity_reset_every": 30})
+"""Warm-up, SH degrees, five densifications and an opacity reset."""
+
+
+def trained(device: Device, folder: Path) -> tuple[Gaussians, float]:
+    """A model trained on the tiny scene, which is written to the folder, and its mean PSNR on the held-out views."""
+    scene = load_scene(folder if folder.exists() else write_scene(folder))
+    model = train(scene, TRAINING, device=device)
+    renderer = Renderer(device)
+    errors = [np.mean((renderer.render(model, view.camera).image - view.load()) ** 2) for view in scene.test_views]
+    return model, float(np.mean(-10 * np.log10(errors)))

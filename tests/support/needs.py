@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Needed beside the extra `test`: mark a test `needs("name")`, or call `require("name")` in a fixture or a module.
+
+Without it the test is skipped, and the reason is the line that installs it; conftest.py lists them at the end.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+SCENES = Path(os.environ.get("CLSPLAT_SCENES", Path(__file__).parents[3] / "shared" / "scenes"))
+"""The real data."""
+NODE_CACHE = Path(__file__).parents[2] / ".pytest_cache" / "node" / "node_modules"
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+PREFIX = "needs "
+"""Beginning of every reason of this kind."""
+
+
+@dataclass(frozen=True)
+class Need:
+    """A package, a program or data; line: the command that brings it."""
+
+    title: str
+    line: str
+    is_there: Callable[[], bool]
+
+
+def of_extra(module: str, title: str, extra: str) -> Need:
+    """A package from the index; in `.venv`, where tools/test runs, an extra brings it."""
+    return Need(title, f"python3 tools/environment.py {extra}", lambda: find_spec(module) is not None)
+
+
+def chromium_path() -> str | None:
+    """The browser: CLSPLAT_CHROMIUM, or the first that the path has."""
+    named = os.environ.get("CLSPLAT_CHROMIUM")
+    return next((found for name in ([named] if named else CHROMIUM) if (found := shutil.which(name))), None)
+
+
+def openjd_path() -> str | None:
+    """The program `openjd`, beside this Python or on the path."""
+    return shutil.which("openjd", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
+
+
+def node_modules() -> Path | None:
+    """The folder of the readers from npm: CLSPLAT_NODE_MODULES, or where node.py puts them."""
+    given = os.environ.get("CLSPLAT_NODE_MODULES")
+    folder = Path(given).resolve() if given else NODE_CACHE
+    return folder if shutil.which("node") and folder.is_dir() else None
+
+
+NEEDS = {
+    "av": of_extra("av", "PyAV", "video"),
+    "chromium": Need("Chromium", "apt-get install chromium, or set CLSPLAT_CHROMIUM", lambda: bool(chromium_path())),
+    "distributed": of_extra("distributed", "distributed", "farm"),
+    "hatchling": of_extra("hatchling", "hatchling", "test"),
+    "importlinter": of_extra("importlinter", "import-linter", "dev"),
+    "html5lib": of_extra("html5lib", "html5lib", "test"),
+    "matplotlib": of_extra("matplotlib", "Matplotlib", "plot"),
+    "node": Need(
+        "readers from npm", "apt-get install nodejs npm && python3 tests/support/node.py", lambda: bool(node_modules())
+    ),
+    "oclgrind": Need("Oclgrind", "apt-get install oclgrind", lambda: shutil.which("oclgrind") is not None),
+    "openjd": Need("openjd-cli", "python3 tools/environment.py dev", lambda: bool(openjd_path())),
+    "playwright": of_extra("playwright", "Playwright", "test"),
+    "pxr": of_extra("pxr", "OpenUSD", "usd"),
+    "scenes": Need("real scenes", "set CLSPLAT_SCENES to their folder", SCENES.is_dir),
+    "viser": of_extra("viser", "viser", "view"),
+}
+
+
+def missing(name: str) -> str:
+    """Why a test that needs this is skipped; empty where it is there."""
+    need = NEEDS[name]
+    return "" if need.is_there() else f"{PREFIX}{need.title}: {need.line}"
+
+
+def require(name: str) -> None:
+    """Skip the test, or the module that is being imported, where this is not there."""
+    if reason := missing(name):
+        pytest.skip(reason, allow_module_level=True)

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""tools/digests.py: what it calls a problem. CI runs the whole of it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from compare import relative_error
+from golden_frames import SCENES, arrays_of
+from pipeline import shaped
+from quick import quick
+
+from clsplat.device.context import Device
+from clsplat.images.channels import CHANNELS
+
+ROOT = Path(__file__).resolve().parents[2]
+TOOLS = ROOT / "tools"
+sys.path.insert(0, str(TOOLS))
+import digests  # noqa: E402
+from digests import EXPECTED, Row, problems  # noqa: E402
+
+PICTURES = {"perspective": {"rgb": "c", "motion": "v"}, "fisheye": {"rgb": "d"}}
+GOOD = Row("A", "8x1", "f", "g8", "m8", True, 20.0, 100, pictures=PICTURES)
+ROWS = [GOOD, replace(GOOD, driver="B"), Row("A", "1x64", "f", "g1", "m1", True, 20.1, 101, 5e-7, pictures=PICTURES)]
+
+
+def test_no_problem() -> None:
+    assert problems(ROWS) == []
+
+
+@pytest.mark.parametrize(
+    ("index", "change", "words"),
+    [
+        (1, {"frame": "x"}, "B, 8x1: the frame is x, on A, 8x1 it is f"),
+        (2, {"frame": "x"}, "A, 1x64: the frame is x"),
+        (
+            2,
+            {"pictures": {"perspective": PICTURES["perspective"], "fisheye": {"rgb": "x"}}},
+            "A, 1x64: rgb of the fisheye camera is x, on A, 8x1 it is d",
+        ),
+        (1, {"pictures": {}}, "B, 8x1: rgb of the perspective camera is missing"),
+        (1, {"gradient": "x"}, "B, 8x1: the gradient is x, on A in that shape it is g8"),
+        (2, {"difference": 2e-6}, "A, 1x64: the gradient is 2.0e-06 from that of 8x1"),
+        (2, {"difference": float("nan")}, "A, 1x64: the gradient is nan"),
+        (0, {"repeats": False}, "A, 8x1: two trainings gave two models"),
+        (1, {"model": "x"}, "B, 8x1: the model is x, on A in that shape it is m8"),
+        (2, {"psnr": 18.0}, "A, 1x64: the model has 18.00 dB, that of 8x1 20.00 dB"),
+        (2, {"trouble": "ended with status 1"}, "A, 1x64: ended with status 1"),
+    ],
+)
+def test_a_problem(index: int, change: dict[str, object], words: str) -> None:
+    rows = list(ROWS)
+    rows[index] = replace(rows[index], **change)  # type: ignore[arg-type]
+    assert any(text.startswith(words) for text in problems(rows))
+
+
+def test_a_failure_that_is_expected_has_to_fail() -> None:
+    driver, shape = next(iter(EXPECTED))
+    row = Row(driver, shape, "f", "g", trouble="known")
+    assert problems([*ROWS, row]) == []
+    assert "take it from EXPECTED" in problems([*ROWS, replace(row, trouble="", gradient="g1")])[0]
+
+
+def test_nothing_run() -> None:
+    assert problems([Row("A", "8x1", trouble="no")])[-1] == "nothing was run"
+
+
+def test_tables_have_every_driver() -> None:
+    rows = [*ROWS, Row(*next(iter(EXPECTED)), trouble="known")]
+    assert len(digests.table(rows).splitlines()) == 2 + len(rows)
+    lines = digests.summary(rows).splitlines()
+    assert f"| 8x1 | A; B | `f` | `{GOOD.channels}` | `g8` | `m8`, 20.000 dB |" in lines
+    assert lines[-2:] == ["| perspective | `c` | `v` |", "| fisheye | `d` | not defined |"]
+
+
+def test_a_child(tmp_path: Path) -> None:
+    command = [sys.executable, str(TOOLS / "digests.py"), "child", "0", "8x1", str(tmp_path / "arrays.npz")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert set(told) == {"frame", "gradient", "pictures"}
+    channels = {"deep", *CHANNELS}
+    kinds = ("perspective", "orthographic", "equirectangular", "fisheye")
+    assert {kind: set(each) for kind, each in told["pictures"].items()} == dict.fromkeys(kinds, channels)
+    assert (tmp_path / "arrays.npz").exists()
+    page = (ROOT / "docs/bit-identity.md").read_text("utf-8").splitlines()
+    row = Row("any", "8x1", **told)
+    rows = [line for line in page if line.startswith("| 8x1 |") and "not run" not in line]
+    assert rows and all(f"| `{row.frame}` | `{row.channels}` | `{row.gradient}` |" in line for line in rows)
+    assert set(digests.channel_table(row)) <= set(page)
+
+
+@pytest.mark.parametrize("shape", quick([(1, 1), (1, 64), (4, 1), (8, 16), (16, 1)], (1, 64)), ids=str)
+def test_gradients_of_two_shapes(shape: tuple[int, int], default_device: Device) -> None:
+    """The order of blending's sums is the shape's: of each parameter group within GRADIENT_BOUND, in norm."""
+    wanted, got = arrays_of(shaped(default_device, 8, 1)), arrays_of(shaped(default_device, *shape))
+    for scene in SCENES:
+        for name in ("gradients", "screen"):
+            for a, b in zip(got[scene][name], wanted[scene][name], strict=True):
+                assert 0 < relative_error(a, b) <= digests.GRADIENT_BOUND

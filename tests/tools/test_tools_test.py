@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""tools/test: the command line that it makes, and that a test which crashes or hangs ends the run and is named."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+GROUPS = "import pytest\ndef pytest_collection_modifyitems(items):\n    for item in items:\n"
+GROUPS += "        item.add_marker(pytest.mark.xdist_group(item.path.stem))\n"
+PATIENCE = 120
+"""Seconds for a run of a few: one that hangs never ends."""
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    """The script as a module."""
+    spec = spec_from_loader("tools_test", SourceFileLoader("tools_test", str(ROOT / "tools" / "test")))
+    assert spec is not None
+    module = module_from_spec(spec)
+    assert spec.loader is not None
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def commands(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """What is run in place of pytest."""
+    made: list[list[str]] = []
+
+    def run(command: list[str]) -> int:
+        made.append(command[3:])
+        return 5
+
+    monkeypatch.setattr(tool, "set_up", lambda extras: Path("python") if extras == ("test",) else None)
+    monkeypatch.setattr(tool, "run", run)
+    monkeypatch.setattr(tool, "cores", lambda: 2)
+    monkeypatch.setattr(tool, "memory", lambda: 64 << 30)
+    monkeypatch.chdir(ROOT)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        ("", "-n 2 --dist loadgroup"),
+        ("--all", "-n 2 --dist loadgroup -m ''"),
+        ("-k ply --no-header", "-n 2 --dist loadgroup -k ply --no-header"),
+        ("--all -x tests/models/test_ply.py", "-n 2 --dist loadgroup -m '' -x tests/models/test_ply.py"),
+        ("-n 0", "-n 0"),
+        ("-n4 -q", "-n4 -q"),
+        ("--numprocesses=3", "--numprocesses=3"),
+        ("-p no:xdist", "-p no:xdist"),
+        ("--pdb", "--pdb"),
+    ],
+)
+def test_its_command_line(
+    given: str, wanted: str, tool: ModuleType, commands: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["tools/test", *given.split()])
+    assert tool.main() == 5
+    assert commands == [[word.strip("'") for word in wanted.split()]]
+
+
+@pytest.mark.parametrize(
+    ("cores", "free", "wanted"), [(1, None, 1), (2, None, 2), (64, None, 4), (8, 5 << 30, 2), (8, 1 << 30, 1)]
+)
+def test_as_many_processes_as_are_worth_it(
+    cores: int, free: int | None, wanted: int, tool: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tool, "cores", lambda: cores)
+    monkeypatch.setattr(tool, "memory", lambda: free)
+    assert tool.processes() == wanted
+
+
+def test_help_installs_nothing() -> None:
+    done = subprocess.run([sys.executable, str(ROOT / "tools/test"), "--help"], capture_output=True, text=True)  # noqa: PLW1510
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "tools/test --all" in done.stdout
+
+
+def run(tool: ModuleType, folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    """pytest with the project's settings and in the processes of tools/test, on two files of a few tests."""
+    (folder / "conftest.py").write_text(GROUPS)
+    (folder / "test_fine.py").write_text(
+        "import pytest\n@pytest.mark.parametrize('i', range(20))\ndef test_it(i): pass\n"
+    )
+    how = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(folder), *tool.distribution([])]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "COV"))}
+    command = [sys.executable, "-m", "pytest", *how, *more, str(folder)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=PATIENCE, check=False, cwd=folder, env=environment
+    )
+
+
+def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> None:
+    body = "import os, pytest\n@pytest.mark.parametrize('i', range(6))\ndef test_it(i):\n    if i == 3: os.abort()\n"
+    (tmp_path / "test_aborts.py").write_text(body)
+    done = run(tool, tmp_path)
+    assert done.returncode == 1, done.stdout
+    assert "crashed while running 'test_aborts.py::test_it[3]'" in done.stdout
+
+
+def test_what_hangs_ends_and_is_named(tool: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "test_hangs.py").write_text("import time\ndef test_it():\n    time.sleep(1000)\n")
+    done = run(tool, tmp_path, "-o", "faulthandler_timeout=1")
+    assert done.returncode == 1, done.stdout
+    assert "crashed while running 'test_hangs.py::test_it'" in done.stdout
+    assert "Timeout (0:00:01)!" in done.stderr

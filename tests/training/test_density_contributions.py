@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The policy beyond the paper: growth by a budget, views that agree, pruning by contribution."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+from test_density import state
+
+from clsplat.config.training import DensityConfig, TrainConfig
+from clsplat.training.density import StatisticsNeeds
+from clsplat.training.density.adaptive import (
+    Adaptive,
+    Plan,
+    budget,
+    is_due,
+    is_pruning_due,
+    plan,
+    plan_pruning,
+)
+
+CONFIG = DensityConfig()
+GROWING = replace(CONFIG, growth="budget", max_gaussians=9000, start=500, stop=2500)
+WEAK, STRONG = 1e-4, 3e-4
+"""Mean gradients on either side of the threshold."""
+
+
+def contributions(totals: ArrayLike, largest: ArrayLike | None = None) -> dict[str, np.ndarray]:
+    """Statistics of the last whole epoch; `largest` are of the one under way."""
+    values = np.asarray(totals, np.float32)
+    largest = values if largest is None else np.asarray(largest, np.float32)
+    return {"whole_totals": values, "whole_largest": np.minimum(values, largest), "current_largest": largest}
+
+
+def make_plan(
+    gradients: ArrayLike,
+    config: DensityConfig = CONFIG,
+    step: int = 600,
+    *,
+    opacities: ArrayLike = 0.5,
+    agreeing: ArrayLike | None = None,
+    known: dict[str, np.ndarray] | None = None,
+) -> Plan:
+    """All small, so that who is densified is cloned, and seen in four views."""
+    sums = 4 * np.asarray(gradients, np.float32)
+    n = len(sums)
+    o = np.broadcast_to(np.asarray(opacities, np.float32), n)
+    statistics = {"gradient_sums": sums, "seen": np.full(n, 4, np.float32), "radii": np.full(n, 5, np.float32)}
+    if agreeing is not None:
+        statistics["agreeing"] = np.asarray(agreeing, np.float32)
+    parameters = {"log_scales": np.full((n, 3), np.log(0.05), np.float32), "opacity_logits": np.log(o / (1 - o))}
+    return plan(config, state(step, 10.0, parameters, {**statistics, **(known or {})}))
+
+
+def cloned(made: Plan) -> list[int]:
+    rows: list[int] = made.rows[made.fresh].tolist()
+    return rows
+
+
+def kept(made: Plan) -> list[int]:
+    rows: list[int] = made.rows[~made.fresh].tolist()
+    return rows
+
+
+# Growth
+
+
+def steps_of(config: DensityConfig) -> list[int]:
+    return [step for step in range(config.stop + 1) if is_due(config, step)]
+
+
+@pytest.mark.parametrize(
+    ("every", "start", "stop"), [(100, 500, 2500), (100, 500, 2501), (70, 333, 1999), (500, 0, 600)]
+)
+def test_the_number_follows_the_parabola(every: int, start: int, stop: int) -> None:
+    """Taming 3DGS's A(x), in its own form, where the passes are evenly spaced; and its ends in any case."""
+    config = replace(GROWING, every=every, start=start, stop=stop)
+    steps, first, last = steps_of(config), 1000, config.max_gaussians
+    counts = [first]
+    for step in steps:
+        counts.append(budget(config, step, counts[-1]))
+    assert counts[-1] == last, "the last densification reaches the budget"
+    assert sorted(counts) == counts
+    span = steps[-1] - start
+    slope = 2 * (last - first) / span
+    x = np.array([start, *steps]) - start
+    wanted = (last - first - slope * span) / span**2 * x**2 + slope * x + first
+    # whole Gaussians: half a one is rounded at each pass, and less is left of that at the next
+    np.testing.assert_allclose(counts, wanted, atol=1.0 * len(steps) ** 0.5)
+
+
+def test_what_was_pruned_is_made_up_for() -> None:
+    config, count = GROWING, 1000
+    for step in steps_of(config):
+        count = budget(config, step, count)
+        if step == 1200:
+            count //= 2
+    assert count == config.max_gaussians
+
+
+def test_a_budget_that_is_exceeded_adds_nothing() -> None:
+    config = replace(GROWING, max_gaussians=4)
+    assert cloned(make_plan([STRONG] * 6, config, step=2400)) == []
+
+
+def test_the_strongest_go_first_whatever_the_threshold() -> None:
+    config = replace(GROWING, max_gaussians=9, start=500, stop=601)  # one densification, with room for four
+    gradients = [WEAK, STRONG, 0, WEAK / 2, 2 * STRONG]
+    assert cloned(make_plan(gradients, config)) == [0, 1, 3, 4], "no gradient, no clone"
+    assert cloned(make_plan(gradients, replace(config, max_gaussians=8))) == [0, 1, 4]
+    assert cloned(make_plan(gradients, replace(config, max_gaussians=6))) == [4]
+    useless = contributions([9, 9, 9, 9, 0.1])
+    made = make_plan(gradients, replace(config, max_gaussians=6, min_contribution=1.0), known=useless)
+    assert (kept(made), cloned(made)) == ([0, 1, 2, 3], [1])
+
+
+# Agreement
+
+
+def test_views_have_to_agree() -> None:
+    gradients, agreeing = [STRONG, STRONG, WEAK, STRONG], [1, 2, 4, 3]
+    assert cloned(make_plan(gradients, agreeing=agreeing)) == [0, 1, 3], "the default does not ask"
+    config = replace(CONFIG, views_agree=2)
+    assert cloned(make_plan(gradients, config, agreeing=agreeing)) == [1, 3], "beside the mean, not in its place"
+    assert cloned(make_plan(gradients, replace(config, views_agree=3), agreeing=agreeing)) == [3]
+    roomy = replace(config, max_gaussians=5)
+    assert cloned(make_plan([9 * STRONG, STRONG, WEAK, 2 * STRONG], roomy, agreeing=agreeing)) == [3]
+
+
+# Contribution
+
+
+def test_what_no_view_needs_goes() -> None:
+    known = contributions([0, 3, 9, np.inf, 9], [0, 0.49, 0.5, np.inf, 0.1])
+    config = replace(CONFIG, min_contribution=0.5)
+    made = make_plan([WEAK, WEAK, WEAK, WEAK, STRONG], config, known=known)
+    assert (kept(made), cloned(made)) == ([2, 3], []), "not known is kept; what goes is not cloned"
+    made = make_plan([WEAK] * 5, CONFIG, known=known)
+    assert kept(made) == [0, 1, 2, 3, 4], "only if asked for"
+
+
+@pytest.mark.parametrize(
+    ("fraction", "left"), [(0.2, [0, 1, 2, 3, 4, 5]), (0.25, [0, 1, 2, 4, 5]), (0.5, [0, 1, 4, 5])]
+)
+def test_a_fraction_of_those_that_are_known_goes(fraction: float, left: list[int]) -> None:
+    """Of equals the first; four are known."""
+    config = replace(CONFIG, prune_at=(600, 3000), prune_fraction=fraction)
+    known = contributions([7, np.inf, 5, 2, np.inf, 8])
+    assert kept(make_plan([WEAK] * 6, config, known=known)) == left
+    assert kept(make_plan([WEAK] * 6, config, step=700, known=known)) == [0, 1, 2, 3, 4, 5]
+    equal = contributions([4, 4, 4, 4])
+    assert kept(make_plan([WEAK] * 4, replace(config, prune_fraction=0.5), known=equal)) == [2, 3]
+
+
+def test_pruning_alone_adds_nothing_and_asks_for_less() -> None:
+    config = replace(CONFIG, min_contribution=0.5, prune_every=100)
+    opacities = np.array([0.5, 0.004, 0.5, 0.5])
+    logits = np.log(opacities / (1 - opacities)).astype(np.float32)
+    made = plan_pruning(config, state(20_000, 10.0, {"opacity_logits": logits}, contributions([9, 9, 0.4, 9])))
+    assert (made.rows.tolist(), made.fresh.any(), made.split.any()) == ([0, 3], False, False)
+    assert made.rows.dtype == np.uint32
+    made = plan_pruning(
+        replace(config, min_contribution=0.0), state(20_000, 10.0, {"opacity_logits": np.zeros(3, np.float32)}, {})
+    )
+    assert made.rows.tolist() == [0, 1, 2]
+
+
+def test_when_pruning_is_due() -> None:
+    assert not any(is_pruning_due(CONFIG, step) for step in range(20_000))
+    config = replace(CONFIG, prune_every=2000, prune_at=(70, 15_500), prune_fraction=0.5)
+    due = [step for step in range(20_001) if is_pruning_due(config, step)]
+    assert due == [70, *range(2000, 15_000, 2000), 15_500, *range(16_000, 20_001, 2000)]
+
+
+def needs(config: DensityConfig, step: int = 0) -> StatisticsNeeds:
+    return Adaptive(TrainConfig(density=config)).needs(step)
+
+
+def test_contributions_are_gathered_only_while_something_goes_by_them() -> None:
+    assert not needs(CONFIG).contributions
+    assert not needs(replace(CONFIG, prune_every=100)).contributions, "that alone goes by opacity"
+
+    def last(config: DensityConfig) -> int:
+        wanted = [needs(config, step).contributions for step in range(20_001)]
+        assert wanted == sorted(wanted, reverse=True), "from the first step on"
+        return sum(wanted) - 1
+
+    assert last(replace(CONFIG, min_contribution=1.0)) == CONFIG.stop - 1
+    assert last(replace(CONFIG, min_contribution=1.0, every=0)) == -1, "no pass would read them"
+    assert last(replace(CONFIG, min_contribution=1.0, every=0, prune_every=100)) == 20_000
+    assert last(replace(CONFIG, prune_at=(900, 7000), prune_fraction=0.5)) == 7000
+    assert last(replace(CONFIG, prune_at=(900,), prune_fraction=0.5, min_contribution=1.0)) == CONFIG.stop - 1
+    assert not needs(CONFIG).agreement
+    assert needs(replace(CONFIG, views_agree=2)).agreement
+    assert not needs(replace(CONFIG, views_agree=2, every=0)).agreement

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Density control by contribution, agreement and budget in training: it happens when it is due, it repeats to the last
+byte wherever training was stopped, and in pieces."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from compare import assert_close, assert_same_bits
+from quick import quick
+from test_trainer import host, model_bytes
+from tiny import short, write_scene
+
+from clsplat.api import train
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.gaussians import GROUPS
+from clsplat.reference.render import render_grad
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.stages.device_gaussians import HostGaussians
+from clsplat.training.density import ModelState, adaptive
+from clsplat.training.density.adaptive import Plan
+from clsplat.training.trainer import Trainer
+
+EVERYTHING = short(
+    iterations=48,
+    density={
+        "min_contribution": 0.6,
+        "prune_every": 6,
+        "prune_at": (22, 41),
+        "prune_fraction": 0.2,
+        "views_agree": 2,
+        "growth": "budget",
+        "max_gaussians": 120,
+    },
+)
+"""CONFIG of `tiny` with all that goes beyond the paper, and steps of nothing but pruning before and after `stop`."""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return model_bytes(scene, EVERYTHING, default_device, tmp_path_factory.mktemp("undisturbed"))
+
+
+def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the tests below stop and repeat."""
+    made: dict[tuple[str, int], tuple[int, Plan]] = {}
+    known: list[int] = []
+
+    def noted(name: str) -> Any:
+        real = getattr(adaptive, name)
+
+        def call(config: Any, model: ModelState) -> Plan:
+            result: Plan = real(config, model)
+            made[name, model.step] = (model.count, result)
+            largest = [model.statistics[f"{epoch}_largest"].get() for epoch in ("current", "whole")]
+            known.append(int(np.isfinite(np.maximum(*largest)).sum()))
+            return result
+
+        return call
+
+    monkeypatch.setattr(adaptive, "plan", noted("plan"))
+    monkeypatch.setattr(adaptive, "plan_pruning", noted("plan_pruning"))
+    trainer = Trainer(scene, EVERYTHING, default_device)
+    for _ in range(EVERYTHING.iterations):
+        trainer.train_step()
+    assert [step for name, step in made if name == "plan"] == [15, 20, 25, 30, 35]
+    assert [step for name, step in made if name == "plan_pruning"] == [12, 18, 22, 24, 36, 41, 42]
+    pruned = {step: count - len(p.rows) for (name, step), (count, p) in made.items() if name == "plan_pruning"}
+    assert pruned[41] > 0
+    assert any(p.fresh.any() for _, p in made.values())
+    assert 0 in known, "right after the reset"
+    assert max(known) > 40
+
+
+def test_a_pruning_alone_keeps_what_is_not_of_epochs(scene: Scene, default_device: Device) -> None:
+    config = short(
+        density={"prune_every": 26, "min_contribution": 20.0, "every": 99, "start": 5, "opacity_reset_every": 0}
+    )
+    trainer = Trainer(scene, config, default_device)
+    for _ in range(26):
+        trainer.train_step()
+    before = {name: array.get() for name, array in trainer.statistics.named().items()}
+    models = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
+    gone = np.maximum(before["current_largest"], before["whole_largest"]) < 20.0
+    assert 0 < gone.sum() < len(gone)
+    trainer._control_density()
+    for name, array in trainer.statistics.named().items():
+        assert_same_bits(array.get(), before[name][~gone], name)
+    for kind, values in models.items():
+        after = host(getattr(trainer, kind))
+        for group in GROUPS:
+            assert_same_bits(after[group], values[group][~gone], f"{kind} {group}")
+
+
+def test_contributions_are_those_of_an_epoch(scene: Scene, default_device: Device) -> None:
+    """With rates of zero every view sees the same model: an epoch's totals are those of the float64 twin, and views at
+    a quarter of the size count as much as whole ones."""
+    still = dict.fromkeys(("means_rate", "means_rate_end", "sh_dc_rate", "sh_rest_rate", "opacities_rate"), 0.0)
+    base = short(density={"every": 1000, "prune_at": (99,), "prune_fraction": 0.5})
+    optimiser = replace(base.optimiser, **still, scales_rate=0.0, quaternions_rate=0.0)
+    config = replace(base, optimiser=optimiser, warmup=())
+    trainer = Trainer(scene, config, default_device)
+    model, views = trainer.gaussians(), scene.train_views
+    for _ in range(len(views) + 1):
+        trainer.train_step()
+    nothing = np.zeros((views[0].camera.height, views[0].camera.width, 3))
+    each = np.array([render_grad(model, view.camera, nothing).contributions for view in views])
+    assert trainer.statistics.whole is not None
+    # 4/255 a view, as of the stage itself
+    assert_close(trainer.statistics.whole.totals.get(), each.sum(axis=0), relative=1e-4, absolute=len(views) * 4 / 255)
+    assert_close(trainer.statistics.whole.largest.get(), each.max(axis=0), relative=1e-4, absolute=4 / 255)
+    coarse = Trainer(scene, replace(config, warmup=(99,)), default_device)
+    for _ in range(len(views) + 1):
+        coarse.train_step()
+    assert coarse.statistics.whole is not None
+    # half the pixels a side: the low-pass of 0.3 square pixels weighs four times as much, which makes small ones larger
+    ratio = coarse.statistics.whole.totals.get().sum() / each.sum()
+    assert ratio == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_reset_forgets_contributions(scene: Scene, default_device: Device) -> None:
+    trainer = Trainer(scene, EVERYTHING, default_device)
+    for _ in range(20):
+        trainer.train_step()
+    assert trainer.statistics.whole is not None
+    assert np.isfinite(trainer.statistics.whole.totals.get()).any()
+    trainer._control_density()
+    for epoch in (trainer.statistics.whole, trainer.statistics.current):
+        assert epoch is not None
+        assert np.isinf(epoch.totals.get()).all()
+
+
+@pytest.mark.parametrize("step", quick([7, 8, 12, 19, 20, 22, 40, 41, 45], 8, 20, 41))
+def test_stopping_and_going_on_gives_the_same_bytes(
+    step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
+) -> None:
+    """At the seams of epochs (8 views), of resets, of passes and of what is gathered."""
+    model_bytes(scene, replace(EVERYTHING, iterations=step), default_device, tmp_path / "run")
+    run = Run.create(tmp_path / "run", EVERYTHING, resume=True)
+    train(scene, EVERYTHING, device=default_device, run=run, resume=True)
+    assert run.model_path.read_bytes() == undisturbed
+
+
+def test_settings_that_come_with_resume(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    """The checkpoint has no contributions: nothing is known until an epoch is over, and nothing is pruned by it."""
+    plain = short(iterations=14)
+    model_bytes(scene, plain, default_device, tmp_path / "run")
+    run = Run.create(tmp_path / "run", EVERYTHING, resume=True)
+    checkpoint = run.load_latest_checkpoint()
+    assert checkpoint is not None
+    trainer = Trainer(scene, EVERYTHING, default_device)
+    trainer.restore(checkpoint)
+    assert trainer.statistics.whole is not None
+    assert np.isinf(trainer.statistics.whole.largest.get()).all()
+    assert trainer.statistics.seen.get().any(), "what it has is taken"
+    train(scene, EVERYTHING, device=default_device, run=run, resume=True)
+    assert run.model_path.exists()
+
+
+MANY = replace(
+    EVERYTHING,
+    density=replace(EVERYTHING.density, max_gaussians=2500, min_contribution=0.02, views_agree=1),
+    random_points=400,
+)
+
+
+@pytest.mark.parametrize("share", [0.6, 0.22])
+def test_in_less_memory_the_same_bytes(share: float, default_device: Device, tmp_path: Path) -> None:
+    scene = load_scene(write_scene(tmp_path / "scene", points=False))
+    free = default_device.with_memory_limit(None)
+    wanted = model_bytes(scene, MANY, free, tmp_path / "free")
+    device = default_device.with_memory_limit(int(share * free.memory.peak))
+    run = Run.create(tmp_path / "limited", MANY)
+    pieces = []
+    train(scene, MANY, device=device, run=run, on_plan=lambda plan: pieces.append(plan.pieces))
+    assert run.model_path.read_bytes() == wanted
+    assert device.memory.limit is not None
+    assert device.memory.peak <= device.memory.limit
+    assert any(any(each) for each in pieces)
+    assert any(streamed for streamed, _, _ in pieces) or share > 0.5
+
+
+def test_the_budget_is_reached(scene: Scene, default_device: Device) -> None:
+    counts: list[int] = []
+    config = short(density={"growth": "budget", "max_gaussians": 150, "min_opacity": 1e-6, "max_world_fraction": 1e9})
+    train(scene, config, device=default_device, on_step=lambda report: counts.append(report.gaussians))
+    assert counts[-1] == 150, "nothing is pruned, and the last densification reaches it"
+    assert len(scene.points) < counts[1] < 150
+
+
+def test_every_driver_prunes_alike(device: Device, default_device: Device, scene: Scene) -> None:
+    config: TrainConfig = replace(EVERYTHING, iterations=16)
+    trainers = [Trainer(scene, config, opened) for opened in (device, default_device)]
+    for trainer in trainers:
+        for _ in range(config.iterations):
+            trainer.train_step()
+        assert not isinstance(trainer.parameters, HostGaussians)
+    assert trainers[0].parameters.count == trainers[1].parameters.count

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one function of a view's gradient: a trainer's step is it, and a probe sees each stage before Adam."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from compare import assert_same_bits
+from tiny import write_scene
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device
+from clsplat.gaussians import GROUPS
+from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.stages.device_gaussians import allocate_gaussians
+from clsplat.stages.loss import Loss
+from clsplat.stages.project import Slots
+from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
+from clsplat.training.trainer import Trainer
+
+CONFIG = TrainConfig(iterations=9, warmup=(), sh_degree=1)
+
+
+class Witness(StepProbe):
+    """Notes the order of the stages, and the model as Adam finds it."""
+
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+
+    def forward(self, frame: Frame) -> None:
+        del frame
+        self.stages.append("forward")
+
+    def loss(self, result: Loss) -> None:
+        del result
+        self.stages.append("loss")
+
+    def pair_gradients(self, slots: Slots) -> None:
+        del slots
+        self.stages.append("pair_gradients")
+
+    def row_gradients(self, rows: StepRows) -> None:
+        self.stages.append("row_gradients")
+        self.gradients = {group: rows.gradients[group].get() for group in GROUPS}
+        self.means, self.first = rows.parameters["means"].get(), rows.first["means"].get()
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+def test_a_trainer_s_step_is_a_gradient_step(scene: Scene, default_device: Device) -> None:
+    trainer, by_hand = (Trainer(scene, CONFIG, default_device) for _ in range(2))
+    before = by_hand.parameters["means"].get()
+    view = int(np.random.default_rng(CONFIG.seed).permutation(len(trainer.views))[-1])
+    trainer.train_step()
+    by_hand.step = 1
+    step = GradientStep(
+        default_device, Rasterizer(default_device), CONFIG, 1, by_hand.rates(), slot_fields(by_hand.strategy.needs(1))
+    )
+    model = (by_hand.parameters, by_hand.first, by_hand.second)
+    gradients = allocate_gaussians(default_device, by_hand.parameters.count, by_hand.parameters.coefficients, zero=True)
+    photograph, witness = by_hand.photographs.load(view, 1.0), Witness()
+    background = upload(default_device, np.zeros(3, np.float32))
+    camera = by_hand.local(by_hand.views[view].camera)
+    result = step.run(model, gradients, photograph, camera, background, witness)
+    assert witness.stages == ["forward", "loss", "pair_gradients", "row_gradients"]
+    assert_same_bits(witness.means, before, "Adam comes after the probe")
+    assert not witness.first.any()
+    assert witness.gradients["means"].any()
+    assert np.isfinite(result.read()).all()
+    for kind in ("parameters", "first", "second"):
+        for group in GROUPS:
+            got, wanted = getattr(by_hand, kind)[group].get(), getattr(trainer, kind)[group].get()
+            assert_same_bits(got, wanted, f"{kind} {group}")
+    assert all(not gradients[group].get().any() for group in GROUPS), "Adam leaves them zero"

@@ -1,0 +1,414 @@
+# SPDX-License-Identifier: Apache-2.0
+"""NaN, infinity and garbage in every array of a training: nothing reads what nobody wrote, and nothing spreads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compare import assert_same_bits
+from golden_frames import checksums
+from pipeline import shaped
+from quick import quick
+from tiny import short, write_scene
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, Workspace, allocate
+from clsplat.device.context import Device
+from clsplat.device.layout import SPLAT
+from clsplat.errors import InputError
+from clsplat.gaussians import GROUPS
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.stages.device_gaussians import DeviceGaussians
+from clsplat.training import step as step_module
+from clsplat.training.trainer import Trainer
+
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
+WORDS = {"NaN": "1", "-inf": "0xff800000", "bytes of 255": "0xffffffff", "garbage": "0x4f3a91c7"}
+BROKEN = (np.nan, np.inf, -np.inf)
+GARBAGE = (3e38, -1e30, 1e-42)
+ROW = 5
+"""The Gaussian that is poisoned."""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+@pytest.fixture(scope="module")
+def many_points(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """The same pictures, and random points to start from."""
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene", points=False))
+
+
+# Memory that nobody has written
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.uint8, np.uint32])
+def test_memory_is_poisoned_when_asked_for(default_device: Device, monkeypatch: pytest.MonkeyPatch, kind: type) -> None:
+    for word in WORDS.values():
+        monkeypatch.setenv("CLSPLAT_POISON", word)
+        pattern = np.full(7, 0x7FC00000 if word == "1" else int(word, 0), np.uint32).view(np.uint8)
+        work = Workspace(default_device)
+        for _ in range(2):  # again, as what the last user left has to be gone
+            for array in (allocate(default_device, (7,), kind), work.array("some", (7,), kind)):
+                whole = array.nbytes // 4 * 4
+                assert_same_bits(array.get().view(np.uint8)[:whole], pattern[:whole])
+                array.fill(0)
+    monkeypatch.setenv("CLSPLAT_POISON", "much")
+    with pytest.raises(InputError, match="CLSPLAT_POISON much: expected 1, or 32 bits"):
+        Workspace(default_device)
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_frames_and_gradients_in_poisoned_memory(device: Device, monkeypatch: pytest.MonkeyPatch, word: str) -> None:
+    monkeypatch.delenv("CLSPLAT_POISON", raising=False)
+    wanted = checksums(device)
+    monkeypatch.setenv("CLSPLAT_POISON", WORDS[word])
+    assert checksums(device) == wanted
+
+
+EVERYTHING = short(
+    iterations=24,
+    warmup=(2, 4),
+    sh_degree_every=8,
+    density={"start": 5, "every": 4, "min_contribution": 0.05, "views_agree": 2, "absolute_gradients": True},
+)
+"""Growth of every array, contributions and agreement, two SH degrees, an opacity reset."""
+
+
+MANY = short(
+    iterations=32,
+    random_points=400,
+    density={"gradient_threshold": 1e-4, "max_gaussians": 2500, "opacity_reset_every": 0},
+)
+"""Gaussians that become so many that memory is a matter of them and not of the planes."""
+
+
+@pytest.mark.parametrize("word", quick(["NaN", "garbage"], "NaN"))
+@pytest.mark.parametrize("how", quick(["at once", "in pieces", "in vectors of 1"], "at once"))
+def test_training_in_poisoned_memory(
+    scene: Scene, many_points: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, word: str, how: str
+) -> None:
+    device = shaped(default_device, 1, 64) if how == "in vectors of 1" else default_device
+    pieces = how == "in pieces"
+    config = MANY if pieces else EVERYTHING
+    found = []
+    for value in ("", WORDS[word]):
+        monkeypatch.setenv("CLSPLAT_POISON", value)
+        memory = little_memory(many_points, default_device) if pieces else device
+        trainer = Trainer(many_points if pieces else scene, config, memory)
+        for _ in range(config.iterations):
+            trainer.train_step()
+        assert trainer.watch.latest is None
+        assert trainer.plan.streamed == pieces
+        found.append(trainer.checkpoint()[0])
+    assert found[0].keys() == found[1].keys()
+    for name, array in found[0].items():
+        assert_same_bits(found[1][name], array, name)
+
+
+def little_memory(scene: Scene, device: Device) -> Device:
+    """So much that MANY is streamed at its end."""
+    free = device.with_memory_limit(None)
+    trainer = Trainer(scene, MANY, free)
+    for _ in range(MANY.iterations):
+        trainer.train_step()
+    return device.with_memory_limit(int(0.25 * free.memory.peak))
+
+
+# What something else has spoilt
+
+
+def quiet(**changes: object) -> TrainConfig:
+    """Three SH bands from the start, all Gaussians as they are."""
+    density = changes.pop("density", {"every": 0})
+    return short(warmup=(), sh_degree=2, sh_degree_every=0, density=density, **changes)
+
+
+def started(scene: Scene, device: Device, config: TrainConfig | None = None) -> Trainer:
+    """After three steps, so that there are moments."""
+    trainer = Trainer(scene, config or quiet(), device)
+    for _ in range(3):
+        trainer.train_step()
+    return trainer
+
+
+def put(array: DeviceArray, value: float, row: int = ROW) -> None:
+    """Into the last element of a row: of a quaternion's, the first has no gradient while the others are 0."""
+    values = array.get()
+    values.reshape(len(values), -1)[row, -1] = value
+    array.set(values)
+
+
+def rows_of(trainer: Trainer) -> dict[str, np.ndarray]:
+    """Parameters of all Gaussians but the poisoned one."""
+    return {group: np.delete(trainer.parameters[group].get(), ROW, axis=0) for group in GROUPS}
+
+
+def assert_well(trainer: Trainer) -> None:
+    """Every number of the model is finite, and no trouble is left that a later step would meet."""
+    arrays, _ = trainer.checkpoint()
+    assert all(np.isfinite(values).all() for name, values in arrays.items() if not name.startswith("statistics"))
+    trainer.watch.incidents.clear()
+    for _ in range(3):
+        assert np.isfinite(trainer.train_step().read()).all()
+    trainer.mend(look=True)
+    assert trainer.watch.incidents == []
+
+
+def assert_others_alike(one: Trainer, other: Trainer) -> None:
+    for group, values in rows_of(one).items():
+        assert_same_bits(rows_of(other)[group], values, group)
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize("group", GROUPS)
+def test_broken_parameters_are_not_drawn_and_removed(
+    scene: Scene, default_device: Device, group: str, sparse: bool
+) -> None:
+    config = quiet()
+    config = short(warmup=(), sh_degree_every=0, density={"every": 0}, optimiser=type(config.optimiser)(sparse=sparse))
+    for value in BROKEN:
+        poisoned, hidden = started(scene, default_device, config), started(scene, default_device, config)
+        put(poisoned.parameters[group], value)
+        put(hidden.parameters["opacity_logits"], -100.0)
+        loss, wanted = poisoned.train_step().read(), hidden.train_step().read()
+        # What is opaque, a point or black is drawn: with higher bands it is a matter of the direction.
+        drawn = {"opacity_logits": value > 0, "log_scales": value < 0, "sh_dc": value < 0, "sh_rest": True}
+        if np.isnan(value) or not drawn.get(group, False):
+            assert loss == wanted, value
+            assert_others_alike(poisoned, hidden)
+        assert np.isfinite(loss).all()
+        poisoned.train_step()  # which notices
+        poisoned.checkpoint()  # which finds what was hidden as well
+        (incident,) = poisoned.watch.incidents
+        assert (incident.stage, incident.count) == ("parameters", 1), value
+        assert poisoned.parameters.count == hidden.parameters.count - 1
+        assert_well(poisoned)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_garbage_in_parameters_spoils_nothing_else(scene: Scene, default_device: Device, group: str) -> None:
+    for value in GARBAGE:
+        trainer = started(scene, default_device)
+        put(trainer.parameters[group], value)
+        for _ in range(3):
+            assert np.isfinite(trainer.train_step().read()).all(), value
+        assert trainer.parameters.count >= 39
+        assert_well(trainer)
+
+
+def poison_gradients(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, group: str, value: float) -> None:
+    """In the next step alone, after the backward pass."""
+    real = trainer.rasterizer.row_gradients
+
+    def poisoned(parameters: DeviceGaussians, *arguments: object, **options: object) -> object:
+        screen = real(parameters, *arguments, **options)  # type: ignore[arg-type]
+        put(trainer.gradients[group], value)
+        monkeypatch.setattr(trainer.rasterizer, "row_gradients", real)
+        return screen
+
+    monkeypatch.setattr(trainer.rasterizer, "row_gradients", poisoned)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_broken_gradient_costs_its_gaussian_alone(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, group: str
+) -> None:
+    for value in (*BROKEN, 1e30):
+        poisoned, plain = started(scene, default_device), started(scene, default_device)
+        poison_gradients(poisoned, monkeypatch, group, value)
+        before = poisoned.parameters[group].get().reshape(40, -1)[ROW, -1]
+        poisoned.train_step()
+        plain.train_step()
+        assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before, "it was not moved"
+        assert_others_alike(poisoned, plain)
+        assert not any(poisoned.gradients[each].get().any() for each in GROUPS)
+        poisoned.mend(look=True)
+        (incident,) = poisoned.watch.incidents
+        # A finite one of which the square is not is the optimiser's own trouble.
+        assert (incident.stage, incident.count) == ("adam" if value == 1e30 else "project_grad", 1)
+        assert poisoned.parameters.count == 39
+        assert_others_alike(plain, plain)
+        for each in GROUPS:
+            assert_same_bits(poisoned.parameters[each].get(), rows_of(plain)[each], each)
+        assert_well(poisoned)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("which", ["first", "second"])
+def test_broken_moments_begin_again(scene: Scene, default_device: Device, which: str, group: str) -> None:
+    for value in (*BROKEN, -5.0):
+        if which == "first" and value == -5.0:
+            continue  # that is a moment as good as any
+        poisoned, plain = started(scene, default_device), started(scene, default_device)
+        put(getattr(poisoned, which)[group], value)
+        before = poisoned.parameters[group].get().reshape(40, -1)[ROW, -1]
+        poisoned.train_step()
+        plain.train_step()
+        assert_others_alike(poisoned, plain)
+        assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before
+        for moments in (poisoned.first, poisoned.second):
+            assert moments[group].get().reshape(40, -1)[ROW, -1] == 0
+        poisoned.mend(look=True)
+        (incident,) = poisoned.watch.incidents
+        assert incident.stage == "adam"
+        assert poisoned.parameters.count == 40
+        assert_well(poisoned)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("which", ["first", "second"])
+def test_garbage_in_moments_spoils_nothing_else(scene: Scene, default_device: Device, which: str, group: str) -> None:
+    for value in GARBAGE:
+        poisoned, plain = started(scene, default_device), started(scene, default_device)
+        put(getattr(poisoned, which)[group], value)
+        poisoned.train_step()
+        plain.train_step()
+        assert_others_alike(poisoned, plain)
+        for _ in range(3):
+            assert np.isfinite(poisoned.train_step().read()).all(), value
+        assert_well(poisoned)
+
+
+STATISTICS = ("gradient_sums", "seen", "radii", "agreeing", "current_totals", "current_largest", "whole_totals")
+
+
+@pytest.mark.parametrize("name", STATISTICS)
+def test_spoilt_statistics_leave_a_sound_model(scene: Scene, default_device: Device, name: str) -> None:
+    density = {"start": 2, "every": 4, "views_agree": 2, "min_contribution": 0.05, "max_screen_radius": 30.0}
+    for value in (*BROKEN, *GARBAGE):
+        trainer = started(scene, default_device, quiet(density=density))
+        put(trainer.statistics.named()[name], value)
+        for _ in range(6):
+            assert np.isfinite(trainer.train_step().read()).all(), value
+        assert trainer.parameters.count > 30
+        assert_well(trainer)
+
+
+def after(monkeypatch: pytest.MonkeyPatch, name: str, spoil: Callable[[object], None]) -> None:
+    """Let the stage that the trainer calls `name` do its work, once, and spoil what it gives."""
+    real = getattr(step_module, name)
+
+    def spoilt(*arguments: object, **options: object) -> object:
+        result = real(*arguments, **options)
+        spoil(result)
+        monkeypatch.setattr(step_module, name, real)
+        return result
+
+    monkeypatch.setattr(step_module, name, spoilt)
+
+
+@pytest.mark.parametrize("value", BROKEN)
+@pytest.mark.parametrize("where", ["target", "loss"])
+def test_a_broken_loss_is_no_fault_of_the_gaussians(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, where: str, value: float
+) -> None:
+    """A pixel of the photograph, or of the gradient together with the sums as such a pixel leaves them."""
+
+    def spoil(result: object) -> None:
+        if where == "target":
+            array = result
+            assert isinstance(array, DeviceArray)
+            pixels = array.get()
+            pixels[1, 20, 24] = value
+            array.set(pixels)
+            return
+        for array in (result.gradient, result.sums):  # type: ignore[attr-defined]
+            values = array.get()
+            values.reshape(3, -1)[1, 20 * 48 + 24 if values.size > 5000 else 20] = value
+            array.set(values)
+
+    poisoned, plain = started(scene, default_device), started(scene, default_device)
+    after(monkeypatch, where, spoil)
+    result = poisoned.train_step()
+    assert not np.isfinite(result.read()).all()
+    plain.train_step()
+    moved = [
+        not np.array_equal(poisoned.parameters["means"].get()[row], plain.parameters["means"].get()[row])
+        for row in range(40)
+    ]
+    assert sum(moved) > 0
+    assert sum(moved) < 40 or where == "target", "without SSIM's windows most Gaussians are out of the pixel's reach"
+    poisoned.mend(look=True)
+    (incident,) = poisoned.watch.incidents
+    assert incident.stage == "loss"
+    assert incident.step == 4
+    assert poisoned.parameters.count == 40
+    assert_well(poisoned)
+
+
+@pytest.mark.parametrize("value", BROKEN)
+def test_a_broken_slot_costs_its_gaussian_alone(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, value: float
+) -> None:
+    poisoned, plain = started(scene, default_device), started(scene, default_device)
+    real = poisoned.rasterizer.pair_gradients
+
+    def spoilt(frame: object, *arguments: object, **options: object) -> object:
+        slots = real(frame, *arguments, **options)  # type: ignore[arg-type]
+        values = slots.values.get()
+        assert slots.first_slots is not None
+        values[slots.first_slots.get()[ROW]] = value
+        slots.values.set(values)
+        return slots
+
+    monkeypatch.setattr(poisoned.rasterizer, "pair_gradients", spoilt)
+    poisoned.train_step()
+    monkeypatch.undo()
+    plain.train_step()
+    assert_others_alike(poisoned, plain)
+    poisoned.train_step()
+    poisoned.mend()
+    (incident,) = poisoned.watch.incidents
+    assert (incident.stage, incident.count, incident.step) == ("project_grad", 1, 4)
+    statistics = poisoned.statistics.named()
+    assert all(np.isfinite(array.get()).all() for array in statistics.values())
+    assert poisoned.parameters.count == 39
+
+
+def test_a_colour_that_is_not_finite_is_the_only_one_lost(scene: Scene, default_device: Device) -> None:
+    """One that is too large is not drawn either: in the loss it would be all there is."""
+    for value in (1e20, 1e10, np.inf):
+        poisoned, hidden = started(scene, default_device), started(scene, default_device)
+        put(poisoned.parameters["sh_dc"], value)
+        put(hidden.parameters["opacity_logits"], -100.0)
+        assert poisoned.train_step().read() == hidden.train_step().read()
+        counts = poisoned.rasterizer.work.array("tile_counts", (40,), np.uint32).get()
+        assert counts[ROW] == 0
+        splats = poisoned.rasterizer.work.array("splats", (40, len(SPLAT))).get()
+        assert np.isfinite(splats[counts > 0][:, : SPLAT.index("UNUSED")]).all()
+        assert_others_alike(poisoned, hidden)
+
+
+@pytest.mark.slow
+def test_rows_that_are_streamed_are_looked_after_too(many_points: Scene, default_device: Device) -> None:
+    trainer = Trainer(many_points, MANY, little_memory(many_points, default_device))
+    for _ in range(MANY.iterations):
+        trainer.train_step()
+    assert trainer.plan.streamed
+    count = trainer.parameters.count
+    values = trainer.parameters["sh_dc"].get()
+    values[[ROW, 900]] = np.nan
+    trainer.parameters["sh_dc"].set(values)
+    trainer.train_step()
+    trainer.train_step()
+    trainer.mend()
+    (incident,) = trainer.watch.incidents
+    assert (incident.stage, incident.count) == ("parameters", 2)
+    assert trainer.parameters.count == count - 2
+    assert_well(trainer)
+
+
+def test_the_scene_has_what_these_tests_poison(scene: Scene, default_device: Device) -> None:
+    trainer = started(scene, default_device)
+    assert trainer.parameters.count == 40
+    assert trainer.parameters.coefficients == 9
+    counts = trainer.rasterizer.work.array("tile_counts", (40,), np.uint32).get()
+    assert counts[ROW] > 0, "a Gaussian that nobody sees has no gradient to poison"
+    assert Path(scene.views[0].path).exists()

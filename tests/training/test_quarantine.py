@@ -1,0 +1,387 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What training does about numbers that are not finite: mends, tells, goes back with smaller steps, gives up."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calls import Capture
+from calls import train as command_train
+from compare import assert_same_bits
+from quick import quick
+from tiny import CONFIG, short, write_scene
+
+from clsplat.api import train
+from clsplat.config.training import OptimiserConfig, TrainConfig
+from clsplat.device.context import Device
+from clsplat.device.source import kernel_source
+from clsplat.errors import ClsplatError, InputError
+from clsplat.gaussians import GROUPS, SH_LIMIT, group_shapes
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.spherical_harmonics import sh_basis
+from clsplat.training import repro
+from clsplat.training.health import PATIENCE, RETURNS, SMALLER, WINDOW, Patience, examine, finite_or_zero
+from clsplat.training.trainer import Trainer
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
+
+import bench_guards
+
+CHECKED = short(checkpoint_every=5)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+Due = Callable[[Trainer], bool]
+
+
+@contextmanager
+def spoilt(due: Due, group: str = "means", row: int = 5, value: float = np.nan) -> Iterator[None]:
+    """Before a step that is due a parameter turns bad, as in a memory that forgets."""
+    real = Trainer.train_step
+
+    def step(self: Trainer) -> object:
+        if due(self):
+            values = self.parameters[group].get()
+            values.reshape(len(values), -1)[row, 0] = value
+            self.parameters[group].set(values)
+        return real(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "train_step", step)
+        yield
+
+
+@contextmanager
+def heard() -> Iterator[list[str]]:
+    """What is told, line by line."""
+    lines: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield lines
+        lines += [str(each.message) for each in caught]
+
+
+# Policy
+
+
+def model(count: int = 6) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(1)
+    return {g: rng.standard_normal(shape).astype(np.float32) for g, shape in group_shapes(count, 4).items()}
+
+
+def test_what_is_broken_and_what_is_refused() -> None:
+    parameters, first, second = model(), model(), model()
+    found = examine(parameters, first, second)
+    assert not found.any
+    parameters["means"][1, 2] = np.nan
+    parameters["sh_rest"][2, 1, 0] = -SH_LIMIT
+    parameters["means"][3] = 1e18  # far away, but a place
+    first["sh_dc"][4, 1] = np.inf
+    second["opacity_logits"][5] = np.nan
+    found = examine(parameters, first, second)
+    assert found.any
+    assert found.broken.tolist() == [False, True, True, False, False, False]
+    assert found.refused.tolist() == [False, False, False, False, True, True]
+    assert found.lost("loss").tolist() == [False, True, True, False, False, False]
+    assert found.lost("adam").tolist() == [False, True, True, False, True, True]
+    assert finite_or_zero(first["sh_dc"])[4].tolist() == [first["sh_dc"][4, 0], 0, first["sh_dc"][4, 2]]
+
+
+def test_patience() -> None:
+    patience = Patience()
+    for index in range(PATIENCE - 1):
+        patience.note(10 * index + 1)
+        patience.note(10 * index + 1)  # the same step
+        assert not patience.over
+    patience.note(WINDOW + 1)  # the first is forgotten by now
+    assert not patience.over
+    patience.note(WINDOW + 2)
+    assert patience.over
+    for index in range(RETURNS):
+        assert not patience.spent
+        patience = patience.after_return()
+        assert not patience.over
+        assert patience.rate_factor == SMALLER ** (index + 1)
+    assert patience.spent
+    patience.note(7, lost=True)
+    assert patience.over
+
+
+def test_what_is_not_drawn_for_its_colour_is_over_the_limit() -> None:
+    directions = np.random.default_rng(0).standard_normal((5000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    most = np.abs(sh_basis(directions, 3)).sum(axis=1).max()
+    limit = re.search(r"#define COLOUR_LIMIT (\S+)f", kernel_source("project"))
+    assert limit is not None
+    assert 0.5 + most * SH_LIMIT < float(limit[1])
+
+
+# Training goes on
+
+
+def test_a_gaussian_that_breaks_is_removed_and_told_once(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "run", CHECKED)
+    with heard() as lines, spoilt(lambda trainer: trainer.step in (6, 17, 33)):
+        result = train(scene, CHECKED, device=default_device, run=run)
+    told, rest = lines
+    assert re.fullmatch(
+        r"step 7, view 0\d\.png, stage parameters: parameters of 1 Gaussian are not finite, or far too large; 1 "
+        r"removed \(more of this kind will be counted only\)",
+        told,
+    )
+    assert rest == "2 more steps had something that was not finite"
+    for values in (result.means, result.quaternions, result.log_scales, result.opacity_logits, result.sh):
+        assert np.isfinite(values).all()
+    assert [record["step"] for record in run.read_metrics()] == [10, 20, 30, 40]
+
+
+def test_trouble_in_the_command_line_is_a_warning(scene: Scene, tmp_path: Path, capfd: Capture) -> None:
+    folder = Path(scene.views[0].path).parents[1]
+    with spoilt(lambda trainer: trainer.step == 6):
+        assert command_train(folder, tmp_path / "run", CONFIG) == 0
+    told = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
+    assert len(told) == 1
+    assert told[0].startswith("clsplat: warning: step 7, view 0")
+
+
+@pytest.mark.parametrize("stop", quick([7, 8, 9, 11, 12, 20], 7, 11))
+def test_trouble_and_stopping_give_the_same_bytes_as_trouble_alone(
+    scene: Scene, default_device: Device, tmp_path: Path, stop: int
+) -> None:
+    at = (6, 10, 19)
+    models = []
+    for name in ("whole", "stopped"):
+        run = Run.create(tmp_path / name, CONFIG)
+        with heard(), spoilt(lambda trainer: trainer.step in at):
+            if name == "stopped":
+                train(scene, replace(CONFIG, iterations=stop), device=default_device, run=run)
+                run = Run.create(tmp_path / name, CONFIG, resume=True)
+            train(scene, CONFIG, device=default_device, run=run, resume=name == "stopped")
+        models.append(run.model_path.read_bytes())
+    assert models[0] == models[1]
+
+
+# Training goes back
+
+
+def test_repeated_trouble_goes_back_with_smaller_steps(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "run", CHECKED)
+    seen: list[tuple[int, float]] = []
+
+    def due(trainer: Trainer) -> bool:
+        factor = trainer.watch.patience.rate_factor
+        seen.append((trainer.step, factor))
+        return trainer.step >= 21 and factor == 1.0
+
+    with heard() as lines, spoilt(due):
+        train(scene, CHECKED, device=default_device, run=run)
+    back = next(line for line in lines if "back to" in line)
+    match = re.fullmatch(
+        r"step (\d+): 5 of the last 100 steps had trouble: back to step (\d+), with learning rates of 0\.5 of what "
+        r"they would be",
+        back,
+    )
+    assert match is not None
+    stopped, resumed = int(match[1]), int(match[2])
+    assert 21 <= resumed < stopped <= 33
+    assert (resumed, 0.5) in seen
+    steps = [record["step"] for record in run.read_metrics()]
+    assert steps == [10, 20, 30, 40], "what was written of the steps that count no more is gone"
+    checkpoint = run.load_latest_checkpoint()
+    assert checkpoint is not None
+    assert checkpoint.state["patience"]["rate_factor"] == 0.5
+    trainer = Trainer(scene, CHECKED, default_device)
+    plain = trainer.rates()
+    trainer.restore(checkpoint)
+    trainer.step = 0
+    assert trainer.rates() == {group: 0.5 * rate for group, rate in plain.items()}
+
+
+def test_a_model_that_is_mostly_broken_is_not_mended(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "run", CHECKED)
+    real = Trainer.train_step
+
+    def step(self: Trainer) -> object:
+        if self.step == 17 and self.watch.patience.rate_factor == 1.0:
+            self.parameters["sh_dc"].fill(np.nan)
+        return real(self)
+
+    with heard() as lines, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "train_step", step)
+        result = train(scene, CHECKED, device=default_device, run=run)
+    assert re.search(r"parameters of (\d+) Gaussians .*; \1 of \1 are too many to remove", lines[0])
+    assert re.match(r"step (19|20): 1 of the last 100 steps had trouble: back to step 15", lines[1])
+    assert np.isfinite(result.sh).all()
+
+
+def test_without_a_checkpoint_it_starts_again(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    for run in (None, Run.create(tmp_path / "run", CONFIG)):
+        with heard() as lines, spoilt(lambda trainer: trainer.watch.patience.rate_factor == 1.0):
+            train(scene, CONFIG, device=default_device, run=run)
+        assert any("back to step 0, with learning rates of 0.5" in line for line in lines)
+
+
+# Training gives up
+
+
+def test_what_cannot_be_helped_stops_with_a_bundle(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    """Steps so large that every Gaussian has a colour that nothing can have."""
+    config = replace(CHECKED, optimiser=OptimiserConfig(sh_dc_rate=1e9))
+    run = Run.create(tmp_path / "run", config)
+    with heard() as lines, pytest.raises(ClsplatError) as caught:
+        train(scene, config, device=default_device, run=run)
+    assert caught.value.exit_status == 1
+    message = re.fullmatch(
+        r"step (\d+), view (\S+), stage adam: .*, and 3 returns with smaller steps did not help: (\S+) reproduces it "
+        r"\(python -m clsplat\.training\.repro\)",
+        str(caught.value),
+    )
+    assert message is not None
+    assert len([line for line in lines if "back to" in line]) == RETURNS
+    bundle = repro.read_bundle(Path(message[3]))
+    assert bundle.record["reproduced"]
+    assert bundle.config == config
+    assert bundle.record["device"]["name"] == default_device.name
+    assert bundle.record["versions"].keys() == {"clsplat", "numpy", "pyopencl", "python", "system"}
+    counts = repro.replay(bundle, default_device)
+    assert repro.first_trouble(counts) == "adam"
+    assert sum(counts.values()) == counts["adam"] > 0
+    # and the run can be put right
+    Run.create(run.path, CONFIG, overwrite=True)
+    assert not Path(message[3]).exists()
+
+
+def test_a_bundle_has_no_more_than_it_needs(
+    scene: Scene, default_device: Device, tmp_path: Path, capsys: Capture
+) -> None:
+    config = replace(CHECKED, iterations=100)
+    run = Run.create(tmp_path / "run", config)
+    with heard(), pytest.raises(ClsplatError), spoilt(lambda trainer: trainer.step > 5, "log_scales", value=np.inf):
+        train(scene, config, device=default_device, run=run)
+    (path,) = run.path.glob("trouble-step-*.npz")
+    bundle = repro.read_bundle(path)
+    kept, of = bundle.record["of"]
+    assert kept == 1 < of
+    assert {len(values) for groups in bundle.models.values() for values in groups.values()} == {1}
+    assert bundle.photograph.shape[:2] == (bundle.camera.height, bundle.camera.width)
+    assert path.stat().st_size < 50_000
+    assert repro.main([str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "first in parameters" in out
+    assert f"1 of {of} Gaussians" in out
+    assert repro.main([str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["stage"] == "parameters"
+
+
+def test_a_bundle_of_a_sound_step_says_so(
+    scene: Scene, default_device: Device, tmp_path: Path, capsys: Capture
+) -> None:
+    """Where the trouble was the machine's nothing shows it again: then all Gaussians are kept."""
+    trainer = Trainer(scene, CONFIG, default_device)
+    for _ in range(7):
+        trainer.train_step()
+    trainer.watch.loss_failed()
+    trainer.mend()
+    assert trainer.watch.latest is not None
+    path = repro.write_bundle(tmp_path, trainer, trainer.watch.latest)
+    assert repro.read_bundle(path).record["of"] == [40, 40]
+    assert not repro.read_bundle(path).record["reproduced"]
+    assert repro.main([str(path)]) == 1
+    assert "all is well on this device" in capsys.readouterr().out
+
+
+def test_a_bundle_with_a_setting_of_an_earlier_version_loads(
+    scene: Scene, default_device: Device, tmp_path: Path
+) -> None:
+    trainer = Trainer(scene, CONFIG, default_device)
+    trainer.train_step()
+    trainer.watch.loss_failed()
+    trainer.mend()
+    assert trainer.watch.latest is not None
+    path = repro.write_bundle(tmp_path, trainer, trainer.watch.latest)
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    record = json.loads(arrays[repro.RECORD].tobytes())
+    earlier = "[train.rasterizer]\nsh_angle = 1.5\nrow_skip = false"
+    record["settings"] = record["settings"].replace("[train.rasterizer]", earlier)
+    arrays[repro.RECORD] = np.frombuffer(json.dumps(record).encode(), np.uint8)
+    np.savez(path, allow_pickle=False, **arrays)
+    with pytest.warns(UserWarning, match=r"sh_angle = 1\.5, train\.rasterizer\.row_skip = False$") as told:
+        assert repro.read_bundle(path).config == CONFIG
+    assert len(told) == 1
+
+
+def test_what_is_no_bundle_is_named(tmp_path: Path, capsys: Capture) -> None:
+    path = tmp_path / "some.npz"
+    assert repro.main([str(path)]) == 2
+    assert f"{path}: no such file" in capsys.readouterr().err
+    np.savez(path, a=np.zeros(3))
+    with pytest.raises(InputError, match="not a bundle"):
+        repro.read_bundle(path)
+    path.write_bytes(b"PK")
+    with pytest.raises(InputError, match="not a bundle"):
+        repro.read_bundle(path)
+
+
+def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device: Device) -> None:
+    config = replace(CONFIG, iterations=100)
+    with heard(), spoilt(lambda _: True), pytest.raises(ClsplatError, match="give a run, and what reproduces it"):
+        train(scene, config, device=default_device)
+
+
+# Without the checks
+
+
+def test_kernels_without_checks_have_the_same_bits_and_no_checks(scene: Scene, default_device: Device) -> None:
+    """What `tools/bench_guards.py` compares with."""
+    trainers = [Trainer(scene, CONFIG, each) for each in (default_device, unguarded(default_device))]
+    for trainer in trainers:
+        for _ in range(20):
+            trainer.train_step()
+    arrays = [trainer.checkpoint()[0] for trainer in trainers]
+    for name, array in arrays[0].items():
+        assert_same_bits(arrays[1][name], array, name)
+    for trainer in trainers:
+        values = trainer.first["means"].get()
+        values[3] = np.nan
+        trainer.first["means"].set(values)
+        trainer.train_step()
+    spoilt = [bool(np.isnan(trainer.parameters["means"].get()).any()) for trainer in trainers]
+    assert spoilt == [False, True]
+
+
+def unguarded(device: Device) -> Device:
+    return device.with_switches({"UNGUARDED": True})
+
+
+def test_the_cost_of_the_checks_is_told(scene: Scene, capsys: Capture) -> None:
+    folder = Path(scene.views[0].path).parents[1]
+    assert bench_guards.main([str(folder), "--repeat", "2", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["gaussians"] == 40
+    for kind in ("wall", "cpu"):
+        assert result[kind]["with_ms"] > 0
+        assert result[kind]["without_ms"] > 0
+    assert bench_guards.main(["--repeat", "0"]) == 2
+    assert "--repeat 0: expected at least 1" in capsys.readouterr().err
+
+
+def test_rates_are_the_settings_where_nothing_happened(scene: Scene, default_device: Device) -> None:
+    trainer = Trainer(scene, CONFIG, default_device)
+    trainer.step = 1
+    assert trainer.rates()["sh_dc"] == TrainConfig().optimiser.sh_dc_rate
+    assert all(group in trainer.rates() for group in GROUPS)
