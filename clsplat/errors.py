@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import os
+import warnings
 from collections.abc import Iterable
 
 
@@ -16,7 +17,12 @@ class ClsplatError(Exception):
 
 def plain(text: str) -> str:
     """`text` as one line that any terminal shows as it is: names in hostile files may hold anything."""
-    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)
+
+
+def warn(text: str) -> None:
+    """Warn in one line, as of the calling line: the command line shows the warnings of this package's modules."""
+    warnings.warn(plain(text), stacklevel=2)
 
 
 def examples(names: Iterable[object], most: int = 3) -> str:

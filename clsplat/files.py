@@ -280,8 +280,8 @@ def name_trouble(name: str, *, windows: bool = WINDOWS) -> str | None:
         return "is no name for a file"
     if windows:
         for part in pure.parts:
-            if found := _REFUSED.search(part):
-                return f"has {found[0]!r} in it, which no name of a file on Windows may have"
+            if character := _REFUSED.search(part):
+                return f"has {character[0]!r} in it, which no name of a file on Windows may have"
             if _DEVICE.fullmatch(part):
                 return f"is a name that Windows keeps for a device ({part})"
             if part[-1] in ". ":
@@ -310,34 +310,32 @@ def abandoned(targets: Iterable[Path]) -> list[Path]:
     for target in targets:
         real = Path(os.path.realpath(target))
         names.setdefault(real.parent, set()).add(real.name)
-    found = []
+    result = []
     for folder, wanted in names.items():
         with suppress(OSError):
             for entry in os.scandir(folder):
                 match = _TEMPORARY.fullmatch(entry.name)
                 if match and match[1] in wanted and _is_abandoned(path := Path(entry.path), match[2]):
-                    found.append(path)
-    return sorted(found)
+                    result.append(path)
+    return sorted(result)
 
 
 def digest(path: str | os.PathLike[str]) -> str:
     """SHA-256 of the file's content, in hexadecimal. Raises OSError."""
-    found = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            found.update(block)
-    return found.hexdigest()
+    return _digest(path, hashlib.sha256())
 
 
 def short_digest(path: Path) -> str | None:
     """BLAKE2b of 16 bytes of the file's content, in hexadecimal, which is quicker; None where there is no file."""
-    if not is_file(path):
-        return None
-    found = hashlib.blake2b(digest_size=16)
+    return _digest(path, hashlib.blake2b(digest_size=16)) if is_file(path) else None
+
+
+def _digest(path: str | os.PathLike[str], state: Any) -> str:
     with open(path, "rb") as file:
         while block := file.read(1 << 20):
-            found.update(block)
-    return found.hexdigest()
+            state.update(block)
+    digits: str = state.hexdigest()
+    return digits
 
 
 def _sync_folder(folder: Path) -> None:
@@ -401,12 +399,12 @@ def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT) -> str:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    result = dict(pairs)
+    if len(result) < len(pairs):
         names = [name for name, _ in pairs]
-        twice = next(name for name in found if names.count(name) > 1)
+        twice = next(name for name in result if names.count(name) > 1)
         raise ValueError(f"the key {twice[:40]!r} is there twice")
-    return found
+    return result
 
 
 def parse_json(text: str | bytes, *, once: bool = False) -> Any:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import prod
+from typing import Any
 
 import numpy as np
 
@@ -43,22 +44,26 @@ class Gaussians:
         """0 to 3."""
         return round(float(np.sqrt(self.sh.shape[1]))) - 1
 
+    def arrays(self) -> dict[str, Any]:
+        """The parameters, float32, by their names, in the order of the class."""
+        return {group.field: getattr(self, group.field) for group in GROUPS.values()}
+
     def local(self, camera: Camera) -> Camera:
         """A camera in the world as one that counts from where the means do, with the model's near plane."""
         return camera.from_origin(self.origin).before(self.near)
 
     def check(self) -> None:
         """Raise ValueError naming the array whose dtype or shape is not as the class says."""
-        for name in (*(group.field for group in GROUPS.values()), "origin"):
-            if not isinstance(array := getattr(self, name), np.ndarray):
+        for name, array in {**self.arrays(), "origin": self.origin}.items():
+            if not isinstance(array, np.ndarray):
                 raise ValueError(f"{name} is a {type(array).__name__}, expected a NumPy array")
         count = len(self.means) if self.means.ndim else 0
         coefficients = self.sh.shape[1] if self.sh.ndim == 3 else 0
         if coefficients not in [(degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1)]:
             raise ValueError(f"sh has shape {self.sh.shape}, expected (N, 1, 4, 9 or 16, 3)")
         shapes = {group.field: (count, *group.shape) for group in GROUPS.values()} | {"sh": (count, coefficients, 3)}
-        for name, shape in shapes.items():
-            array = getattr(self, name)
+        for name, array in self.arrays().items():
+            shape = shapes[name]
             if array.dtype != np.float32 or array.shape != shape:
                 raise ValueError(f"{name} is {array.dtype} {array.shape}, expected float32 {shape}")
         if self.origin.dtype != np.float64 or self.origin.shape != (3,):

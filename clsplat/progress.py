@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO, TypeVar
 from typing_extensions import Self
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress as RichProgress
 
+Progress = Callable[[str, float | None], None]
+"""A listener: the text of a stage, and the part of it that is done, None where that is not known."""
 PLAIN_INTERVAL = 10.0
 """Seconds between plain lines."""
 SMOOTHING = 0.1
@@ -24,10 +26,14 @@ SMOOTHING = 0.1
 BarT = TypeVar("BarT", bound="_Bar")
 
 
+def no_progress(text: str, fraction: float | None = None) -> None:
+    """A listener that passes over everything."""
+
+
 class _Bar:
     """A context manager with a live bar where the stream is a terminal; `live` is None elsewhere."""
 
-    live: Progress | None = None
+    live: RichProgress | None = None
 
     def __init__(self, stream: TextIO, description: str, total: int, *, counted: bool = False) -> None:
         from rich.console import Console

@@ -25,5 +25,5 @@ def quaternion_of(rotation: Float64) -> Float64:
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    found = np.array([w, x, y, z])
-    return found if w >= 0 else -found
+    quaternion = np.array([w, x, y, z])
+    return quaternion if w >= 0 else -quaternion

@@ -375,7 +375,6 @@ def read_photos(folder: Path) -> None:
 def read_record(folder: Path) -> None:
     """Look if a result of structure from motion can be used again."""
     sfm._is_finished(folder, folder / "photos", "0", overwrite=False)  # noqa: SLF001
-    sfm.unregistered(folder)
 
 
 BYTES = ("flip", "truncate", "numbers", "insert", "remove", "repeat", "append", "zeros", "swap")

@@ -124,9 +124,9 @@ class Bench:
         self.names.update(model=str(folder / "run" / "model.ply"), cache=str(folder / "cache"))
         write_scene(folder / "scene")
         if any(verb.name == "sfm" for verb in verbs):
-            from clsplat.demo.ray_caster import ignore_progress, write_photos
+            from clsplat.demo.ray_caster import write_photos
 
-            write_photos(folder / "photos", count=12, width=320, height=240, progress=ignore_progress)
+            write_photos(folder / "photos", count=12, width=320, height=240)
         for name in ("run", "other"):
             self.call(["train", self.names["scene"], "-o", self.names[name], "--iterations", str(SHORT), *TRAINING])
 

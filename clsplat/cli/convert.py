@@ -19,6 +19,7 @@ from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
+    from clsplat.models.formats import Format
 
 QUICK = 2.0
 """Seconds that writing a file may take without a word."""
@@ -82,8 +83,7 @@ def run(verb: Convert, services: Services) -> int:
     from clsplat.files import check_new
     from clsplat.images import colour
     from clsplat.models import difference, edit
-    from clsplat.models.formats import format_of, format_of_name, load, save, sog
-    from clsplat.models.info import beside
+    from clsplat.models.formats import format_of, format_of_name, load, save
     from clsplat.runs.run import model_file
 
     source, merged = model_file(verb.source), [model_file(path) for path in verb.merge]
@@ -91,25 +91,24 @@ def run(verb: Convert, services: Services) -> int:
     matrix = convert_edits.similarity(verb)
     target_format = format_of_name(verb.target, writable=True)
     check_new(verb.target, overwrite=verb.overwrite, sources=[source, *merged])
-    for path in beside(verb.target):
-        if path.suffix == ".bin" or path.stem.partition("_")[0] in sog.PICTURES:
-            check_new(path, overwrite=verb.overwrite)
+    for companion in target_format.side_files(verb.target):
+        check_new(companion, overwrite=verb.overwrite)
     original, space = load(source), colour.recorded_space(source)
     edited = convert_edits.edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
     comments = () if space == colour.SRGB else (colour.comment(space),)
     save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK))
     if space != colour.recorded_space(verb.target):
-        warn(f"{verb.target}: {target_format.NAME} has no place for the colour space, which is {space}")
+        warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
     read = load(verb.target)
     if not isclose(read.near, edited.near, rel_tol=NEAR_SLACK):
         warn(
-            f"{verb.target}: {target_format.NAME} has no place for the near plane, which is {edited.near:.4g}; readers "
+            f"{verb.target}: {target_format.name} has no place for the near plane, which is {edited.near:.4g}; readers "
             f"will take {read.near:.4g}"
         )
-    written = edit.take(edited, target_format.order(edited)) if hasattr(target_format, "order") else edited
+    written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
     result: dict[str, Any] = {
-        "source": _described(source, format_of(source).NAME, original),
-        "target": _described(verb.target, target_format.NAME, read),
+        "source": _described(source, format_of(source), original),
+        "target": _described(verb.target, target_format, read),
         "errors": difference.errors(written, read),
     }
     if verb.scene is not None:
@@ -154,8 +153,8 @@ def _check(verb: Convert) -> None:
         raise InputError(f"--test-every {verb.test_every} --resolution {verb.resolution}: expected at least 0")
 
 
-def _described(path: Path, name: str, gaussians: Gaussians) -> dict[str, Any]:
+def _described(path: Path, form: Format, gaussians: Gaussians) -> dict[str, Any]:
     from clsplat.models.info import size
 
-    file = {"path": str(path), "format": name, "bytes": size(path)}
+    file = {"path": str(path), "format": form.name, "bytes": size(path, form)}
     return file | {"gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}

@@ -11,7 +11,7 @@ which there would be no points to start from: what training puts there may hang 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,9 +24,9 @@ from scipy import ndimage
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.images.writing import write_spec
+from clsplat.progress import Progress, no_progress
 from clsplat.shots.viewpoints import look_at
 
-Progress = Callable[[str, float | None], None]
 Palette = tuple[tuple[float, float, float], ...]
 
 SUN = np.array([0.45, -0.35, 0.82], np.float32) / np.float32(np.sqrt(0.45**2 + 0.35**2 + 0.82**2))
@@ -58,14 +58,12 @@ class Noise:
             total += np.float32(weight) * sample
             weight *= gain
         # B-spline smoothing leaves about a third of the lattice's range
-        stretched: Float32 = np.tanh(2.2 * total).astype(np.float32)
-        return stretched
+        return np.asarray(np.tanh(2.2 * total).astype(np.float32))
 
 
 def smooth_square(phase: Float32, softness: float) -> Float32:
     """A square wave of period 1 with soft edges, [0, 1]: hard edges would alias in the texture."""
-    wave: Float32 = 0.5 + 0.5 * np.tanh(np.sin(2 * np.pi * phase) / softness)
-    return wave
+    return np.asarray(0.5 + 0.5 * np.tanh(np.sin(2 * np.pi * phase) / softness))
 
 
 def palette_colour(value: Float32, colours: Palette) -> Float32:
@@ -79,14 +77,12 @@ def speckled(colour: Float32, points: Float32, noise: Noise, wavelength: float) 
     """Soft dark and light specks over colour (n, 3): blobs of a few pixels are what SIFT finds and matches."""
     fine = noise(points + 11, wavelength, 2, gain=0.8)[:, None]
     dark, light = np.clip(-1.7 * fine - 0.5, 0, 1), np.clip(1.7 * fine - 0.5, 0, 1)
-    shaded: Float32 = colour * (1 - 0.55 * dark) + (0.97 - colour) * (0.45 * light)
-    return shaded
+    return np.asarray(colour * (1 - 0.55 * dark) + (0.97 - colour) * (0.45 * light))
 
 
 def dot(a: Float32, b: Float32) -> Float32:
     """Row-wise scalar product of (n, 3) and (n, 3) or (3,)."""
-    product: Float32 = a[:, 0] * b[..., 0] + a[:, 1] * b[..., 1] + a[:, 2] * b[..., 2]
-    return product
+    return np.asarray(a[:, 0] * b[..., 0] + a[:, 1] * b[..., 1] + a[:, 2] * b[..., 2])
 
 
 @dataclass
@@ -128,8 +124,7 @@ class Surface(ABC):
         corner = y0 * self.columns + x0
         top = flat[corner] * (1 - fx) + flat[corner + 1] * fx
         bottom = flat[corner + self.columns] * (1 - fx) + flat[corner + self.columns + 1] * fx
-        mixed: Float32 = top * (1 - fy) + bottom * fy
-        return mixed
+        return np.asarray(top * (1 - fy) + bottom * fy)
 
     def grid(self, rows: int, columns: int) -> tuple[Float32, Float32]:
         """Position and normal at the centres of a rows x columns grid over the texture, (rows * columns, 3)."""
@@ -143,8 +138,7 @@ class Floor(Surface):
     def distance(self, origin: Float32, direction: Float32) -> Float32:
         with np.errstate(divide="ignore", invalid="ignore"):
             t = -origin[..., 2] / direction[:, 2]
-        hit: Float32 = np.where(t > 1e-4, t, np.inf).astype(np.float32)
-        return hit
+        return np.where(t > 1e-4, t, np.inf).astype(np.float32)
 
     def texture_coordinates(self, points: Float32) -> tuple[Float32, Float32]:
         scale = np.float32(0.5 / WALL_RADIUS)
@@ -176,8 +170,7 @@ class Wall(Surface):
         with np.errstate(divide="ignore", invalid="ignore"):
             t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # from inside, the far root is the one ahead
             z = origin[..., 2] + t * direction[:, 2]
-        hit: Float32 = np.where((t > 1e-3) & (z < WALL_HEIGHT) & (z > 0), t, np.inf).astype(np.float32)
-        return hit
+        return np.where((t > 1e-3) & (z < WALL_HEIGHT) & (z > 0), t, np.inf).astype(np.float32)
 
     def texture_coordinates(self, points: Float32) -> tuple[Float32, Float32]:
         angle = np.arctan2(points[:, 1], points[:, 0]) / np.float32(2 * np.pi)
@@ -213,8 +206,7 @@ class Ball(Surface):
         c = (offset * offset).sum(-1) - np.float32(self.radius**2)
         discriminant = b * b - c
         t = -b - np.sqrt(np.maximum(discriminant, 0))
-        hit: Float32 = np.where((discriminant > 0) & (t > 1e-3), t, np.inf).astype(np.float32)
-        return hit
+        return np.where((discriminant > 0) & (t > 1e-3), t, np.inf).astype(np.float32)
 
     def texture_coordinates(self, points: Float32) -> tuple[Float32, Float32]:
         local = (points - np.asarray(self.centre, np.float32)) / np.float32(self.radius)
@@ -260,8 +252,7 @@ class Box(Surface):
                 other = (half[axis] - start[..., axis]) / step[:, axis]
                 np.maximum(enter, np.minimum(one, other), out=enter)
                 np.minimum(leave, np.maximum(one, other), out=leave)
-        hit: Float32 = np.where((enter < leave) & (enter > 1e-3), enter, np.inf).astype(np.float32)
-        return hit
+        return np.where((enter < leave) & (enter > 1e-3), enter, np.inf).astype(np.float32)
 
     def texture_coordinates(self, points: Float32) -> tuple[Float32, Float32]:
         local = (points - np.asarray(self.centre, np.float32)) @ self._local_from_world().T
@@ -344,14 +335,6 @@ def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], n
     surface.texture = texture.reshape(surface.rows, surface.columns, 3).astype(np.float32)
 
 
-def sky(direction: Float32) -> Float32:
-    """A pale gradient, (n, 3), for unit directions (n, 3)."""
-    up = np.clip(direction[:, 2], 0, 1)[:, None]
-    horizon, zenith = np.array([0.80, 0.84, 0.88], np.float32), np.array([0.45, 0.60, 0.82], np.float32)
-    colour: Float32 = horizon * (1 - up) + zenith * up
-    return colour
-
-
 def cameras(count: int, width: int, height: int, seed: int) -> list[Camera]:
     """Hand-held views: three in five on a low ring, the others on a high one, all towards the middle, with jitter."""
     generator = np.random.default_rng(seed + 1)
@@ -386,7 +369,7 @@ def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32
         distance = surface.distance(origin, direction)
         closer = distance < nearest
         nearest[closer], hit_index[closer] = distance[closer], index
-    colour = sky(direction)
+    colour = np.zeros_like(direction)  # no ray misses the wall
     for index, surface in enumerate(surfaces):
         rays = np.flatnonzero(hit_index == index)
         if not len(rays):
@@ -401,12 +384,8 @@ def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32
             colour[rays] += surface.gloss * highlight[:, None]
     fine = colour.reshape(camera.height, samples, camera.width, samples, 3)
     linear = np.clip(fine.mean(axis=(1, 3)), 0, 1)
-    encoded: Float32 = linear ** np.float32(1 / 1.6)  # a gentle tone curve: the photos should not look gloomy
-    return encoded
-
-
-def ignore_progress(text: str, fraction: float | None) -> None:
-    """Do nothing: progress that nobody reads."""
+    # a gentle tone curve: the photos should not look gloomy
+    return np.asarray(linear ** np.float32(1 / 1.6))
 
 
 def write_jpeg(path: Path, image: Float32) -> None:
@@ -432,7 +411,7 @@ def write_photos(
     width, height: pixels. progress(text, fraction) is called as the work goes on. Raises ClsplatError where a
     photo cannot be written. Poses are neither returned nor written: recovering them is the point of the demo.
     """
-    report = progress or ignore_progress
+    report = progress or no_progress
     folder.mkdir(parents=True, exist_ok=True)
     report("painting the scene", 0.0)
     surfaces = still_life()

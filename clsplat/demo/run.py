@@ -12,13 +12,13 @@ from typing import Any
 from clsplat.api import train
 from clsplat.config.training import TrainConfig
 from clsplat.config.verbs import DEMO_ITERATIONS
-from clsplat.demo.ray_caster import Progress, ignore_progress, write_photos
+from clsplat.demo.ray_caster import write_photos
 from clsplat.device.context import open_device
 from clsplat.errors import InputError, examples
 from clsplat.files import atomic_write, is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
-from clsplat.progress import StageProgress, TrainProgress
+from clsplat.progress import Progress, StageProgress, TrainProgress
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
@@ -53,10 +53,10 @@ def claim(output: Path) -> None:
     """Mark a folder as a demo's. Raises InputError where it has what a demo would replace, and is not marked."""
     if is_file(output / MARK):
         return
-    found = [name for name in MADE if (output / name).exists() or (output / name).is_symlink()]
-    if found:
+    existing = [name for name in MADE if (output / name).exists() or (output / name).is_symlink()]
+    if existing:
         raise InputError(
-            f"{output}: holds {examples(found, len(MADE))}, which no demo has made and a demo would replace; choose "
+            f"{output}: holds {examples(existing, len(MADE))}, which no demo has made and a demo would replace; choose "
             "another folder, or remove them"
         )
     atomic_write(output / MARK, b"What is beside this file was made by clsplat demo, which may replace it.\n")
@@ -69,7 +69,11 @@ def _run_demo(output: Path, *, device: str | None, iterations: int, frames: int)
     opened = open_device(device)
     scene_folder = make_scene(output, StageProgress())
     run_folder, turntable_folder = output / "run", output / "turntable"
-    result = _train(scene_folder, run_folder, iterations, opened)
+    config = TrainConfig(iterations=iterations)
+    run = Run.create(run_folder, config, scene=scene_folder, resume=False, overwrite=True)
+    with TrainProgress(iterations) as progress:
+        train(load_scene(scene_folder), config, device=opened, run=run, on_step=progress)
+    result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
     _render_turntable(scene_folder, run_folder, turntable_folder, frames, opened)
 
     minutes, seconds = divmod(round(time.monotonic() - start), 60)
@@ -96,20 +100,9 @@ def make_scene(output: Path, progress: Progress | None = None) -> Path:
     if not set(existing).issubset(expected):
         raise InputError(f"{photos}: holds files that are not the demo's, expected a new folder")
     if existing != expected:
-        write_photos(photos, count=PHOTOS, width=WIDTH, height=HEIGHT, progress=progress or ignore_progress)
+        write_photos(photos, count=PHOTOS, width=WIDTH, height=HEIGHT, progress=progress)
     # the ray caster's lens has no distortion, as ours is known to have none: photos need no resampling
     return sfm.reconstruct(photos, scene, camera_model="SIMPLE_PINHOLE", overwrite=True, progress=progress)
-
-
-def _train(scene_folder: Path, run_folder: Path, iterations: int, device: Any) -> dict[str, Any]:
-    """Train a run and give its evaluation on the held-out photos. An earlier demo's run is replaced."""
-    config = TrainConfig(iterations=iterations)
-    scene = load_scene(scene_folder)
-    run = Run.create(run_folder, config, scene=scene_folder, resume=False, overwrite=True)
-    with TrainProgress(iterations) as progress:
-        train(scene, config, device=device, run=run, on_step=progress)
-    result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
-    return result
 
 
 def _render_turntable(scene_folder: Path, run_folder: Path, target: Path, frames: int, device: Any) -> None:

@@ -36,23 +36,26 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
         raise ValueError(f"{len(original)} and {len(read)} Gaussians")
     low, high = original.means.min(axis=0).astype(np.float64), original.means.max(axis=0).astype(np.float64)
     extent = float(np.linalg.norm(high - low))
-    found: dict[str, list[Float64]] = {name: [] for name in UNITS}
     shift = read.origin - original.origin
+    blocks = []
     for start in range(0, len(original), _BLOCK):
         rows = slice(start, start + _BLOCK)
-        moved = read.means[rows].astype(np.float64) - original.means[rows] + shift
-        distance = np.linalg.norm(moved, axis=1)
-        found["position"].append(distance)
-        found["position_relative"].append(distance / extent if extent else distance * 0)
-        found["scale"].append(_scale_errors(original.log_scales[rows], read.log_scales[rows]))
-        found["rotation"].append(_angles(original.quaternions[rows], read.quaternions[rows]))
-        logits = original.opacity_logits[rows], read.opacity_logits[rows]
-        found["opacity"].append(np.abs(packing.opacities(logits[1]) - packing.opacities(logits[0])))
-        dc = packing.colours(read.sh[rows, 0]) - packing.colours(original.sh[rows, 0])
-        found["colour"].append(np.abs(dc).max(axis=1))
-        found["sh"].append(_sh_errors(original.sh[rows, 1:], read.sh[rows, 1:]))
-    whole = {name: np.concatenate(values) for name, values in found.items()}
-    return {name: {"largest": float(all_.max()), "mean": float(all_.mean())} for name, all_ in whole.items()}
+        distance = np.linalg.norm(read.means[rows].astype(np.float64) - original.means[rows] + shift, axis=1)
+        opacities = [packing.opacities(model.opacity_logits[rows]) for model in (original, read)]
+        colours = [packing.colours(model.sh[rows, 0]) for model in (original, read)]
+        blocks.append(
+            {
+                "position": distance,
+                "position_relative": distance / extent if extent else distance * 0,
+                "scale": _scale_errors(original.log_scales[rows], read.log_scales[rows]),
+                "rotation": _angles(original.quaternions[rows], read.quaternions[rows]),
+                "opacity": np.abs(opacities[1] - opacities[0]),
+                "colour": np.abs(colours[1] - colours[0]).max(axis=1),
+                "sh": _sh_errors(original.sh[rows, 1:], read.sh[rows, 1:]),
+            }
+        )
+    whole = {name: np.concatenate([block[name] for block in blocks]) for name in UNITS}
+    return {name: {"largest": float(column.max()), "mean": float(column.mean())} for name, column in whole.items()}
 
 
 def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
@@ -75,15 +78,15 @@ def _sh_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
     width = max(a.shape[1], b.shape[1])
     if width == 0:
         return np.zeros(len(a))
-    p, q = (np.pad(each.astype(np.float64), ((0, 0), (0, width - each.shape[1]), (0, 0))) for each in (a, b))
+    p, q = (np.pad(sh.astype(np.float64), ((0, 0), (0, width - sh.shape[1]), (0, 0))) for sh in (a, b))
     return np.asarray(np.abs(p - q).max(axis=(1, 2)))
 
 
-def table(found: dict[str, dict[str, float]]) -> str:
+def table(losses: dict[str, dict[str, float]]) -> str:
     """A line for each attribute."""
     names = {"position_relative": "", "sh": "SH"}
     lines = ["error      largest      mean"]
     for name, unit in UNITS.items():
         label = names.get(name, name)
-        lines.append(f"{label:9}  {found[name]['largest']:<11.3g}  {found[name]['mean']:<11.3g}  {unit}")
+        lines.append(f"{label:9}  {losses[name]['largest']:<11.3g}  {losses[name]['mean']:<11.3g}  {unit}")
     return "\n".join(lines)

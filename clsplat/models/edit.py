@@ -29,17 +29,9 @@ _SIMILAR = 1e-6
 """Most that Q^T Q may differ from 1: matrices are typed with six digits, or float32's."""
 
 
-def take(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
-    """The Gaussians of those rows, (n,) booleans or indices."""
-    return Gaussians(
-        gaussians.means[rows],
-        gaussians.quaternions[rows],
-        gaussians.log_scales[rows],
-        gaussians.opacity_logits[rows],
-        gaussians.sh[rows],
-        gaussians.origin,
-        gaussians.near,
-    )
+def take(gaussians: Gaussians, rows: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
+    """The Gaussians of those rows, a slice or (n,) booleans or indices."""
+    return replace(gaussians, **{name: array[rows] for name, array in gaussians.arrays().items()})
 
 
 def in_box(gaussians: Gaussians, low: Sequence[float], high: Sequence[float]) -> NDArray[np.bool_]:
@@ -80,15 +72,9 @@ def merge(models: Sequence[Gaussians]) -> Gaussians:
     def sh(model: Gaussians) -> Float32:
         return np.pad(model.sh, ((0, 0), (0, coefficients - model.sh.shape[1]), (0, 0)))
 
-    return Gaussians(
-        np.concatenate([means(model) for model in models]),
-        np.concatenate([model.quaternions for model in models]),
-        np.concatenate([model.log_scales for model in models]),
-        np.concatenate([model.opacity_logits for model in models]),
-        np.concatenate([sh(model) for model in models]),
-        origin,
-        min(model.near for model in models),
-    )
+    parts = [replace(model, means=means(model), sh=sh(model)).arrays() for model in models]
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Gaussians(**whole, origin=origin, near=min(model.near for model in models))
 
 
 def decompose(matrix: Float64, slack: float = _SIMILAR) -> tuple[float, Float64, Float64]:
@@ -153,8 +139,7 @@ def _turned(quaternions: Float32, turn: Float64) -> Float32:
     x, y, z, w = Rotation.from_matrix(proper).as_quat()
     # Hamilton's product of (w, x, y, z) and each quaternion
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    turned: Float32 = (quaternions.astype(np.float64) @ product.T).astype(np.float32)
-    return turned
+    return np.asarray((quaternions.astype(np.float64) @ product.T).astype(np.float32))
 
 
 def rotate_sh(sh: Float32, turn: Float64) -> Float32:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,12 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import NEAR
-from clsplat.files import is_file, open_input
+from clsplat.files import is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import recorded_space
 from clsplat.models.codec import values as packing
-from clsplat.models.formats import format_of, model_path, ply, tell_kind
+from clsplat.models.edit import take
+from clsplat.models.formats import Format, resolve
 
 PERCENTILES = (0, 1, 50, 99, 100)
 _BLOCK = 1 << 16
@@ -24,52 +26,30 @@ _BLOCK = 1 << 16
 
 def model_info(path: Path) -> dict[str, Any]:
     """Figures that `clsplat info --json` prints. Raises InputError for a file that no format reads."""
-    path = model_path(path)
-    module = format_of(path)
-    tell_kind(path, module)
-    result: dict[str, Any] = {"path": str(path), "format": module.NAME, "bytes": size(path)}
-    if module is ply:
-        origin, blocks = _ply_blocks(path)
+    path, form = resolve(path)
+    result: dict[str, Any] = {"path": str(path), "format": form.name, "bytes": size(path, form)}
+    if form.blocks:
+        origin, blocks = form.blocks(path)
     else:
-        model: Gaussians = module.read(path)
+        model = form.read(path)
         origin, blocks = model.origin, _blocks(model)
-    result |= module.describe(path) if hasattr(module, "describe") else {}
+    result |= form.describe(path)
     result |= _summary(blocks, origin)
     result["colorspace"] = recorded_space(path)
-    result["loses"] = getattr(module, "LOSES", "")
+    result["loses"] = form.loses
     return result
 
 
-def size(path: Path) -> int:
-    """Bytes of the file, with the pictures beside a meta.json and the .bin beside a .gltf."""
-    return sum(each.stat().st_size for each in (path, *beside(path)) if is_file(each))
-
-
-def beside(path: Path) -> list[Path]:
-    """The other files of a model: the pictures of a meta.json, the .bin of a .gltf."""
-    if path.name == "meta.json":
-        return sorted(path.parent.glob("*.webp"))
-    return [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
-
-
-def _ply_blocks(path: Path) -> tuple[NDArray[np.float64], Iterator[Gaussians]]:
-    with open_input(path, "a 3DGS PLY") as file:
-        header = ply.read_header(file, path)
-    origin = np.zeros(3) if header.origin is None else header.origin
-    return origin, ply.read_blocks(path)
+def size(path: Path, form: Format) -> int:
+    """Bytes of the model's files."""
+    return sum(file.stat().st_size for file in (path, *form.side_files(path)) if is_file(file))
 
 
 def _blocks(model: Gaussians) -> Iterator[Gaussians]:
     """Blocks of a whole model, in the world."""
     for start in range(0, len(model), _BLOCK):
         rows = slice(start, start + _BLOCK)
-        yield Gaussians(
-            packing.world_means(model, rows).astype(np.float32),
-            model.quaternions[rows],
-            model.log_scales[rows],
-            model.opacity_logits[rows],
-            model.sh[rows],
-        )
+        yield replace(take(model, rows), means=packing.world_means(model, rows).astype(np.float32))
 
 
 def _summary(blocks: Iterator[Gaussians], origin: NDArray[np.float64]) -> dict[str, Any]:
@@ -105,8 +85,8 @@ def _summary(blocks: Iterator[Gaussians], origin: NDArray[np.float64]) -> dict[s
 
 
 def _percentiles(values: NDArray[Any]) -> dict[str, float]:
-    found = np.percentile(values, PERCENTILES)
-    return {f"p{percent}": float(value) for percent, value in zip(PERCENTILES, found, strict=True)}
+    results = np.percentile(values, PERCENTILES)
+    return {f"p{percent}": float(value) for percent, value in zip(PERCENTILES, results, strict=True)}
 
 
 def _listed(percentiles: dict[str, float]) -> str:
@@ -119,11 +99,12 @@ def text(info: dict[str, Any]) -> str:
     def numbers(values: list[float]) -> str:
         return " ".join(f"{value:.6g}" for value in values)
 
-    kind = ", ".join(
-        [info["format"], *(f"{key} {info[key]}" for key in ("version", "encoding", "level") if key in info)]
-    )
+    details = [f"{key} {info[key]}" for key in ("version", "encoding", "level") if key in info]
     count = info["gaussians"]
-    lines = [("format", kind), ("bytes", f"{info['bytes']:,}, {info['bytes'] / max(count, 1):.1f} a Gaussian")]
+    lines = [
+        ("format", ", ".join([info["format"], *details])),
+        ("bytes", f"{info['bytes']:,}, {info['bytes'] / max(count, 1):.1f} a Gaussian"),
+    ]
     lines.append(("Gaussians", f"{count:,}" + (f", {info['not_finite']:,} not finite" if info["not_finite"] else "")))
     used = info["sh_degree_used"]
     only = "" if used == info["sh_degree"] else f", zero beyond {used}"

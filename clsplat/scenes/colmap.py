@@ -12,10 +12,10 @@ import math
 import os
 import re
 import struct
-import warnings
 from array import array
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO, TypeVar
 
@@ -23,52 +23,27 @@ import numpy as np
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
 from clsplat.rotations import rotation_from_quaternion
+from clsplat.scenes.data_set import MAX_NUMBER, DataSet, PosedImage
 from clsplat.scenes.lens import Lens, absurd, check_lens, models
 
 Value = TypeVar("Value")
 
 STEMS = ("cameras", "images", "points3D")
+COUNT = struct.Struct("<Q")
 OBSERVATION_BYTES = 24  # x, y, id of the point
 TRACK_BYTES = 8  # ids of the image and of the observation in it
 MAX_NAME_BYTES = 4096
 MAX_LINE = 1 << 26
 """Characters of a line of text; the observations of a picture and the track of a point are one each."""
-MAX_NUMBER = 1e30
-"""Coordinates beyond it are damage; their squares are still finite."""
-WINDOW = 1 << 20
 NEWER = 60.0
 """Seconds by which a text file is newer than its binary one where it was edited since: tools that write both,
 and programs that copy them, are done with the second sooner."""
 ANNOUNCED = re.compile(r"# *Number of (?:cameras|images|points): *(\d{1,18})\b")
 POSE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 EXPECTED = "a file of a COLMAP model"
-
-
-@dataclass(frozen=True, eq=False)
-class ModelImage:
-    """A picture of a model: its name (relative to the images' folder), lens, and `cam_from_world`.
-
-    rotation (3, 3), translation (3,), float64.
-    """
-
-    name: str
-    lens: Lens
-    rotation: Float64
-    translation: Float64
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """images by name, in order; points (N, 3) float64 in the world; colors (N, 3) float32 in [0, 1]; warnings: what a
-    user should hear, a line each."""
-
-    images: list[ModelImage]
-    points: Float64
-    colors: Float32
-    warnings: list[str] = field(default_factory=list)
 
 
 def find_model(folder: Path) -> Path | None:
@@ -88,20 +63,20 @@ def find_model(folder: Path) -> Path | None:
     return None
 
 
-def read_model(folder: Path) -> Model:
+def read_model(folder: Path) -> DataSet:
     """Read the model in `folder`; each of the three files as .bin if there, else as .txt.
 
     points3D may be missing, there are no points then. Raises InputError, naming the file, for one that is missing,
-    cut short, longer than its contents, damaged, or of a camera model that is unknown. The model's warnings tell of
-    text with less than its header announces, and of text that is newer than the binary file that is read.
+    cut short, longer than its contents, damaged, or of a camera model that is unknown. Warns of text with less than its
+    header announces, and of text that is newer than the binary file that is read.
     """
-    heard = _passed_over(folder)
-    lenses = _read_cameras(folder, heard)
-    images = _read_images(folder, lenses, heard)
-    if _file(folder, "points3D") is None:
-        return Model(images, np.empty((0, 3)), np.empty((0, 3), np.float32), heard)
-    points, colors = _read_points(folder, heard)
-    return Model(images, points, colors, heard)
+    images = _read_posed_images(folder)
+    return DataSet(images, *_read_points(folder)) if _file(folder, "points3D") else DataSet(images)
+
+
+def _read_posed_images(folder: Path) -> list[PosedImage]:
+    _warn_of_newer_text(folder)
+    return _read_images(folder, _read_cameras(folder))
 
 
 def read_cameras(folder: Path) -> dict[str, Camera]:
@@ -116,15 +91,13 @@ def read_cameras(folder: Path) -> dict[str, Camera]:
         raise InputError(f"{folder}: no COLMAP model, expected cameras and images (.bin or .txt) in it or in sparse/0")
     pinholes: dict[Lens, Camera] = {}
     cameras = {}
-    heard = _passed_over(model)
-    images = _read_images(model, _read_cameras(model, heard), heard)
+    images = _read_posed_images(model)
     for image in images:
         if image.lens not in pinholes:
             pinholes[image.lens] = image.lens.pinhole(np.eye(3), np.zeros(3))
         cameras[image.name] = replace(pinholes[image.lens], rotation=image.rotation, translation=image.translation)
-    for text in (*heard, absurd([(image.name, image.lens) for image in images])):
-        if text:
-            warnings.warn(plain(text), stacklevel=2)
+    if doubt := absurd([(image.name, image.lens) for image in images]):
+        warn(doubt)
     return cameras
 
 
@@ -136,70 +109,55 @@ def safe_name(name: str) -> bool:
 
 
 class _Binary:
-    """Reads little-endian records from a file, a window of it at a time; InputError where it ends."""
+    """Reads little-endian records from a file; InputError where it ends."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path, self.file = path, file
-        self.size = os.fstat(file.fileno()).st_size
-        self.window, self.start = b"", 0
-        self.position = 0
+        self.size = self.left = os.fstat(file.fileno()).st_size
         self.doing = "its header"
 
-    def _at(self, size: int) -> int:
-        """Index in the window of the position; `size` bytes from there on are in it, as far as the file has them."""
-        if not self.start <= self.position <= self.position + size <= self.start + len(self.window):
-            self.file.seek(self.position)
-            self.window, self.start = self.file.read(max(size, WINDOW)), self.position
-        return self.position - self.start
-
     def read(self, layout: struct.Struct) -> tuple[float, ...]:
-        self._require(layout.size)
-        at = self._at(layout.size)
-        values = layout.unpack_from(self.window, at)
-        self.position += layout.size
-        return values
+        self._take(layout.size)
+        return layout.unpack(self.file.read(layout.size))
 
     def skip(self, size: int) -> None:
-        self._require(size)
-        self.position += size
+        self._take(size)
+        self.file.seek(size, os.SEEK_CUR)
 
-    def _require(self, size: int) -> None:
-        if size > self.size - self.position:
-            raise InputError(
-                f"{self.path}: truncated or corrupt: its {self.size} bytes end inside {self.doing}; "
-                "copy the file again or export the model anew"
-            )
+    def _take(self, size: int) -> None:
+        if size > self.left:
+            raise corrupt(self.path, f"its {self.size} bytes end inside {self.doing}")
+        self.left -= size
 
     def name(self) -> str:
-        start = self._at(min(MAX_NAME_BYTES, self.size - self.position))
-        end = self.window.find(b"\0", start, start + MAX_NAME_BYTES)
-        if end < 0:
+        raw = b"".join(islice(iter(lambda: self.file.read(1), b"\0"), min(MAX_NAME_BYTES, self.left)))
+        if len(raw) == min(MAX_NAME_BYTES, self.left):
             raise corrupt(self.path, f"{self.doing} has a name without an end")
-        raw = self.window[start:end]
-        self.position += len(raw) + 1
+        self.left -= len(raw) + 1
         try:
             return raw.decode("utf-8")
         except UnicodeDecodeError:
             raise corrupt(self.path, f"{self.doing} has the name {raw[:40]!r}, expected UTF-8") from None
 
-    def count(self, what: str, least: int) -> Iterator[int]:
-        """The records that the file says it has, each of at least `least` bytes, in turn."""
-        (count,) = self.read(struct.Struct("<Q"))
-        number = int(count)
-        if number * least > self.size:
-            self.doing = f"the {number} {what}s that its header announces"
-            self.skip(number * least)
+
+def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
+    """The file at each of the records that it says it has, of at least `least` bytes each, in turn."""
+    with open_input(path, EXPECTED) as opened:
+        file = _Binary(path, opened)
+        (number,) = map(int, file.read(COUNT))
+        if number * least > file.size:
+            file.doing = f"the {number} {what}s that its header announces"
+            file.skip(number * least)
         for index in range(number):
-            self.doing = f"{what} {index + 1} of {number}"
-            yield index
-        if self.position != self.size:
-            extra = self.size - self.position
-            raise corrupt(self.path, f"{extra} bytes follow the last of its {number} {what}s")
+            file.doing = f"{what} {index + 1} of {number}"
+            yield file
+        if file.left:
+            raise corrupt(path, f"{file.left} bytes follow the last of its {number} {what}s")
 
 
-def corrupt(path: Path, found: str) -> InputError:
+def corrupt(path: Path, trouble: str) -> InputError:
     """The error for a model's file whose contents cannot be."""
-    return InputError(f"{path}: truncated or corrupt: {found}; copy the file again or export the model anew")
+    return InputError(f"{path}: truncated or corrupt: {trouble}; copy the file again or export the model anew")
 
 
 def _is_model(folder: Path) -> bool:
@@ -232,21 +190,20 @@ def _claimed_images(folder: Path) -> int:
     return sum(1 for _ in _image_lines(path))
 
 
-def _passed_over(folder: Path) -> list[str]:
-    """A warning of edited text that is not read, as a binary file goes before it."""
+def _warn_of_newer_text(folder: Path) -> None:
+    """Warn of edited text that is not read, as a binary file goes before it."""
     edited = []
     for stem in STEMS:
         binary, text = folder / f"{stem}.bin", folder / f"{stem}.txt"
         if is_file(binary) and is_file(text) and text.stat().st_mtime > binary.stat().st_mtime + NEWER:
             edited.append(stem)
-    if not edited:
-        return []
-    read, not_read = (", ".join(stem + extension for stem in edited) for extension in (".bin", ".txt"))
-    return [f"{folder}: {read} is read and not the newer {not_read}; remove what is not meant"]
+    if edited:
+        read, not_read = (", ".join(stem + extension for stem in edited) for extension in (".bin", ".txt"))
+        warn(f"{folder}: {read} is read and not the newer {not_read}; remove what is not meant")
 
 
-def _check_count(path: Path, found: int, heard: list[str]) -> None:
-    """Text that is cut at the end of a line has nothing else that is wrong."""
+def _check_count(path: Path, count: int) -> None:
+    """Warn of text that is cut at the end of a line, which has nothing else that is wrong."""
     if path.suffix != ".txt":
         return
     announced = 0
@@ -254,34 +211,32 @@ def _check_count(path: Path, found: int, heard: list[str]) -> None:
         while (line := file.readline(MAX_NAME_BYTES)).lstrip(b"\xef\xbb\xbf").startswith(b"#"):
             if match := ANNOUNCED.match(line.lstrip(b"\xef\xbb\xbf").decode("utf-8", "replace")):
                 announced = int(match[1])
-    if found < announced:
-        heard.append(f"{path}: its header announces {announced:,}, and it holds {found:,}; is it cut, or edited since?")
+    if count < announced:
+        warn(f"{path}: its header announces {announced:,}, and it holds {count:,}; is it cut, or edited since?")
 
 
-def _read_cameras(folder: Path, heard: list[str]) -> dict[int, Lens]:
+def _read_cameras(folder: Path) -> dict[int, Lens]:
     path = _require(folder, "cameras")
     lenses: dict[int, Lens] = {}
     for key, lens in _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path):
         if key in lenses:
             raise corrupt(path, f"camera {key} is there twice")
         lenses[key] = check_lens(lens, f"{path}: camera {key}")
-    _check_count(path, len(lenses), heard)
+    _check_count(path, len(lenses))
     return lenses
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     layout, known = struct.Struct("<IiQQ"), models()
-    with open_input(path, EXPECTED) as opened:
-        file = _Binary(path, opened)
-        for _ in file.count("camera", layout.size):
-            key, model, width, height = (int(value) for value in file.read(layout))
-            if model not in known:
-                raise InputError(
-                    f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
-                    f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
-                )
-            name, parameters = known[model]
-            yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
+    for file in _records(path, "camera", layout.size):
+        key, model, width, height = (int(value) for value in file.read(layout))
+        if model not in known:
+            raise InputError(
+                f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
+                f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
+            )
+        name, parameters = known[model]
+        yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
@@ -292,9 +247,9 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
         yield _parsed(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse, line.split())
 
 
-def _read_images(folder: Path, lenses: dict[int, Lens], heard: list[str]) -> list[ModelImage]:
+def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
     path = _require(folder, "images")
-    images: dict[str, ModelImage] = {}
+    images: dict[str, PosedImage] = {}
     for name, camera, pose in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
         if camera not in lenses:
             raise corrupt(path, f"image {name[:80]!r} has the camera {camera}, which is not in the model")
@@ -306,23 +261,21 @@ def _read_images(folder: Path, lenses: dict[int, Lens], heard: list[str]) -> lis
         norm = math.hypot(*pose[:4])
         if not (0.5 < norm < 2 and (np.abs(translation) < MAX_NUMBER).all()):
             raise corrupt(path, f"image {name} has the pose {list(pose)}, expected a unit quaternion, finite numbers")
-        images[name] = ModelImage(name, lenses[camera], rotation_from_quaternion(quaternion / norm), translation)
+        images[name] = PosedImage(name, lenses[camera], rotation_from_quaternion(quaternion / norm), translation)
     if not images:
         raise InputError(f"{path}: holds no images, expected at least one")
-    _check_count(path, len(images), heard)
+    _check_count(path, len(images))
     return [images[name] for name in sorted(images)]
 
 
 def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
-    head, count = struct.Struct("<I7dI"), struct.Struct("<Q")
-    with open_input(path, EXPECTED) as opened:
-        file = _Binary(path, opened)
-        for _ in file.count("image", head.size + 1 + count.size):
-            _, *pose, camera = file.read(head)
-            name = file.name()
-            (observations,) = file.read(count)
-            file.skip(int(observations) * OBSERVATION_BYTES)
-            yield name, int(camera), tuple(pose)
+    head = struct.Struct("<I7dI")
+    for file in _records(path, "image", head.size + 1 + COUNT.size):
+        _, *pose, camera = file.read(head)
+        name = file.name()
+        (observations,) = file.read(COUNT)
+        file.skip(int(observations) * OBSERVATION_BYTES)
+        yield name, int(camera), tuple(pose)
 
 
 def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
@@ -357,30 +310,28 @@ def _text_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
         yield _parsed(path, number, expected, parse, line.split(maxsplit=9))
 
 
-def _read_points(folder: Path, heard: list[str]) -> tuple[Float64, Float32]:
+def _read_points(folder: Path) -> tuple[Float64, Float32]:
     path = _require(folder, "points3D")
     values = array("d")  # a list of tuples would take six times the memory
     for row in _binary_points(path) if path.suffix == ".bin" else _text_points(path):
         values.extend(row)
     table = np.frombuffer(values, np.float64).reshape(-1, 6) if values else np.empty((0, 6))
-    _check_count(path, len(table), heard)
+    _check_count(path, len(table))
     near = (np.abs(table[:, :3]) < MAX_NUMBER).all(axis=1)
     good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all(axis=1)
     if not good.all():
         index = int(np.argmin(good))
-        found = f"point {index + 1} of {len(table)} has the position and colour {table[index].tolist()}"
-        raise corrupt(path, f"{found}, expected finite numbers and colours 0 to 255")
+        trouble = f"point {index + 1} of {len(table)} has the position and colour {table[index].tolist()}"
+        raise corrupt(path, f"{trouble}, expected finite numbers and colours 0 to 255")
     return np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3:] / 255, np.float32)
 
 
 def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
     layout = struct.Struct("<Q3d3BdQ")
-    with open_input(path, EXPECTED) as opened:
-        file = _Binary(path, opened)
-        for _ in file.count("point", layout.size):
-            _, *values, _, track = file.read(layout)
-            file.skip(int(track) * TRACK_BYTES)
-            yield tuple(values)
+    for file in _records(path, "point", layout.size):
+        _, *values, _, track = file.read(layout)
+        file.skip(int(track) * TRACK_BYTES)
+        yield tuple(values)
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:

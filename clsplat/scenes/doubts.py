@@ -40,7 +40,7 @@ def of_scene(scene: Scene, background: Background) -> list[str]:
     lenses = absurd([(view.name, view.lens) for view in scene.views])
     looked = spread(scene.train_views, LOOKED_AT)
     pictures = [_pixels(view) for view in looked]
-    found = (
+    doubts = (
         _coincident(scene),
         _principal_points(scene),
         lenses,
@@ -48,7 +48,7 @@ def of_scene(scene: Scene, background: Background) -> list[str]:
         _empty(looked, pictures, background),
         _background(pictures, background),
     )
-    return [text for text in found if text]
+    return [text for text in doubts if text]
 
 
 def of_pictures(

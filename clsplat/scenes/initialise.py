@@ -104,8 +104,7 @@ def mean_squared_distance(points: Float64) -> Float64:
     tree: Any = import_module("scipy.spatial").cKDTree(points)  # scipy has no types
     distances, _ = tree.query(points, k=neighbours + 1)
     # Sorted, so the first is 0: the point itself or one at the same place, which is the same distance.
-    mean: Float64 = np.mean(np.square(distances[:, 1:]), axis=1)
-    return mean
+    return np.asarray(np.mean(np.square(distances[:, 1:]), axis=1))
 
 
 def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Generator) -> tuple[Float64, Float64]:

@@ -100,13 +100,7 @@ class Lens:
 
     def img_from_cam(self, points: Float64) -> Float64:
         """Project points (N, 3) in camera space to pixels (N, 2); NaN where the model has no image of them."""
-        pixels: Float64 = self._camera().img_from_cam(np.ascontiguousarray(points, np.float64))
-        return pixels
-
-    def cam_from_img(self, pixels: Float64) -> Float64:
-        """Rays of pixels (N, 2) as (N, 2), x / z and y / z."""
-        rays: Float64 = self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64))
-        return rays
+        return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))
 
     def _camera(self) -> pycolmap.Camera:
         camera = pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
@@ -138,13 +132,13 @@ def check_lens(lens: Lens, where: str) -> Lens:
 def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
     """A warning of the pictures whose lens bends beyond reason, or nothing. lenses: with the pictures' names."""
     bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
-    found = [(name, lens) for name, lens in lenses if bend[lens]]
-    if not found:
+    bent = [(name, lens) for name, lens in lenses if bend[lens]]
+    if not bent:
         return ""
-    lens = found[0][1]
+    lens = bent[0][1]
     params = " ".join(f"{value:g}" for value in lens.params)
     return (
-        f"the lens of {examples(name for name, _ in found)} bends the picture beyond reason ({lens.model} {params}): "
+        f"the lens of {examples(name for name, _ in bent)} bends the picture beyond reason ({lens.model} {params}): "
         "check its coefficients, and their order"
     )
 

@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -17,17 +17,17 @@ import numpy as np
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, NEARS, Camera
 from clsplat.config.verbs import TEST_EVERY
-from clsplat.errors import InputError, examples, plain
+from clsplat.errors import InputError, examples, plain, warn
 from clsplat.files import digest, short_digest
 from clsplat.images.reading import companions, downscale, find_images, image_size, read_image, require_images
+from clsplat.progress import Progress
 from clsplat.scenes import colmap, transforms
+from clsplat.scenes.data_set import DataSet, PosedImage
 from clsplat.scenes.lens import Lens, undistort
 from clsplat.scenes.sfm import reconstruct
-from clsplat.scenes.transforms import Frame
 
 Kind = Literal["colmap", "blender", "transforms", "photos"]
 Split = Literal["train", "test"]
-Progress = Callable[[str, float | None], None]
 T = TypeVar("T")
 
 MAX_SIZE = 1600
@@ -82,8 +82,8 @@ class View:
     def _read(self) -> Float32:
         image = read_image(self.path, orient=self.upright)
         if image.shape[:2] != (self.lens.height, self.lens.width):
-            found = f"{image.shape[1]} x {image.shape[0]}"
-            raise InputError(f"{self.path}: is {found} pixels now, expected {self.lens.width} x {self.lens.height}")
+            actual = f"{image.shape[1]} x {image.shape[0]}"
+            raise InputError(f"{self.path}: is {actual} pixels now, expected {self.lens.width} x {self.lens.height}")
         return image
 
 
@@ -93,7 +93,7 @@ class Scene:
 
     name: the folder's; views sorted by name; points (N, 3) float64 in the world, N may be 0; point_colors (N, 3)
     float32 in [0, 1]; bounds: corners (low, high), each (3,) float64, world units, of the box for random initial
-    points; warnings: what a user should hear, a line each.
+    points; warnings: for the user, a line each.
     """
 
     name: str
@@ -141,7 +141,7 @@ class Scene:
     def _of_each(self, work: Callable[[View], T]) -> dict[str, T]:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             try:
-                return {view.name: each for view, each in zip(self.views, pool.map(work, self.views), strict=True)}
+                return {view.name: result for view, result in zip(self.views, pool.map(work, self.views), strict=True)}
             finally:
                 pool.shutdown(cancel_futures=True)
 
@@ -160,21 +160,20 @@ class Scene:
         if size == 0 or np.linalg.norm(middle) < FAR * size:
             return np.zeros(3)
         step = 2.0 ** np.ceil(np.log2(size))
-        origin: Float64 = np.round(middle / step) * step
-        return origin
+        return np.asarray(np.round(middle / step) * step)
 
     @cached_property
-    def _spread(self) -> tuple[Float64, float]:
-        """The middle of the training cameras, and how far the farthest is from there."""
+    def _spread(self) -> tuple[Float64, float, float]:
+        """The middle of the training cameras, how far the farthest is from there, and their largest coordinate."""
         centres = np.stack([view.camera.position for view in self.train_views or self.views])
         middle: Float64 = centres.mean(axis=0)
-        return middle, float(np.linalg.norm(centres - middle, axis=1).max())
+        return middle, float(np.linalg.norm(centres - middle, axis=1).max()), float(np.abs(centres).max())
 
-    @cached_property
+    @property
     def in_one_place(self) -> bool:
         """True if all training cameras are in one place, but for rounding."""
-        centres = np.stack([view.camera.position for view in self.train_views or self.views])
-        return self._spread[1] <= ROUNDING * float(np.abs(centres).max())
+        _, spread, largest = self._spread
+        return spread <= ROUNDING * largest
 
     @cached_property
     def extent(self) -> float:
@@ -183,7 +182,7 @@ class Scene:
         If the cameras are all in one place, the median distance of the points from there, or 1 if there are none: it
         scales the learning rates.
         """
-        middle, spread = self._spread
+        middle, spread, _ = self._spread
         if not self.in_one_place:
             return 1.1 * spread
         return (float(np.median(np.linalg.norm(self.points - middle, axis=1))) if len(self.points) else 0.0) or 1.0
@@ -237,7 +236,7 @@ def load_scene(
     size that is wanted.
 
     A folder of photos goes through `clsplat.scenes.sfm` first, into work_dir (NAME_colmap beside it if not given),
-    where a result for the same photos is found again; progress(text, fraction or None) hears of that.
+    where a result for the same photos is found again; progress(text, fraction or None) is called on the way.
 
     Raises InputError naming the file for whatever is wrong with the input: see `detect`, `colmap.read_model` and
     `transforms.read_transforms`; pictures that are listed and missing, or of another size than their camera; pictures
@@ -250,28 +249,30 @@ def load_scene(
     kind = detect(path)
     if images is not None and kind != "colmap":
         raise InputError(f"{path}: is a {kind} scene, a folder of images can be chosen only for a COLMAP one")
-    heard: list[str] = []
-    box = None
     smaller: list[Path] = []
-    if kind in ("blender", "transforms"):
-        data = _read_transforms(path, kind, heard)
-        found, points, colors, box = data.frames, data.points, data.colors, data.box
-    else:
-        model_path = _reconstruct(path, work_dir, progress, heard) if kind == "photos" else path
-        found, points, colors, smaller = _read_colmap(model_path, images, heard)
-    found = sorted(found, key=lambda frame: frame.name)
-    own_split = any(frame.split for frame in found)
-    views = []
-    for index, frame in enumerate(found):
-        held_out = frame.split == "test" if own_split else test_every > 0 and index % test_every == 0
-        views.append(_view(frame, "test" if held_out else "train", resolution, smaller))
-    _warn_of_copies(views, heard)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if kind in ("blender", "transforms"):
+            data = _read_transforms(path, kind)
+        else:
+            folder = path
+            if kind == "photos":
+                photos = path.resolve()
+                folder = reconstruct(photos, work_dir or photos.with_name(f"{photos.name}_colmap"), progress=progress)
+            data, smaller = _read_colmap(folder, images)
+        posed = sorted(data.images, key=lambda image: image.name)
+        own_split = any(image.split for image in posed)
+        views = []
+        for index, image in enumerate(posed):
+            held_out = image.split == "test" if own_split else test_every > 0 and index % test_every == 0
+            views.append(_view(image, "test" if held_out else "train", resolution, smaller))
+        _warn_of_copies(views)
     if kind == "blender":
         bounds = (np.full(3, -BLENDER_CUBE), np.full(3, BLENDER_CUBE))
     else:
-        bounds = camera_bounds([view.camera for view in views], box)
+        bounds = camera_bounds([view.camera for view in views], data.box)
     name = path.resolve().name if path.is_dir() else path.resolve().parent.name
-    return Scene(name, views, points, colors, bounds, [plain(warning) for warning in heard])
+    return Scene(name, views, data.points, data.colors, bounds, [plain(str(warning.message)) for warning in caught])
 
 
 def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = None) -> tuple[Float64, Float64]:
@@ -301,26 +302,13 @@ def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = N
     return low, high
 
 
-def _reconstruct(path: Path, work_dir: Path | None, progress: Progress | None, heard: list[str]) -> Path:
-    path = path.resolve()
-    output = work_dir or path.with_name(f"{path.name}_colmap")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        scene = reconstruct(path, output, progress=progress)
-    heard += [str(warning.message) for warning in caught]
-    return scene
-
-
-def _read_colmap(
-    path: Path, chosen: str | Path | None, heard: list[str]
-) -> tuple[list[Frame], Float64, Float32, list[Path]]:
-    """Frames, points, colours, and the folders of downscaled pictures that may stand in."""
+def _read_colmap(path: Path, chosen: str | Path | None) -> tuple[DataSet, list[Path]]:
+    """The data set, and the folders of downscaled pictures that may stand in."""
     model_path = colmap.find_model(path)
     assert model_path is not None  # detect has found it
     model = colmap.read_model(model_path)
-    heard += model.warnings
     if len(model.points) == 0:
-        heard.append(f"{model_path}: has no points, training starts from random ones")
+        warn(f"{model_path}: has no points, training starts from random ones")
     # The model's own folder may be what was given: then the pictures are beside one of those above it.
     above = [path, *path.resolve().parents[:2]] if model_path == path else [path]
     if chosen is not None:
@@ -335,14 +323,14 @@ def _read_colmap(
     present = find_images(folder)
     if not present:
         raise InputError(f"{folder}: no images found, expected the {len(model.images)} of {model_path}")
-    frames = [Frame(m.name, folder / m.name, m.lens, m.rotation, m.translation) for m in model.images]
-    require_images([frame.path for frame in frames], model_path)
-    _warn_of_unlisted(present, frames, model_path, folder, heard)
+    model.images = [replace(image, path=folder / image.name) for image in model.images]
+    require_images([image.path for image in model.images], model_path)
+    _warn_of_unlisted(present, model, model_path, folder)
     smaller = [] if chosen is not None else [folder.with_name(f"{folder.name}_{factor}") for factor in (2, 4, 8)]
-    return frames, model.points, model.colors, [candidate for candidate in smaller if candidate.is_dir()]
+    return model, [candidate for candidate in smaller if candidate.is_dir()]
 
 
-def _read_transforms(path: Path, kind: Kind, heard: list[str]) -> transforms.Transforms:
+def _read_transforms(path: Path, kind: Kind) -> DataSet:
     folder = path.parent if path.is_file() else path
     if kind == "blender":
         data = transforms.read_blender(folder)
@@ -350,27 +338,24 @@ def _read_transforms(path: Path, kind: Kind, heard: list[str]) -> transforms.Tra
     else:
         listed_in = path if path.is_file() else folder / "transforms.json"
         data = transforms.read_transforms(listed_in)
-    heard += data.warnings
-    parents = {frame.path.parent for frame in data.frames}
+    parents = {image.path.parent for image in data.images}
     present = [file for parent in parents for file in find_images(parent, deep=False)]
-    _warn_of_unlisted(present, data.frames, listed_in, folder, heard)
+    _warn_of_unlisted(present, data, listed_in, folder)
     return data
 
 
-def _warn_of_unlisted(
-    present: list[Path], frames: list[Frame], listed_in: Path, folder: Path, heard: list[str]
-) -> None:
-    listed = {frame.path for frame in frames}
+def _warn_of_unlisted(present: list[Path], data: DataSet, listed_in: Path, folder: Path) -> None:
+    listed = {image.path for image in data.images}
     unlisted = sorted(path for path in present if path not in listed)
     known = companions(unlisted, listed, folder) if unlisted else set()
     if unlisted := [path for path in unlisted if path not in known]:
-        heard.append(
+        warn(
             f"{listed_in}: does not list {len(unlisted):,} image(s) that are there, and they are not used: "
             f"{examples(unlisted)}"
         )
 
 
-def _warn_of_copies(views: list[View], heard: list[str]) -> None:
+def _warn_of_copies(views: list[View]) -> None:
     """A held-out picture that is trained on as well says nothing about how good the model is."""
     by_size: dict[int, list[View]] = {}
     for view in views:
@@ -382,29 +367,29 @@ def _warn_of_copies(views: list[View], heard: list[str]) -> None:
             held_out = [(view.name, trained.get(digest(view.path))) for view in same if view.split == "test"]
             copies += [f"{name} is {other}" for name, other in held_out if other is not None]
     if copies:
-        heard.append(
+        warn(
             f"{len(copies)} of the held-out pictures are trained on too, as copies under another name, so that their "
             f"scores say little: {examples(sorted(copies))}; remove the copies"
         )
 
 
-def _view(frame: Frame, split: Split, resolution: int, smaller: list[Path]) -> View:
-    """The frame at the working size, its header checked."""
-    lens, upright = _fit(frame.path, frame.lens)
-    camera = lens.pinhole(frame.rotation, frame.translation)
+def _view(image: PosedImage, split: Split, resolution: int, smaller: list[Path]) -> View:
+    """The image at the working size, its header checked."""
+    lens, upright = _fit(image.path, image.lens)
+    camera = lens.pinhole(image.rotation, image.translation)
     longest = max(camera.width, camera.height)
     scale = min(1.0, (resolution or MAX_SIZE) / longest)
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    path = frame.path
+    path = image.path
     if scale < 1 and lens.is_pinhole and not upright:
         for folder in smaller:
-            candidate = folder / frame.name
+            candidate = folder / image.name
             if candidate.is_file() and _stands_in(candidate, width, height, lens):
                 path = candidate
                 width, height = image_size(path, orient=False)
                 lens = lens.resized(width, height)
                 break
-    return View(frame.name, camera.resized(width, height), path, split, lens, upright)
+    return View(image.name, camera.resized(width, height), path, split, lens, upright)
 
 
 def _stands_in(path: Path, width: int, height: int, lens: Lens) -> bool:

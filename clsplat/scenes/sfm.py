@@ -14,17 +14,16 @@ import sys
 import tempfile
 import threading
 import time
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, Literal
 
-from clsplat.errors import ClsplatError, InputError, examples
-from clsplat.files import is_file, parse_json, read_document, replace
+from clsplat.errors import ClsplatError, InputError, examples, warn
+from clsplat.files import is_file, replace
 from clsplat.process import apart
+from clsplat.progress import Progress, no_progress
 from clsplat.scenes import sfm_photos
+from clsplat.scenes.transforms import load_document
 
-Progress = Callable[[str, float | None], None]
 Matching = Literal["auto", "exhaustive", "sequential"]
 
 RECORD = "sfm.json"
@@ -32,16 +31,8 @@ RECORD = "sfm.json"
 EXHAUSTIVE_PHOTOS = 100
 """Up to here "auto" matches every pair: the pairs grow with the square, and a CPU does some 50 a second."""
 MINIMUM_PHOTOS = 3
-CAMERA_MODELS = (
-    "auto",
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "OPENCV_FISHEYE",
-)
+CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL",
+                 "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # fmt: skip
 
 # stage of the worker: what the user reads, and the table that grows by a row with each photo or pair
 _STAGES = {
@@ -77,19 +68,19 @@ def reconstruct(
     SIMPLE_RADIAL (one distortion coefficient) for others. shared_camera: see `sfm_photos.camera_groups`.
     max_image_size: pixels, longest side for features alone, the undistorted photos keep their size. threads: all
     cores if None. The same seed gives the same cameras, bit by bit up to 80 photos. overwrite: replace a result of
-    other photos. progress(text, fraction or None) hears of every stage.
+    other photos. progress(text, fraction or None) is called in every stage.
 
     Warns of photos that could not be placed, are of a kind that cannot be read, or lost their alpha. Raises InputError
     for a folder without photos, a photo that does not decode, an output that is something else, and photos that no
     cameras can be recovered from; ClsplatError where pycolmap itself fails. KeyboardInterrupt leaves nothing behind.
     """
-    report = progress or _ignore
+    report = progress or no_progress
     if matching not in ("auto", "exhaustive", "sequential"):
         raise InputError(f"matching {matching!r}: expected auto, exhaustive or sequential")
     if camera_model not in CAMERA_MODELS:
         raise InputError(f"camera model {camera_model!r}: expected one of {', '.join(CAMERA_MODELS)}")
-    found = sfm_photos.find_photos(images, excluded=output)
-    paths = found.photos
+    photo_files = sfm_photos.find_photos(images, excluded=output)
+    paths = photo_files.photos
     settings = f"{matching} {camera_model} {shared_camera} {max_image_size} {max_features} {seed}"
     fingerprint = sfm_photos.fingerprint(images, paths, settings)
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
@@ -98,12 +89,13 @@ def reconstruct(
     if len(paths) < MINIMUM_PHOTOS:
         raise InputError(f"{images}: only {len(paths)} photo(s) found, expected at least {MINIMUM_PHOTOS}")
     for left_out, why in (
-        (found.others, "convert to JPEG, PNG or TIFF first"),
-        (found.broken, "links that lead nowhere"),
-        (found.companions, "by their names masks, depths or the like of other photos"),
+        (photo_files.others, "convert to JPEG, PNG or TIFF first"),
+        (photo_files.broken, "links that lead nowhere"),
+        (photo_files.companions, "by their names masks, depths or the like of other photos"),
     ):
         if left_out:
-            warnings.warn(f"{images}: {_listed(left_out, images)} left out: {why}", stacklevel=2)
+            names = [sfm_photos.photo_name(images, path) for path in left_out]
+            warn(f"{images}: {_listed(names)} left out: {why}")
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -133,12 +125,10 @@ def reconstruct(
         record["files"] = _sizes(work / "result")
         (work / "result" / RECORD).write_bytes((json.dumps(record, indent=2) + "\n").encode())
         if missing:
-            lost = _listed([images / name for name in missing], images)
-            warnings.warn(f"{images}: {lost} could not be placed and will not be used", stacklevel=2)
+            warn(f"{images}: {_listed(missing)} could not be placed and will not be used")
         if cut := _without_their_alpha(photos, result["registered"], work / "result" / "images"):
-            which = _listed([images / name for name in cut], images)
-            message = f"{which} lost their alpha when their lens was undone: the scene's images are opaque there"
-            warnings.warn(f"{images}: {message}", stacklevel=2)
+            loss = "lost their alpha when their lens was undone: the scene's images are opaque there"
+            warn(f"{images}: {_listed(cut)} {loss}")
         _move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -152,30 +142,6 @@ def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], 
     return [name for name in registered if name in transparent and not sfm_photos.has_alpha(result / name)]
 
 
-def _ignore(text: str, fraction: float | None) -> None:
-    """Do nothing: progress that nobody reads."""
-
-
-def unregistered(output: Path) -> list[str]:
-    """Names of the photos that have no camera in a result of `reconstruct`."""
-    names = _record(output).get("unregistered")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise InputError(f"{output / RECORD}: has no list 'unregistered', expected a result of sfm; make it anew")
-    return names
-
-
-def _record(output: Path) -> dict[str, Any]:
-    """The record of what a result was made from. Raises InputError."""
-    path, expected = output / RECORD, "the record of a result of sfm"
-    try:
-        record = parse_json(read_document(path, expected))
-    except ValueError as error:
-        raise InputError(f"{path}: is not JSON ({error}), expected {expected}") from None
-    if not isinstance(record, dict):
-        raise InputError(f"{path}: holds no JSON object, expected {expected}")
-    return record
-
-
 def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: bool) -> bool:
     """True if output is the result wanted. Raises InputError where it is something that must not be replaced."""
     if not output.exists():
@@ -183,7 +149,7 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
     if not output.is_dir():
         raise InputError(f"{output}: is a file, expected a folder for the scene or a new name")
     try:
-        record = _record(output)
+        record = load_document(output / RECORD, "the record of a result of sfm", "its fingerprint")
     except InputError:
         if any(output.iterdir()):
             raise InputError(f"{output}: is not empty and not a result of sfm, expected a new folder") from None
@@ -211,8 +177,8 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
 def _sizes(result: Path) -> dict[str, int]:
     """Bytes of the files of a result, by their names in it."""
     folders = (result / "images", result / "sparse")
-    found = (path for folder in folders for path in folder.rglob("*"))
-    return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(found) if is_file(path)}
+    paths = (path for folder in folders for path in folder.rglob("*"))
+    return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(paths) if is_file(path)}
 
 
 def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:
@@ -246,10 +212,8 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
                 process.stdin.close()
             process.stdout.close()
     if not answer:
-        tail = [line.strip() for line in log_path.read_text("utf-8", errors="replace").splitlines() if line.strip()][
-            -3:
-        ]
-        raise ClsplatError(f"structure from motion failed (status {process.returncode}): {' | '.join(tail)}")
+        lines = [line.strip() for line in log_path.read_text("utf-8", errors="replace").splitlines() if line.strip()]
+        raise ClsplatError(f"structure from motion failed (status {process.returncode}): {' | '.join(lines[-3:])}")
     return answer
 
 
@@ -323,6 +287,6 @@ def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
     )
 
 
-def _listed(paths: list[Path], folder: Path) -> str:
+def _listed(names: list[str]) -> str:
     """A line such as 3 photo(s) (a.jpg, b.jpg, c.jpg), cut where there are many."""
-    return f"{len(paths):,} photo(s) ({examples(sfm_photos.photo_name(folder, path) for path in paths)})"
+    return f"{len(names):,} photo(s) ({examples(names)})"

@@ -45,7 +45,7 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class Found:
+class PhotoFiles:
     """photos in the order of their names, and what is left out: images of kinds that cannot be used, links that lead
     nowhere, and masks, depths and the like that go with photos."""
 
@@ -55,7 +55,7 @@ class Found:
     companions: list[Path]
 
 
-def find_photos(folder: Path, excluded: Path | None = None) -> Found:
+def find_photos(folder: Path, excluded: Path | None = None) -> PhotoFiles:
     """The photos below a folder.
 
     Hidden files and folders are skipped, as is `excluded` (the output, where it lies inside). Raises InputError
@@ -84,13 +84,13 @@ def find_photos(folder: Path, excluded: Path | None = None) -> Found:
                 others.append(here / name)
     if not photos:
         kinds = " ".join(sorted(EXTENSIONS))
-        found = f", only {len(others)} of a kind not supported such as {others[0].name}" if others else ""
-        found += f", only {len(broken)} link(s) that lead nowhere such as {broken[0].name}" if broken else ""
-        raise InputError(f"{folder}: no photos found{found}; expected files ending in {kinds}")
+        unusable = f", only {len(others)} of a kind not supported such as {others[0].name}" if others else ""
+        unusable += f", only {len(broken)} link(s) that lead nowhere such as {broken[0].name}" if broken else ""
+        raise InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
     key = partial(photo_name, folder)
     aside = companions(photos, photos, folder)
     kept = [path for path in photos if path not in aside]
-    return Found(*(sorted(paths, key=key) for paths in (kept, others, broken, aside)))
+    return PhotoFiles(*(sorted(paths, key=key) for paths in (kept, others, broken, aside)))
 
 
 def photo_name(folder: Path, path: Path) -> str:

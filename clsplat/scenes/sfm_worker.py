@@ -18,24 +18,9 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO, TypedDict
+from typing import Any, TextIO
 
 import pycolmap
-
-
-class Task(TypedDict):
-    """The parent's request. photos, work: folders; groups: names of the photos that share a camera."""
-
-    photos: str
-    work: str
-    groups: list[list[str]]
-    sequential: bool
-    camera_model: str
-    max_image_size: int
-    max_features: int
-    threads: int
-    seed: int
-
 
 DETERMINISTIC_PHOTOS = 80
 """Up to here the mapping runs on one thread, which makes it repeat bit by bit and costs little."""
@@ -47,9 +32,10 @@ OVERLAP = 12
 
 
 class Worker:
-    """One reconstruction: each method is a stage, in the order of `run`."""
+    """One reconstruction: each method is a stage, in the order of `run`. task: see `sfm.reconstruct`; photos and work
+    are folders, groups the names of the photos that share a camera."""
 
-    def __init__(self, task: Task, channel: TextIO) -> None:
+    def __init__(self, task: dict[str, Any], channel: TextIO) -> None:
         self.task, self.channel = task, channel
         self.photos, self.work = Path(task["photos"]), Path(task["work"])
         self.database = self.work / "database.db"
@@ -271,7 +257,7 @@ def main() -> None:
     # what native code prints on standard output must not get between our lines
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    task: Task = json.loads(sys.stdin.readline())
+    task = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, args=(sys.stdin,), daemon=True).start()
     pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     Worker(task, channel).run()

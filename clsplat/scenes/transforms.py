@@ -13,18 +13,18 @@ import math
 import os
 import posixpath
 import re
-import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from clsplat.arrays import Float32, Float64
-from clsplat.errors import InputError, examples, plain
+from clsplat.arrays import Float32, Float64, numbers
+from clsplat.errors import InputError, examples, warn
 from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.images.reading import EXTENSIONS, image_size, require_images
 from clsplat.models.formats import ply
+from clsplat.scenes.data_set import MAX_NUMBER, DataSet, PosedImage
 from clsplat.scenes.lens import Lens, absurd, check_lens
 
 DRIVE = re.compile(r"\A[A-Za-z]:/")
@@ -33,8 +33,6 @@ NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 """instant-ngp's defaults: its position is scale times the file's, plus offset."""
 LAST_ROW = 1e-6
 """Most that a pose's last row may differ from 0 0 0 1: products of float32's matrices are that exact."""
-MAX_NUMBER = 1e30
-"""Larger ones are damage; their squares are still finite."""
 PERSPECTIVE = ("", "PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE = ("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 RGB = ("red", "green", "blue")
@@ -44,36 +42,7 @@ some take them before they refine the lens."""
 EXPORT_AGAIN = "export the data set anew or add it"
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One picture of a data set: name, file, lens at the file's listed size, and `cam_from_world`.
-
-    rotation (3, 3), translation (3,), float64; split: "train", "test", or None where the data set has no own split.
-    """
-
-    name: str
-    path: Path
-    lens: Lens
-    rotation: Float64
-    translation: Float64
-    split: str | None = None
-
-
-@dataclass(eq=False)
-class Transforms:
-    """Contents of the files. points (N, 3) and colors (N, 3) in [0, 1] are nerfstudio's sparse points, if any.
-
-    box: instant-ngp's volume, the corners (low, high), world units, or None.
-    """
-
-    frames: list[Frame]
-    points: Float64 = field(default_factory=lambda: np.empty((0, 3)))
-    colors: Float32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
-    box: tuple[Float64, Float64] | None = None
-    warnings: list[str] = field(default_factory=list)
-
-
-def read_transforms(path: Path) -> Transforms:
+def read_transforms(path: Path) -> DataSet:
     """Read one transforms.json.
 
     Intrinsics may stand in the file or in each frame: `fl_x fl_y` or `camera_angle_x camera_angle_y`, `cx cy` (the
@@ -81,37 +50,39 @@ def read_transforms(path: Path) -> Transforms:
     `camera_model` or `is_fisheye`.
     `file_path` is relative to the file, with or without extension. nerfstudio's `ply_file_path` and its
     `train_filenames`, `val_filenames` and `test_filenames` are honoured: what is in the last two, or not in the first,
-    is held out. The result's warnings tell of what is ignored and of what contradicts itself. Raises InputError that
+    is held out. Warns of what is ignored and of what contradicts itself. Raises InputError that
     names the file and the key for JSON that does not parse, a key that is missing or of the wrong kind, and listed
     pictures that are missing.
     """
     document = load_document(path)
     readers = _readers(path, document)
-    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
-    require_images(files, path)
-    frames, heard = _frames(path, readers, files)
-    result = Transforms(frames, warnings=heard)
+    require_images([_find_file(keys) for keys in readers], path)
+    data = DataSet(_images(path, readers))
     if any("mask_path" in keys.frame for keys in readers):
-        result.warnings.append(f"{path}: 'mask_path' is ignored, masks are not supported")
-    result.box = _ngp_box(Keys(path, None, {}, document))
-    _read_points(path, document, result)
-    return result
+        warn(f"{path}: 'mask_path' is ignored, masks are not supported")
+    data.box = _ngp_box(Keys(path, None, {}, document))
+    cloud = document.get("ply_file_path")
+    if isinstance(cloud, str) and cloud:
+        _inside(path.parent, cloud, f"{path}: 'ply_file_path'")
+        file = path.parent / cloud.replace("\\", "/")
+        if is_file(file):
+            data.points, data.colors = read_point_cloud(file)
+        else:
+            warn(f"{path}: its points 'ply_file_path' are missing: {file}; using random ones")
+    return data
 
 
-def read_poses(path: Path, size: tuple[int, int] | None = None) -> list[Frame]:
+def read_poses(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
     """The cameras of a transforms.json alone, in its order.
 
     Its pictures need not be there where the file says `w h`; else, where a picture is missing, too, it counts as one of
     `size`, (width, height). Raises InputError as `read_transforms`; warns of what contradicts itself, and of
     lenses beyond reason.
     """
-    readers = _readers(path, load_document(path))
-    files = [_find_file(path.parent, keys.text("file_path")) for keys in readers]
-    frames, heard = _frames(path, readers, files, size)
-    for text in (*heard, absurd([(frame.name, frame.lens) for frame in frames])):
-        if text:
-            warnings.warn(plain(text), stacklevel=2)
-    return frames
+    images = _images(path, _readers(path, load_document(path)), size)
+    if doubt := absurd([(image.name, image.lens) for image in images]):
+        warn(doubt)
+    return images
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
@@ -124,77 +95,66 @@ def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
     return readers
 
 
-def _frames(
-    path: Path, readers: list[Keys], files: list[Path], size: tuple[int, int] | None = None
-) -> tuple[list[Frame], list[str]]:
-    """The frames, and warnings of what contradicts itself."""
-    frames = []
-    for keys, file in zip(readers, files, strict=True):
-        listed = keys.text("file_path")
+def _images(path: Path, readers: list[Keys], size: tuple[int, int] | None = None) -> list[PosedImage]:
+    """The images. Warns of what contradicts itself."""
+    images: dict[str, PosedImage] = {}
+    for keys in readers:
+        file, listed = _find_file(keys), _plain(keys.text("file_path"))
+        name = listed + file.name[len(PurePosixPath(listed).name) :]  # with the extension of the file
         lens = _lens(keys, file, size)
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
-        name = _plain(listed) + file.name[len(PurePosixPath(_plain(listed)).name) :]  # with the extension found
-        frames.append(Frame(name, file, lens, rotation, translation))
-    seen: set[str] = set()
-    for frame in frames:
-        if frame.name in seen:
-            raise InputError(f"{path}: lists {frame.name} twice, expected each picture once; remove one of the frames")
-        seen.add(frame.name)
-    heard = _contradictions(path, readers, frames)
-    return _split(path, readers, frames, heard), heard
+        if name in images:
+            raise InputError(f"{path}: lists {name} twice, expected each picture once; remove one of the frames")
+        images[name] = PosedImage(name, lens, rotation, translation, file)
+    _warn_of_contradictions(path, readers, list(images.values()))
+    return _split(path, readers, list(images.values()))
 
 
-def _split(path: Path, readers: list[Keys], frames: list[Frame], heard: list[str]) -> list[Frame]:
-    """The frames with nerfstudio's own split, where the file has one."""
-    known = {frame.name: frame.name for frame in frames}
-    known |= {_plain(keys.text("file_path")): frame.name for keys, frame in zip(readers, frames, strict=True)}
+def _split(path: Path, readers: list[Keys], images: list[PosedImage]) -> list[PosedImage]:
+    """The images with nerfstudio's own split, where the file has one."""
+    known = {image.name: image.name for image in images}
+    known |= {_plain(keys.text("file_path")): image.name for keys, image in zip(readers, images, strict=True)}
     listed = []
     for key in ("train_filenames", "test_filenames", "val_filenames"):
         names = readers[0].document.get(key) or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError(f"{path}: '{key}' is {short(names)}, expected a list of file names; correct or remove it")
         if lost := [name for name in names if _plain(name) not in known]:
-            heard.append(f"{path}: '{key}' lists {examples(lost)}, and no frame has that as its 'file_path'")
+            warn(f"{path}: '{key}' lists {examples(lost)}, and no frame has that as its 'file_path'")
         listed.append({known[_plain(name)] for name in names if _plain(name) in known})
     train, held_out = listed[0], listed[1] | listed[2]
     if not (train or held_out):
-        return frames
+        return images
     trained = (train or set(known.values())) - held_out
     if not trained:
         raise InputError(
-            f"{path}: 'test_filenames' and 'val_filenames' hold out all {len(frames)} pictures, expected some to train "
+            f"{path}: 'test_filenames' and 'val_filenames' hold out all {len(images)} pictures, expected some to train "
             "on; remove these keys for a split of --test-every"
         )
-    return [replace(frame, split="train" if frame.name in trained else "test") for frame in frames]
+    return [replace(image, split="train" if image.name in trained else "test") for image in images]
 
 
-def _contradictions(path: Path, readers: list[Keys], frames: list[Frame]) -> list[str]:
-    heard = []
+def _warn_of_contradictions(path: Path, readers: list[Keys], images: list[PosedImage]) -> None:
     for axis in "xy":
         focal, angle = f"fl_{axis}", f"camera_angle_{axis}"
-        found = []
-        for keys, frame in zip(readers, frames, strict=True):
+        contradictions = []
+        for keys, image in zip(readers, images, strict=True):
             used, other = keys.number(focal), keys.get(angle)
             # one of the frame goes before one of the file, which is of other frames then
             alike = (keys.frame.get(focal) is None) == (keys.frame.get(angle) is None)
             if used and alike and isinstance(other, int | float) and 0 < other < math.pi:
-                size = frame.lens.width if axis == "x" else frame.lens.height
+                size = image.lens.width if axis == "x" else image.lens.height
                 meant = 0.5 * size / math.tan(0.5 * other)
                 if abs(used / meant - 1) > AGREE:
-                    found.append(f"{frame.name} ({used:g}, not {meant:.4g})")
-        if found:
-            heard.append(f"{path}: '{focal}' is used, '{angle}' says otherwise of {examples(found)}")
-    if any(_shutter(keys.get("rolling_shutter")) for keys in readers):
-        heard.append(f"{path}: 'rolling_shutter' is ignored, pictures are taken as exposed at once")
-    return heard
+                    contradictions.append(f"{image.name} ({used:g}, not {meant:.4g})")
+        if contradictions:
+            warn(f"{path}: '{focal}' is used, '{angle}' says otherwise of {examples(contradictions)}")
+    shutters = [keys.get("rolling_shutter") for keys in readers]
+    if any(any(value) if isinstance(value, list) else value for value in shutters):
+        warn(f"{path}: 'rolling_shutter' is ignored, pictures are taken as exposed at once")
 
 
-def _shutter(value: object) -> bool:
-    """True if a rolling shutter does anything."""
-    return any(value) if isinstance(value, list) else bool(value)
-
-
-def read_blender(folder: Path) -> Transforms:
+def read_blender(folder: Path) -> DataSet:
     """Read transforms_train.json and, if there, transforms_test.json, the data set's own split (val is left out).
 
     Raises InputError as `read_transforms`.
@@ -204,14 +164,12 @@ def read_blender(folder: Path) -> Transforms:
     if not held_out.is_file():
         return train
     test = read_transforms(held_out)
-    frames = []
-    for split, part in (("train", train), ("test", test)):
-        frames += [Frame(f.name, f.path, f.lens, f.rotation, f.translation, split) for f in part.frames]
-    names = {frame.name for frame in train.frames}
-    for frame in test.frames:
-        if frame.name in names:
-            raise InputError(f"{held_out}: lists {frame.name}, which is a training picture too; remove one of them")
-    return Transforms(frames, train.points, train.colors, train.box, train.warnings + test.warnings)
+    names = {image.name for image in train.images}
+    for image in test.images:
+        if image.name in names:
+            raise InputError(f"{held_out}: lists {image.name}, which is a training picture too; remove one of them")
+    images = [replace(image, split="train") for image in train.images]
+    return replace(train, images=images + [replace(image, split="test") for image in test.images])
 
 
 class Keys:
@@ -228,8 +186,8 @@ class Keys:
     def text(self, key: str) -> str:
         value = self.get(key)
         if not isinstance(value, str) or not value.strip():
-            found = f"has no '{key}'" if value is None else f"'{key}' is {short(value)}, expected text"
-            raise InputError(f"{self.where}: {found}; {EXPORT_AGAIN}")
+            trouble = f"has no '{key}'" if value is None else f"'{key}' is {short(value)}, expected text"
+            raise InputError(f"{self.where}: {trouble}; {EXPORT_AGAIN}")
         return value
 
     def number(self, key: str) -> float | None:
@@ -273,9 +231,9 @@ def _plain(listed: str) -> str:
     return "/".join(part for part in text.split("/") if part not in ("", ".", ".."))
 
 
-def _find_file(folder: Path, listed: str) -> Path:
+def _find_file(keys: Keys) -> Path:
     """The picture; one that does not exist is returned as it is listed."""
-    path = Path(os.path.normpath(folder / listed.replace("\\", "/")))
+    path = Path(os.path.normpath(keys.path.parent / keys.text("file_path").replace("\\", "/")))
     if is_file(path) or not path.name:
         return path
     for extension in (*EXTENSIONS, *(extension.upper() for extension in EXTENSIONS)):
@@ -305,15 +263,15 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
                     f"{keys.where}: has no 'w' and 'h', nor is its picture there: {file}; give both --width and "
                     "--height"
                 )
-            found = size
+            actual = size
         else:
-            found = image_size(file, orient=False)
+            actual = image_size(file, orient=False)
         if width is not None:  # the other one in the picture's proportions
-            height = width * found[1] / found[0]
+            height = width * actual[1] / actual[0]
         elif height is not None:
-            width = height * found[0] / found[1]
+            width = height * actual[0] / actual[1]
         else:
-            width, height = found
+            width, height = actual
     assert height is not None
     fx = _focal(keys, "fl_x", "camera_angle_x", width)
     fy = _focal(keys, "fl_y", "camera_angle_y", height)
@@ -367,17 +325,6 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
     return "OPENCV", [k1, k2, p1, p2]
 
 
-def numbers(given: Any) -> Float64:
-    """An array of a list of numbers, or of lists of them; (0,) for what is none. True and false are no numbers."""
-    rows = given if isinstance(given, list) else []
-    if any(isinstance(each, bool) for row in rows for each in (row if isinstance(row, list) else [row])):
-        return np.empty(0)
-    try:
-        return np.array(given, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return np.empty(0)
-
-
 def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64, float]:
     """`cam_from_world` rotation (3, 3) and translation (3,), and the scale that was in it, of a `world_from_cam` matrix
     (4, 4) or (3, 4) in OpenGL's axes. Raises InputError, about `what` in `where`, for what is no pose."""
@@ -422,18 +369,6 @@ def _ngp_box(keys: Keys) -> tuple[Float64, Float64] | None:
     return (0.5 - side / 2 - shift) / factor, (0.5 + side / 2 - shift) / factor
 
 
-def _read_points(path: Path, document: dict[str, Any], result: Transforms) -> None:
-    listed = document.get("ply_file_path")
-    if not isinstance(listed, str) or not listed:
-        return
-    _inside(path.parent, listed, f"{path}: 'ply_file_path'")
-    cloud = path.parent / listed.replace("\\", "/")
-    if is_file(cloud):
-        result.points, result.colors = read_point_cloud(cloud)
-    else:
-        result.warnings.append(f"{path}: its points 'ply_file_path' are missing: {cloud}; using random ones")
-
-
 def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
     """Positions (N, 3) float64 and colours (N, 3) float32 in [0, 1] of a PLY, grey where it has no colours.
 
@@ -449,7 +384,7 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
         coloured = all(name in kinds for name in RGB)
         parts: list[tuple[Float64, Float32]] = [(np.empty((0, 3)), np.empty((0, 3), np.float32))]
-        for block in ply.read_vertices(file, header, path, "point"):
+        for block in ply.read_vertices(file, header, "point"):
             points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
             colors: Float32 = np.full(points.shape, 0.5, np.float32)
             if coloured:

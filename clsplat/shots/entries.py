@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.arrays import Float64
+from clsplat.arrays import Float64, numbers
 from clsplat.camera import Projection, focal_length
 from clsplat.errors import InputError
 from clsplat.scenes.lens import MAX_SIZE
-from clsplat.scenes.transforms import Keys, numbers, short
+from clsplat.scenes.transforms import Keys, short
 from clsplat.shots.shot import MOST_FRAMES
 
 

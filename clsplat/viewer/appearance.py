@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import steps_of
+from clsplat.models.edit import take
 
 Image = NDArray[np.uint8]
 Mode = Literal["colour", "depth", "alpha", "count"]
@@ -72,21 +73,20 @@ def _within(value: Any, low: float, high: float, usual: float) -> float:
 
 def edited(gaussians: Gaussians, look: Look) -> Gaussians:
     """The model as it is looked at. What does not change is shared with the one given."""
-    found = replace(gaussians)
+    model = replace(gaussians)
     if look.degree < gaussians.sh_degree:
-        found.sh = np.ascontiguousarray(gaussians.sh[:, : (look.degree + 1) ** 2])
+        model.sh = np.ascontiguousarray(gaussians.sh[:, : (look.degree + 1) ** 2])
     if look.size != 1:
-        found.log_scales = gaussians.log_scales + np.float32(math.log(look.size))
+        model.log_scales = gaussians.log_scales + np.float32(math.log(look.size))
     if look.opacity != 1:
         opacity = look.opacity / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
         opacity = np.clip(opacity, 1e-6, LARGEST_OPACITY)
-        found.opacity_logits = np.log(opacity / (1 - opacity)).astype(np.float32)
+        model.opacity_logits = np.log(opacity / (1 - opacity)).astype(np.float32)
     if look.crop is not None:
         low, high = (np.array(corner) - gaussians.origin for corner in (look.crop[:3], look.crop[3:]))
         inside = np.flatnonzero(((gaussians.means >= low) & (gaussians.means <= high)).all(axis=1))
-        for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
-            setattr(found, name, getattr(found, name)[inside])
-    return found
+        model = take(model, inside)
+    return model
 
 
 def colour_picture(image: Float32) -> Image:
@@ -123,5 +123,4 @@ def _shaded(shade: NDArray[np.float64], alpha: Float32 | None) -> Image:
     colours = table[np.rint(255 * at).astype(np.intp)]
     if alpha is not None:
         colours = colours * np.clip(alpha, 0, 1)[:, :, None]
-    shaded: Image = np.rint(colours).astype(np.uint8)
-    return shaded
+    return np.asarray(np.rint(colours).astype(np.uint8))

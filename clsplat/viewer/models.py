@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
 
 from clsplat.camera import Camera
 from clsplat.config.presets import PRESETS
@@ -31,18 +30,6 @@ FEATURES = 3
 """Floats of a Gaussian, at least, that go into channels beside colour."""
 
 
-class Model(Protocol):
-    """version: counts its changes; pixels: the most a picture on a page may have."""
-
-    @property
-    def version(self) -> int: ...
-    @property
-    def pixels(self) -> int: ...
-    def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        """The picture (H, W, 3) uint8, and a remark on it. Raises CapacityError and InputError."""
-        ...
-
-
 def draft(config: RasterizerConfig) -> RasterizerConfig:
     """Settings for pictures in motion: approximate where that is quick, of the same SH."""
     fast = PRESETS["fast"]
@@ -57,6 +44,7 @@ class HeldModel:
     """A model from a file. The device holds it as it is, and with the changes of the last look."""
 
     version = 0
+    """Counts the model's changes."""
 
     def __init__(
         self, gaussians: Gaussians, device: Device, config: RasterizerConfig, background: Sequence[float]
@@ -67,11 +55,11 @@ class HeldModel:
 
     @property
     def pixels(self) -> int:
-        """See `Model`."""
+        """The most that a picture on a page may have."""
         return min(MOST_PIXELS, frame_pixels(self.device, FEATURES))
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        """See `Model`."""
+        """The picture (H, W, 3) uint8, and a remark on it. Raises CapacityError and InputError."""
         key = look.changes(self.gaussians.sh_degree)
         try:
             return self._picture(key, camera, look, exact=exact)
@@ -80,7 +68,11 @@ class HeldModel:
             return self._picture(key, camera, look, exact=exact)
 
     def _picture(self, key: Look | None, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        gaussians, renderers = self._held.pop(key) if key in self._held else (self._made(key), {})
+        gaussians, renderers = (
+            self._held.pop(key)
+            if key in self._held
+            else (self.gaussians if key is None else edited(self.gaussians, key), {})
+        )
         while len(self._held) >= HELD:
             del self._held[next(iter(self._held))]
         self._held[key] = (gaussians, renderers)  # the latest is the last
@@ -88,9 +80,6 @@ class HeldModel:
         if renderer is None:
             renderer = renderers[exact] = Renderer(self.device, self._rasterizers[exact])
         return render_picture(renderer, gaussians, camera, look, self.background)
-
-    def _made(self, key: Look | None) -> Gaussians:
-        return self.gaussians if key is None else edited(self.gaussians, key)
 
 
 class LiveModel:
@@ -105,16 +94,16 @@ class LiveModel:
 
     @property
     def version(self) -> int:
-        """See `Model`; here the step."""
+        """The step."""
         return self.trainer.step
 
     @property
     def pixels(self) -> int:
-        """See `Model`; here what training has memory for."""
+        """The most that training has memory for."""
         return max(view.camera.width * view.camera.height for view in self.trainer.views)
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
-        """See `Model`. Raises InputError for what needs more memory than a limited training leaves."""
+        """The picture, and a remark on it. Raises InputError where a limited training leaves too little memory."""
         trainer = self.trainer
         degree = round(trainer.parameters.coefficients**0.5) - 1
         key = look.changes(degree)
@@ -131,10 +120,13 @@ class LiveModel:
         return render_picture(self._other, self._edited[1], camera, look, self.background)
 
 
+Model = HeldModel | LiveModel
+
+
 def render_picture(
     renderer: Renderer, model: Gaussians | AnyGaussians, camera: Camera, look: Look, background: Sequence[float]
 ) -> tuple[Image, str]:
-    """The result of `Model.picture`, for a model or the part of it that is on the device."""
+    """The result of `picture`, for a model or the part of it that is on the device."""
     if isinstance(model, Gaussians) and not len(model):
         raise InputError("nothing of the model is left: the crop box holds no Gaussian")
     if look.mode in ("depth", "count"):

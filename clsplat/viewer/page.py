@@ -16,7 +16,7 @@ from clsplat.errors import ClsplatError, InputError, plain
 from clsplat.rotations import quaternion_of
 from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
 from clsplat.viewer.path_recorder import FPS, Recorder, save_path
-from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS
+from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose
 from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
 
@@ -41,14 +41,14 @@ class ViserPage:
 
     def __init__(self, client: Any, viewing: Viewing, world: World, paths: Path | None) -> None:
         self.client, self.viewing, self.world, self.paths = client, viewing, world, paths
-        self.key: int = client.client_id
         self.recorder = Recorder()
         self._status: Any = None
         self._shown = 0
         self._drawing, self._drawn = 0, threading.Lock()
+        self.viewer = viewing.join(self)
 
     def show(self, image: Image, level: Level, text: str) -> None:
-        """See `scheduler.Page`."""
+        """Show a picture (H, W, 3), with a remark on it."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
         if self._shown == 2:  # controls keep a browser busy: they may not come before the first picture
@@ -58,7 +58,7 @@ class ViserPage:
             self._say(", ".join(filter(None, (f"{width} x {height}, exact", text))))
 
     def tell(self, message: str) -> None:
-        """See `scheduler.Page`."""
+        """Show the reason that there is no picture."""
         self._build()
         self.client.add_notification("clsplat", plain(message), auto_close_seconds=10.0)
         self._say(plain(message))
@@ -101,7 +101,7 @@ class ViserPage:
         async def changed(_: Any) -> None:
             box = [[side.value[0] for side in sides], [side.value[1] for side in sides]] if crop.value else None
             look = read_look(mode.value, degree.value, size.value, opacity.value, box)
-            self.viewing.looks(self.key, look)
+            self.viewing.looks(self.viewer, look)
             self._draw_box(look)
 
         for control in (mode, degree, size, opacity, crop, *sides):
@@ -142,30 +142,22 @@ class ViserPage:
             self.client.scene.add_frame(name, show_axes=False)
 
     def _add_camera(self, index: int, view: View, *, photo: bool) -> None:
-        camera, start = view.camera, self.world.start
+        camera = view.camera
         if camera.projection != "perspective":
             return
         fov = 2 * math.atan2(0.5 * camera.height, camera.fy)
-        handle = self.client.scene.add_camera_frustum(
-            f"/cameras/{index}",
-            fov,
-            camera.width / camera.height,
-            scale=FRUSTUM * float(np.linalg.norm(start.position - start.target)),
-            color=CAMERA_COLOURS[view.split],
-            image=thumbnail(view) if photo else None,
-            wxyz=quaternion_of(camera.rotation.T),
-            position=camera.position - self.world.origin,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        pose = Pose(camera.rotation.T, camera.position, fov, camera.width, camera.height)
+        image = thumbnail(view) if photo else None
+        shadows = {"cast_shadow": False, "receive_shadow": False}
+        handle = self._add_frustum(f"/cameras/{index}", pose, view.split, image=image, **shadows)
 
         async def clicked(_: Any) -> None:
-            own = self.client.camera
-            ahead = float(np.linalg.norm(own.look_at - own.position))
+            viewpoint = self.client.camera
+            ahead = float(np.linalg.norm(viewpoint.look_at - viewpoint.position))
             with self.client.atomic():
-                own.position = camera.position - self.world.origin
-                own.look_at = camera.position - self.world.origin + ahead * camera.rotation[2]
-                own.fov = fov
+                viewpoint.position = camera.position - self.world.origin
+                viewpoint.look_at = camera.position - self.world.origin + ahead * camera.rotation[2]
+                viewpoint.fov = fov
 
         handle.on_click(clicked)
 
@@ -184,19 +176,19 @@ class ViserPage:
             count.content = f"{keys or 'no'} key{'' if keys == 1 else 's'}"
 
         async def added(_: Any) -> None:
-            pose = self.viewing.pose(self.key)
+            pose = self.viewer.pose
             if pose is not None:
                 self._attempt(lambda: self.recorder.add(pose))
                 self._draw_key(len(self.recorder.keys) - 1)
             counted()
 
         async def removed(_: Any) -> None:
-            self.recorder.remove_last()
+            del self.recorder.keys[-1:]
             self.client.scene.remove_by_name(f"/keys/{len(self.recorder.keys)}")
             counted()
 
         async def cleared(_: Any) -> None:
-            self.recorder.clear()
+            self.recorder.keys.clear()
             self._clear("/keys")
             counted()
 
@@ -224,17 +216,22 @@ class ViserPage:
             save.on_click(saved)
 
     def _draw_key(self, index: int) -> None:
-        pose, start = self.recorder.keys[index], self.world.start
-        self.client.scene.add_camera_frustum(
-            f"/keys/{index}",
+        # thin lines: where the camera still stands, it would frame the page
+        pose, lines = self.recorder.keys[index], {"thickness": 2.0, "thickness_units": "screen"}
+        self._add_frustum(f"/keys/{index}", pose, "key", **lines)
+
+    def _add_frustum(self, name: str, pose: Pose, kind: str, **options: Any) -> Any:
+        """Draw a camera of a kind of CAMERA_COLOURS."""
+        start = self.world.start
+        return self.client.scene.add_camera_frustum(
+            name,
             pose.fov,
             pose.width / pose.height,
             scale=FRUSTUM * float(np.linalg.norm(start.position - start.target)),
-            color=CAMERA_COLOURS["key"],
+            color=CAMERA_COLOURS[kind],
             wxyz=quaternion_of(pose.rotation),
             position=pose.position - self.world.origin,
-            thickness=2.0,
-            thickness_units="screen",  # where the camera still stands, it would frame the page
+            **options,
         )
 
     def _add_screenshot(self, gui: Any) -> None:
@@ -243,7 +240,7 @@ class ViserPage:
 
         async def taken(_: Any) -> None:
             size = (int(width.value), int(height.value))
-            self.viewing.ask(self.key, lambda model: self.screenshot(model, size))
+            self.viewing.ask(self.viewer, lambda model: self.screenshot(model, size))
 
         take.on_click(taken)
 
@@ -253,13 +250,13 @@ class ViserPage:
 
     def screenshot(self, model: Model, size: tuple[int, int]) -> None:
         """Send an exact picture of this size, as `clsplat render` would make it. Raises InputError."""
-        pose = self.viewing.pose(self.key)
+        pose = self.viewer.pose
         if pose is None:
             return
         width, height = size
         if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and width * height <= 4 * MOST_PIXELS):
             raise InputError(f"a screenshot of {width} x {height}: expected at most {4 * MOST_PIXELS:,} pixels")
-        image, _ = model.picture(pose.camera(width, height), self.viewing.look(self.key), exact=True)
+        image, _ = model.picture(pose.camera(width, height), self.viewer.look, exact=True)
         self.client.send_file_download("screenshot.png", png(image), save_immediately=True)
 
     def _attempt(self, action: Any) -> None:
@@ -276,8 +273,7 @@ def png(image: Image) -> bytes:
     """The file."""
     import imageio.v3 as iio
 
-    data: bytes = iio.imwrite("<bytes>", image, extension=".png")
-    return data
+    return iio.imwrite("<bytes>", image, extension=".png")
 
 
 @cache

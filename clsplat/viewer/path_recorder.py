@@ -30,15 +30,6 @@ class Recorder:
             raise InputError(f"there are {MOST_KEYS:,} key frames already")
         self.keys.append(pose)
 
-    def remove_last(self) -> None:
-        """Nothing where there is none."""
-        if self.keys:
-            self.keys.pop()
-
-    def clear(self) -> None:
-        """Begin anew."""
-        self.keys.clear()
-
     def document(self, size: tuple[int, int], *, apart: float = 2.0, fps: float = FPS, loop: bool = False) -> str:
         """The file. size: width, height of its pictures; apart: seconds from key to key, brought to whole frames; loop:
         after the last the first comes again. Raises InputError for no keys, and for numbers that make no path."""
@@ -50,10 +41,10 @@ class Recorder:
         if not (math.isfinite(apart) and math.isfinite(fps) and 0 < fps <= 1000 and 0 < apart <= 3600):
             raise InputError(f"{apart} seconds at {fps} frames a second: expected up to 3600 and up to 1000")
         step = max(round(apart * fps), 1)
-        found: dict[str, Any] = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
+        contents: dict[str, Any] = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
         if loop and len(self.keys) > 1:
-            found["loop_frames"] = step * len(self.keys)
-        found["keys"] = [
+            contents["loop_frames"] = step * len(self.keys)
+        contents["keys"] = [
             {
                 "frame": 1 + step * index,
                 "position": [float(value) for value in pose.position],
@@ -62,7 +53,7 @@ class Recorder:
             }
             for index, pose in enumerate(self.keys)
         ]
-        return json.dumps(found, indent=2) + "\n"
+        return json.dumps(contents, indent=2) + "\n"
 
 
 def save_path(folder: Path, document: str) -> Path:

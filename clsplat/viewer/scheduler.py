@@ -11,38 +11,27 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from clsplat.errors import ClsplatError
-from clsplat.viewer.appearance import Image, Look
+from clsplat.viewer.appearance import Look
 from clsplat.viewer.pose import Pose, fitted
 from clsplat.viewer.refinement import Level, Refinement, Share
 
 if TYPE_CHECKING:
     from clsplat.viewer.models import Model
-
-
-class Page(Protocol):
-    """The page of a viewer."""
-
-    def show(self, image: Image, level: Level, text: str) -> None:
-        """Show a picture (H, W, 3), with a remark on it."""
-        ...
-
-    def tell(self, message: str) -> None:
-        """Show the reason that there is no picture."""
-        ...
+    from clsplat.viewer.page import ViserPage
 
 
 @dataclass(eq=False)
-class Watcher:
-    """One viewer: page, refinement, look and pose."""
+class Viewer:
+    """One viewer: page, refinement, look and pose; trouble: the message that the page has shown last."""
 
-    page: Page
+    page: ViserPage
     refinement: Refinement
     look: Look = field(default_factory=Look)
     pose: Pose | None = None
-    told: str = ""
+    trouble: str = ""
 
 
 class Viewing:
@@ -50,57 +39,47 @@ class Viewing:
 
     def __init__(self, model: Model | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
         self.model, self.clock = model, clock
-        self._watchers: dict[int, Watcher] = {}
-        self._jobs: deque[tuple[int, Callable[[Model], None]]] = deque()
+        self._viewers: list[Viewer] = []
+        self._jobs: deque[tuple[Viewer, Callable[[Model], None]]] = deque()
         self._news = threading.Condition()
-        self._told = False
+        self._is_news = False
 
     def __len__(self) -> int:
-        return len(self._watchers)
+        return len(self._viewers)
 
-    def join(self, key: int, page: Page) -> None:
+    def join(self, page: ViserPage) -> Viewer:
         """Take in a viewer that has opened a page."""
+        viewer = Viewer(page, Refinement(self.clock()))
         with self._news:
-            self._watchers[key] = Watcher(page, Refinement(self.clock()))
+            self._viewers.append(viewer)
+        return viewer
 
-    def leave(self, key: int) -> None:
+    def leave(self, viewer: Viewer) -> None:
         """Drop a viewer whose page is closed."""
         with self._news:
-            self._watchers.pop(key, None)
+            self._viewers.remove(viewer)
 
-    def pose(self, key: int) -> Pose | None:
-        """The viewer's pose, None if there is none."""
-        watcher = self._watchers.get(key)
-        return watcher.pose if watcher else None
-
-    def look(self, key: int) -> Look:
-        """The viewer's look at the model."""
-        watcher = self._watchers.get(key)
-        return watcher.look if watcher else Look()
-
-    def moved(self, key: int, pose: Pose) -> None:
+    def moved(self, viewer: Viewer, pose: Pose) -> None:
         """Take the viewer's pose, a new one or once more the same."""
         with self._news:
-            watcher = self._watchers.get(key)
-            if watcher is not None and not pose.same(watcher.pose):
-                first, watcher.pose = watcher.pose is None, pose
-                if first:
-                    self._wake()
-                else:
-                    self._changed(watcher)
+            if not pose.same(viewer.pose):
+                if viewer.pose is not None:
+                    viewer.refinement.changed(self.clock())
+                viewer.pose = pose
+                self._wake()
 
-    def looks(self, key: int, look: Look) -> None:
+    def looks(self, viewer: Viewer, look: Look) -> None:
         """Take the viewer's look at the model."""
         with self._news:
-            watcher = self._watchers.get(key)
-            if watcher is not None and look != watcher.look:
-                watcher.look = look
-                self._changed(watcher)
+            if look != viewer.look:
+                viewer.look = look
+                viewer.refinement.changed(self.clock())
+                self._wake()
 
-    def ask(self, key: int, job: Callable[[Model], None]) -> None:
-        """Have something done in the device's thread. ClsplatError and OSError are told to them."""
+    def ask(self, viewer: Viewer, job: Callable[[Model], None]) -> None:
+        """Have something done in the device's thread. The page tells of its ClsplatError or OSError."""
         with self._news:
-            self._jobs.append((key, job))
+            self._jobs.append((viewer, job))
             self._wake()
 
     def wake(self) -> None:
@@ -111,76 +90,70 @@ class Viewing:
     def wait(self, most: float) -> None:
         """Wait until there may be something to do, for at most `most` seconds."""
         with self._news:
-            if self._told:
-                self._told = False
+            if self._is_news:
+                self._is_news = False
                 return
             now = self.clock()
             version = self.model.version if self.model else 0
-            waits = [each.refinement.wait(now, version) for each in self._watchers.values() if each.pose is not None]
+            waits = [viewer.refinement.wait(now, version) for viewer in self._viewers if viewer.pose is not None]
             self._news.wait(min([most, *(seconds for seconds in waits if seconds is not None)]))
-            self._told = False
+            self._is_news = False
 
     def work(self, share: Share | None = None) -> bool:
         """Do one thing, if there is one: a job, or the picture of the one whose turn it is. share: of a training, which
         must not be exceeded. Whether something was done."""
-        if not self._watchers and not self._jobs:
+        if not self._viewers and not self._jobs:
             return False
         model = self.model
         if model is None:
             return False
         with self._news:
-            self._told = False
+            self._is_news = False
             job = self._jobs.popleft() if self._jobs else None
             turn = None if job else self._turn(model.version, share)
-            begun = turn[1].refinement.begun() if turn else 0
+            begun = turn[0].refinement.begun() if turn else 0
         if job:
             self._do(*job, model)
         elif turn:
             self._show(*turn, begun, model, share)
         return bool(job or turn)
 
-    def _turn(self, version: int, share: Share | None) -> tuple[int, Watcher, Level] | None:
-        """The viewer that has waited longest of those for which a picture is due, with its key and the picture's
-        level."""
+    def _turn(self, version: int, share: Share | None) -> tuple[Viewer, Level] | None:
+        """The viewer that has waited longest of those for which a picture is due, with the picture's level."""
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):
             return None
-        for key, each in sorted(self._watchers.items(), key=lambda item: item[1].refinement.served):
-            level = each.refinement.due(now, version) if each.pose is not None else None
-            if level is not None and (share is None or share.ready(now, moving=each.refinement.moving)):
-                return key, each, level
+        for viewer in sorted(self._viewers, key=lambda viewer: viewer.refinement.served):
+            level = viewer.refinement.due(now, version) if viewer.pose is not None else None
+            if level is not None and (share is None or share.ready(now, moving=viewer.refinement.moving)):
+                return viewer, level
         return None
 
-    def _show(self, key: int, watcher: Watcher, level: Level, begun: int, model: Model, share: Share | None) -> None:
-        start, version, pose, look = self.clock(), model.version, watcher.pose, watcher.look
+    def _show(self, viewer: Viewer, level: Level, begun: int, model: Model, share: Share | None) -> None:
+        start, version, pose, look = self.clock(), model.version, viewer.pose, viewer.look
         assert pose is not None, "only a viewer with a pose has a turn"
         camera = pose.camera().resized(*fitted(pose.width, pose.height, level.scale, model.pixels))
         try:
             image, text = model.picture(camera, look, exact=level.exact)
-            if key in self._watchers:
-                watcher.page.show(image, level, text)
-            watcher.told = ""
+            if viewer in self._viewers:
+                viewer.page.show(image, level, text)
+            viewer.trouble = ""
         except ClsplatError as error:
-            if watcher.told != str(error):  # once is enough
-                watcher.page.tell(str(error))
-            watcher.told = str(error)
+            if viewer.trouble != str(error):  # once is enough
+                viewer.page.tell(str(error))
+            viewer.trouble = str(error)
         now = self.clock()
-        watcher.refinement.shown(begun, level, now - start, now, version)
+        viewer.refinement.shown(begun, level, now - start, now, version)
         if share is not None:
             share.spent(now, now - start)
 
-    def _do(self, key: int, job: Callable[[Model], None], model: Model) -> None:
-        watcher = self._watchers.get(key)
+    def _do(self, viewer: Viewer, job: Callable[[Model], None], model: Model) -> None:
         try:
             job(model)
         except (ClsplatError, OSError) as error:
-            if watcher is not None:
-                watcher.page.tell(str(error))
-
-    def _changed(self, watcher: Watcher) -> None:
-        watcher.refinement.changed(self.clock())
-        self._wake()
+            if viewer in self._viewers:
+                viewer.page.tell(str(error))
 
     def _wake(self) -> None:
-        self._told = True
+        self._is_news = True
         self._news.notify_all()

@@ -29,7 +29,7 @@ from clsplat.config.verbs import HOST, PORT
 from clsplat.errors import InputError, plain
 from clsplat.viewer.page import ViserPage
 from clsplat.viewer.pose import Start, read_pose
-from clsplat.viewer.scheduler import Viewing
+from clsplat.viewer.scheduler import Viewer, Viewing
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import View
@@ -70,8 +70,8 @@ class Address:
         if self.paths is not None and not self.paths.is_dir():
             raise InputError(f"--paths {self.paths}: no such folder, expected one to save camera paths in")
         try:
-            found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-            family, kind, protocol, _, address = found[0]
+            addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+            family, kind, protocol, _, address = addresses[0]
             with socket.socket(family, kind, protocol) as probe:
                 if os.name == "posix":  # as asyncio does; on Windows it would take the port of another server
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -133,21 +133,23 @@ class Server:
         if training:
             self._add_training()
 
+        viewers: dict[int, Viewer] = {}
+
         async def came(client: Any) -> None:
-            key = client.client_id
-            viewing.join(key, ViserPage(client, viewing, world, address.paths))
+            viewer = viewers[client.client_id] = ViserPage(client, viewing, world, address.paths).viewer
 
             async def moved(camera: Any) -> None:
                 size = (camera.image_width, camera.image_height)
                 pose = read_pose(camera.wxyz, camera.position, camera.fov, size, world.origin)
                 if pose is not None:
-                    viewing.moved(key, pose)
+                    viewing.moved(viewer, pose)
 
             client.camera.on_update(moved)
             await moved(client.camera)
 
         async def left(client: Any) -> None:
-            viewing.leave(client.client_id)
+            if viewer := viewers.pop(client.client_id, None):
+                viewing.leave(viewer)
 
         server.on_client_connect(came)
         server.on_client_disconnect(left)
@@ -228,8 +230,8 @@ def _tell(_: Any, context: dict[str, Any]) -> None:
     """Print a line in place of a traceback; it takes what asyncio gives its handler for errors in tasks."""
     error = context.get("exception")
     words = f"{type(error).__name__}: {error}" if error is not None else str(context.get("message", ""))
-    told = plain(" ".join(words.split()))[:200].rstrip(": ")
-    print(f"clsplat: warning: a page sent what makes no sense here: {told}", file=sys.stderr)
+    message = plain(" ".join(words.split()))[:200].rstrip(": ")
+    print(f"clsplat: warning: a page sent what makes no sense here: {message}", file=sys.stderr)
 
 
 def refused(headers: Any, *, local: bool) -> str:

@@ -29,7 +29,7 @@ class TrainingView:
     def __init__(self, viewing: Viewing, server: Server, background: tuple[float, float, float], last: int) -> None:
         self.viewing, self.server, self.background, self.last = viewing, server, background, last
         self.share = Share()
-        self._told = -math.inf
+        self._told_at = -math.inf
 
     def __call__(self, trainer: Trainer, interrupted: Callable[[], bool]) -> None:
         """Show pictures; returns at once where there are no viewers."""
@@ -47,7 +47,7 @@ class TrainingView:
 
     def _tell(self, trainer: Trainer, *, force: bool = False) -> None:
         now = self.viewing.clock()
-        if force or now - self._told > TELL_EVERY:
+        if force or now - self._told_at > TELL_EVERY:
             state = "paused" if self.server.paused else "training"
             self.server.tell(f"{state}: step {trainer.step:,} of {self.last:,}, {trainer.parameters.count:,} Gaussians")
-            self._told = now
+            self._told_at = now

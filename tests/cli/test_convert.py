@@ -241,7 +241,7 @@ def test_a_file_of_another_kind_than_its_name_says(made: str, name: str, model: 
     capsys.readouterr()
     assert main(["info", str(wrong), "--json"]) == 0
     said = capsys.readouterr()
-    kind = formats.format_of(wrong).NAME
+    kind = formats.format_of(wrong).name
     assert json.loads(said.out)["format"] == kind
     assert said.err == f"clsplat: warning: {wrong}: is {kind} by its content, whatever its name says\n"
     assert len(formats.load(model)) == 300
@@ -274,7 +274,7 @@ def test_info_of_every_format(suffix: str, model: Path, capsys: Capture) -> None
     assert main(["info", str(target), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     whole = Gaussians.load(target)
-    assert found["format"] == formats.format_of(target).NAME
+    assert found["format"] == formats.format_of(target).name
     assert found["gaussians"] == 300
     assert found["sh_degree"] == whole.sh_degree
     assert found["not_finite"] == 0

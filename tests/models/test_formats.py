@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import io
 import random
+import sys
 import tracemalloc
 import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,21 +18,23 @@ from models import assert_equal, random_gaussians
 from needs import SCENES, require
 from scipy.spatial.transform import Rotation
 
+import clsplat
 from clsplat.camera import Camera
+from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
 from clsplat.models import difference, edit, formats
+from clsplat.models.formats import Format
 from clsplat.rendering.renderer import Renderer
 
-FORMATS = formats.formats()
-WRITTEN = {name: module for name, module in FORMATS.items() if hasattr(module, "write")}
+WRITTEN = {row.name: row for row in formats.FORMATS if row.write}
 SIZE = 96
 
 
-def path_of(module: ModuleType, folder: Path, stem: str = "model") -> Path:
-    suffix = next(suffix for suffix in module.SUFFIXES if suffix.startswith("."))
+def path_of(row: Format, folder: Path, stem: str = "model") -> Path:
+    suffix = next(suffix for suffix in row.suffixes if suffix.startswith("."))
     return folder / (stem + suffix)
 
 
@@ -76,9 +79,9 @@ def worst(renderer: Renderer, a: Gaussians, b: Gaussians) -> float:
     return min(psnr(renderer.render(a, c).image, renderer.render(b, c).image) for c in cameras())
 
 
-def as_far_as_it_goes(module: ModuleType, gaussians: Gaussians) -> Gaussians:
+def as_far_as_it_goes(row: Format, gaussians: Gaussians) -> Gaussians:
     """Without the SH that the format has no place for."""
-    return edit.drop_sh(gaussians, getattr(module, "MAX_SH_DEGREE", 3))
+    return edit.drop_sh(gaussians, row.sh_degree)
 
 
 def test_any_mirror_or_turn_of_the_axes_would_be_seen(renderer: Renderer) -> None:
@@ -97,26 +100,26 @@ def test_any_mirror_or_turn_of_the_axes_would_be_seen(renderer: Renderer) -> Non
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_model_comes_back_in_its_place(name: str, renderer: Renderer, tmp_path: Path) -> None:
-    module, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
-    whole = as_far_as_it_goes(module, asymmetric())
+    row, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
+    whole = as_far_as_it_goes(row, asymmetric())
     formats.save(path, whole)
-    assert formats.format_of(path) is module
+    assert formats.format_of(path) is row
     read = Gaussians.load(path)
     read.check()
     assert len(read) == len(whole)
     assert read.sh_degree == whole.sh_degree
     # the issue's contract: 60 dB for floats, 35 for what is quantised
-    assert worst(renderer, whole, read) >= (60 if getattr(module, "FLOAT", False) else 35)
+    assert worst(renderer, whole, read) >= (60 if row.floats else 35)
 
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("name", WRITTEN)
 def test_every_degree_of_sh(name: str, degree: int, tmp_path: Path) -> None:
-    module, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
+    row, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
     model = edit.drop_sh(asymmetric(), degree)
     formats.save(path, model)
     read = formats.load(path)
-    assert read.sh_degree == min(degree, getattr(module, "MAX_SH_DEGREE", 3))
+    assert read.sh_degree == min(degree, row.sh_degree)
     assert len(read) == len(model)
 
 
@@ -173,12 +176,11 @@ def test_means_that_count_from_elsewhere_are_written_in_the_world(name: str, tmp
 @pytest.mark.parametrize("name", WRITTEN)
 def test_the_loss_is_small_in_every_attribute(name: str, tmp_path: Path) -> None:
     """The error of each attribute that `clsplat convert` prints: nothing in floats, a few steps of a byte else."""
-    module, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
-    whole = as_far_as_it_goes(module, asymmetric())
+    row, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
+    whole = as_far_as_it_goes(row, asymmetric())
     formats.save(path, whole)
-    written = edit.take(whole, module.order(whole)) if hasattr(module, "order") else whole
+    written = edit.take(whole, row.order(whole)) if row.order else whole
     found = difference.errors(written, formats.load(path))
-    exact = getattr(module, "FLOAT", False)
     # Floats: logs and logits of what is stored, and unit quaternions, are rounded once more. Else: positions to 10
     # bits, scales and opacities to 7 or 8, rotations to 8, colour to 8. SH of which every one is different are the
     # worst for a palette: the render has to do, this bound is of four of their standard deviations.
@@ -191,7 +193,7 @@ def test_the_loss_is_small_in_every_attribute(name: str, tmp_path: Path) -> None
         "sh": (1e-6, 0.5),
     }
     for attribute, (for_floats, else_) in limits.items():
-        assert found[attribute]["largest"] <= (for_floats if exact else else_), attribute
+        assert found[attribute]["largest"] <= (for_floats if row.floats else else_), attribute
 
 
 def test_scales_count_as_a_part_of_the_gaussians_largest(tmp_path: Path) -> None:
@@ -280,11 +282,49 @@ def test_samples_of_other_tools(suffix: str) -> None:
             formats.load(path).check()
 
 
-def test_modules_keep_to_the_contract() -> None:
-    endings = [suffix for module in FORMATS.values() for suffix in module.SUFFIXES]
+def test_the_table_is_sound() -> None:
+    endings = formats.suffixes()
     assert len(set(endings)) == len(endings), "an ending of two formats"
-    for module in FORMATS.values():
-        assert module.__doc__
-        assert "http" in module.__doc__, f"{module.NAME} cites no specification"
-        assert all(suffix == suffix.lower() for suffix in module.SUFFIXES)
-        assert callable(module.read)
+    assert all(ending == ending.lower() for ending in endings)
+    page = (Path(clsplat.__file__).parents[1] / "docs/formats.md").read_text("utf-8")
+    assert [ending for ending in endings if f"`{ending}`" not in page] == []
+    for row in formats.FORMATS:
+        assert "http" in (sys.modules[row.read.__module__].__doc__ or ""), f"{row.name} cites no specification"
+
+
+def test_a_format_is_one_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A row in the table is all that load, save, info and convert want to know a format."""
+
+    def write(path: Path, gaussians: Gaussians) -> None:
+        with path.open("wb") as file:
+            file.write(b"ours")
+            np.savez(file, **gaussians.arrays())
+
+    def read(path: Path) -> Gaussians:
+        return Gaussians(**np.load(io.BytesIO(path.read_bytes()[4:])))
+
+    def recognises(head: bytes) -> bool:
+        return head.startswith(b"ours")
+
+    row = Format(
+        "ours", (".ours",), read, write, recognises, loses="no more than NumPy", describe=lambda _: {"version": 7}
+    )
+    monkeypatch.setattr(formats, "FORMATS", (*formats.FORMATS, row))
+    model, path = random_gaussians(300), tmp_path / "a.ours"
+    model.save(path)
+    assert path.read_bytes().startswith(b"ours")
+    assert_equal(Gaussians.load(path), model)
+    assert ".ours" in formats.suffixes(writable=True)
+    assert main(["info", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "format        ours, version 7\n" in said
+    assert "loses         no more than NumPy\n" in said
+    assert main(["convert", str(path), str(tmp_path / "b.ply")]) == 0
+    assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ours")]) == 0
+    assert_equal(formats.load(tmp_path / "c.ours"), model)
+    with pytest.warns(UserWarning, match=r"d\.ply: is ours by its content"):
+        assert_equal(formats.load(path.rename(tmp_path / "d.ply")), model)
+    with pytest.raises(InputError, match=r"expected one of .* \.ours "):
+        formats.save(tmp_path / "x.doc", model)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import warnings_of
 from needs import SCENES
 
 from clsplat.errors import InputError
@@ -38,7 +39,7 @@ def change_frame(path: Path, **keys: Any) -> None:
 
 
 def test_opengl_axes_become_colmaps(tmp_path: Path) -> None:
-    frame = read_transforms(make(tmp_path)).frames[0]
+    frame = read_transforms(make(tmp_path)).images[0]
     # The camera stands at (1, 2, 3) and looks along the world's -z, the world's y up.
     np.testing.assert_allclose(-frame.rotation.T @ frame.translation, [1, 2, 3])
     np.testing.assert_allclose(frame.rotation @ [1, 2, 2] + frame.translation, [0, 0, 1])  # ahead: depth 1
@@ -51,7 +52,7 @@ def test_a_scaled_pose_gives_the_same_rotation(tmp_path: Path) -> None:
     scaled = (np.array(POSE) * [[2.0, 2, 2, 1]]).tolist()
     path = make(tmp_path)
     change_frame(path, transform_matrix=scaled[:3])  # without its last row, too
-    frames = read_transforms(path).frames
+    frames = read_transforms(path).images
     np.testing.assert_allclose(frames[1].rotation, frames[0].rotation, atol=1e-12)
     np.testing.assert_allclose(frames[1].translation, frames[0].translation, atol=1e-12)
 
@@ -72,7 +73,7 @@ def test_a_scaled_pose_gives_the_same_rotation(tmp_path: Path) -> None:
     ],
 )
 def test_intrinsics(tmp_path: Path, keys: dict[str, Any], model: str, params: tuple[float, ...]) -> None:
-    lens = read_transforms(make(tmp_path, **keys)).frames[0].lens
+    lens = read_transforms(make(tmp_path, **keys)).images[0].lens
     assert lens.model == model
     assert lens.params == pytest.approx(params)
     assert (lens.width, lens.height) == (keys.get("w", 12), keys.get("h", 8))
@@ -81,7 +82,7 @@ def test_intrinsics(tmp_path: Path, keys: dict[str, Any], model: str, params: tu
 def test_a_frame_may_have_its_own_intrinsics(tmp_path: Path) -> None:
     path = make(tmp_path, k1=0.1)
     change_frame(path, fl_x=20.0, k1=0.0)
-    first, second = (frame.lens for frame in read_transforms(path).frames)
+    first, second = (frame.lens for frame in read_transforms(path).images)
     assert (first.model, first.params[0]) == ("OPENCV", 10)
     assert (second.model, second.params[0]) == ("PINHOLE", 20)
 
@@ -103,7 +104,7 @@ def test_habits_of_file_path(tmp_path: Path, listed: str, name: str) -> None:
     for extra in ("v1.2.png", "upper.PNG"):
         write_image(folder / "images" / extra, np.zeros((8, 12, 3), np.float32))
     change_frame(path, file_path=listed)
-    frame = read_transforms(path).frames[1]
+    frame = read_transforms(path).images[1]
     assert frame.name == name
     assert frame.path.is_file()
 
@@ -169,7 +170,7 @@ def test_blender_has_its_own_split(tmp_path: Path) -> None:
     make(tmp_path, name="transforms_train.json")
     frame = {"file_path": "./held_out/1", "transform_matrix": POSE}
     (tmp_path / "transforms_test.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": [frame]}))
-    frames = read_blender(tmp_path).frames
+    frames = read_blender(tmp_path).images
     assert {frame.name: frame.split for frame in frames} == {
         "images/0.png": "train",
         "images/1.png": "train",
@@ -183,13 +184,13 @@ def test_nerfstudios_split_points_and_masks(tmp_path: Path) -> None:
     header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {name}\n" for name in "xyz")
     header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     (tmp_path / "sparse.ply").write_text(header + "1 2 3 255 0 51\n4 5 6 0 255 0\n")
-    result = read_transforms(path)
-    assert [frame.split for frame in result.frames] == ["train", "test", "train"]
+    with pytest.warns(UserWarning, match="'mask_path' is ignored"):
+        result = read_transforms(path)
+    assert [image.split for image in result.images] == ["train", "test", "train"]
     np.testing.assert_array_equal(result.points, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_allclose(result.colors, [[1, 0, 0.2], [0, 1, 0]])
-    assert any("'mask_path' is ignored" in warning for warning in result.warnings)
     (tmp_path / "sparse.ply").unlink()
-    assert any("sparse.ply" in warning for warning in read_transforms(path).warnings)
+    assert any("sparse.ply" in warning for warning in warnings_of(lambda: read_transforms(path)))
 
 
 @pytest.mark.parametrize(
@@ -206,9 +207,9 @@ def test_nerfstudios_split_points_and_masks(tmp_path: Path) -> None:
     ],
 )
 def test_what_nerfstudio_does_not_train_on_is_held_out(tmp_path: Path, keys: dict[str, Any], split: str) -> None:
-    result = read_transforms(make(tmp_path, 3, **keys))
-    assert [str(frame.split) for frame in result.frames] == split.split()
-    assert result.warnings == []
+    path = make(tmp_path, 3, **keys)
+    assert [str(image.split) for image in read_transforms(path).images] == split.split()
+    assert warnings_of(lambda: read_transforms(path)) == []
 
 
 def test_a_split_that_makes_no_sense(tmp_path: Path) -> None:
@@ -219,7 +220,7 @@ def test_a_split_that_makes_no_sense(tmp_path: Path) -> None:
         read_transforms(make(tmp_path, val_filenames="images"))
     path = make(tmp_path, test_filenames=["images/1.png", "a.png", "b.png", "c.png", "d.png"])
     told = f"{path}: 'test_filenames' lists a.png, b.png, c.png and 1 more, and no frame has that as its 'file_path'"
-    assert read_transforms(path).warnings == [told]
+    assert warnings_of(lambda: read_transforms(path)) == [told]
 
 
 def test_a_transposed_pose_is_refused(tmp_path: Path) -> None:
@@ -233,27 +234,27 @@ def test_a_transposed_pose_is_refused(tmp_path: Path) -> None:
 def test_one_side_alone_has_the_other_in_proportion(
     tmp_path: Path, keys: dict[str, Any], size: tuple[int, int]
 ) -> None:
-    lens = read_transforms(make(tmp_path, **keys)).frames[0].lens
+    lens = read_transforms(make(tmp_path, **keys)).images[0].lens
     assert (lens.width, lens.height) == size
     assert lens.params == (10, 10, size[0] / 2, size[1] / 2)
 
 
 def test_an_angle_that_contradicts_the_focal_length_is_told(tmp_path: Path) -> None:
     path = make(tmp_path, 5, camera_angle_x=2 * math.atan(6 / 10.1))  # 1 % off, as rounding may be
-    assert read_transforms(path).warnings == []
+    assert warnings_of(lambda: read_transforms(path)) == []
     path = make(tmp_path, 5, camera_angle_x=math.pi / 2)
     change_frame(path, fl_x=20.0)  # of this frame alone, and the angle of the others
     pictures = ", ".join(f"images/{n}.png (10, not 6)" for n in (0, 2, 3))
     told = f"{path}: 'fl_x' is used, 'camera_angle_x' says otherwise of {pictures} and 1 more"
-    assert read_transforms(path).warnings == [told]
+    assert warnings_of(lambda: read_transforms(path)) == [told]
     with pytest.warns(UserWarning, match="'camera_angle_x' says otherwise"):
         read_poses(path)
 
 
 def test_a_rolling_shutter_is_told(tmp_path: Path) -> None:
-    assert read_transforms(make(tmp_path, rolling_shutter=[0, 0, 0, 0])).warnings == []
+    assert warnings_of(lambda: read_transforms(make(tmp_path, rolling_shutter=[0, 0, 0, 0]))) == []
     path = make(tmp_path, rolling_shutter=[0, 0, 0.03, 0])
-    assert ["'rolling_shutter' is ignored" in text for text in read_transforms(path).warnings] == [True]
+    assert ["'rolling_shutter' is ignored" in text for text in warnings_of(lambda: read_transforms(path))] == [True]
 
 
 def test_an_absurd_lens_is_told_where_cameras_alone_are_read(tmp_path: Path) -> None:
@@ -290,7 +291,7 @@ def test_ngps_volume(tmp_path: Path) -> None:
 
 @pytest.mark.needs("scenes")
 def test_lego() -> None:
-    frames = read_blender(SCENES / "lego_blender_400").frames
+    frames = read_blender(SCENES / "lego_blender_400").images
     assert sum(frame.split == "train" for frame in frames) == 87
     assert sum(frame.split == "test" for frame in frames) == 13
     for frame in frames:

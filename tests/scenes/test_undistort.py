@@ -42,7 +42,7 @@ def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def photograph(lens: Lens) -> np.ndarray:
     """What the lens sees of the pattern: its exact colour in the middle of each pixel."""
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    found = lens.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
+    found = lens._camera().cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
     return pattern(*found.T).reshape(lens.height, lens.width, 3).astype(np.float32)
 
 

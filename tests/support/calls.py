@@ -6,6 +6,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import warnings
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
@@ -16,6 +18,14 @@ from clsplat.config.training import TrainConfig
 from clsplat.files import temporary_name
 
 Capture = pytest.CaptureFixture[str]
+
+
+def warnings_of(work: Callable[[], object]) -> list[str]:
+    """The user's warnings of a piece of work."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        work()
+    return [str(warning.message) for warning in caught if warning.category is UserWarning]
 
 
 def flags(config: object, prefix: str = "--") -> list[str]:

@@ -308,19 +308,6 @@ def test_far_cameras_are_refused(tmp_path: Path) -> None:
     assert "has the pose" in refusal(lambda: colmap.read_model(path.parent))
 
 
-@pytest.mark.parametrize("window", [1, 30, 100])
-def test_binary_models_are_read_a_window_at_a_time(
-    window: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    make_colmap_binary(tmp_path)
-    whole = colmap.read_model(tmp_path / "sparse/0")
-    monkeypatch.setattr(colmap, "WINDOW", window)
-    parts = colmap.read_model(tmp_path / "sparse/0")
-    assert [image.name for image in parts.images] == [image.name for image in whole.images]
-    np.testing.assert_array_equal(parts.points, whole.points)
-    np.testing.assert_array_equal(parts.images[2].translation, whole.images[2].translation)
-
-
 @pytest.mark.parametrize(
     "name", ["..\\..\\x.png", "C:\\x.png", "C:x.png", "\\\\host\\x.png", "/x.png", "a/../../x.png", "a\nb", ""]
 )
@@ -662,11 +649,12 @@ def test_a_checkpoints_directory_claims_at_most_what_it_has(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    "text", ["{}", "[]", "null", "[" * 100_000, '{"unregistered": 3}', '{"unregistered": [3]}', "{"]
+    "text", ["{}", "[]", "null", "[" * 100_000, '{"fingerprint": 3}', '{"fingerprint": "0", "files": [3]}', "{"]
 )
 def test_records_that_are_none(text: str, tmp_path: Path) -> None:
     (tmp_path / "sfm.json").write_text(text)
-    assert str(tmp_path / "sfm.json") in refusal(lambda: sfm.unregistered(tmp_path))
+    refused = refusal(lambda: sfm._is_finished(tmp_path, tmp_path / "photos", "0", overwrite=False))
+    assert str(tmp_path) in refused
 
 
 def test_spoiling_is_a_matter_of_the_seed_alone() -> None:

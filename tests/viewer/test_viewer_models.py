@@ -115,14 +115,14 @@ class Watching:
 
 def watched(scene: Scene, device: Device, share: Share | None = None, **limits: str) -> tuple[Gaussians, Watching]:
     viewing, page = Viewing(), Watching()
-    viewing.join(1, page)
+    viewer = viewing.join(page)
     looks = [Look(), Look("depth"), Look("count"), Look("alpha"), Look(size=0.5), Look(degree=0)]
 
     def between(trainer: Trainer, _interrupted: object) -> None:
         viewing.model = viewing.model or LiveModel(trainer, BLACK)
         place = CAMERA.position + 0.01 * trainer.step
-        viewing.moved(1, Pose(CAMERA.rotation.T, place, 0.8, 640, 480))
-        viewing.looks(1, looks[trainer.step % len(looks)])
+        viewing.moved(viewer, Pose(CAMERA.rotation.T, place, 0.8, 640, 480))
+        viewing.looks(viewer, looks[trainer.step % len(looks)])
         viewing.work(share)
 
     return train(scene, CONFIG, device=device, between=between, **limits), page  # type: ignore[arg-type]

@@ -33,7 +33,7 @@ from clsplat.viewer.appearance import (
 from clsplat.viewer.path_recorder import MOST_KEYS, Recorder, save_path
 from clsplat.viewer.pose import Pose, extent_of, fitted, looking, read_pose, start_of
 from clsplat.viewer.refinement import PATIENCE, SETTLE, SMALLEST, START, TARGET, Level, Pace, Refinement, Share
-from clsplat.viewer.scheduler import Viewing
+from clsplat.viewer.scheduler import Viewer, Viewing
 
 ZERO = np.zeros(3)
 TURN = np.array([0.5, -0.5, 0.5, 0.5])
@@ -382,10 +382,10 @@ def test_a_closed_loop_has_as_many_frames_as_a_turn(tmp_path: Path) -> None:
 
 def test_keys_are_taken_back() -> None:
     recorder = recorded(0.0, 1.0)
-    recorder.remove_last()
+    del recorder.keys[-1:]
     assert [key.position[0] for key in recorder.keys] == [0.0]
-    recorder.clear()
-    recorder.remove_last()
+    recorder.keys.clear()
+    del recorder.keys[-1:]
     with pytest.raises(InputError, match="no key frames"):
         recorder.document((32, 20))
 
@@ -433,6 +433,8 @@ class FakeModel:
 
 
 class FakePage:
+    viewer: Viewer
+
     def __init__(self) -> None:
         self.shown: list[Level] = []
         self.told: list[str] = []
@@ -454,9 +456,9 @@ class Clock:
 def viewing(*poses: float) -> tuple[Viewing, FakeModel, list[FakePage], Clock]:
     model, clock = FakeModel(), Clock()
     found, pages = Viewing(model, clock), [FakePage() for _ in poses]
-    for key, (page, x) in enumerate(zip(pages, poses, strict=True)):
-        found.join(key, page)
-        found.moved(key, pose(x))
+    for page, x in zip(pages, poses, strict=True):
+        page.viewer = found.join(page)
+        found.moved(page.viewer, pose(x))
     return found, model, pages, clock
 
 
@@ -466,7 +468,7 @@ def test_each_sees_their_own_camera_in_turn() -> None:
     assert [len(page.shown) for page in pages] == [1, 1]
     assert not found.work()
     clock.now = 1.0
-    found.moved(0, pose(5.0))
+    found.moved(pages[0].viewer, pose(5.0))
     assert found.work() and found.work()
     assert pages[1].shown[-1].exact, "who moves does not keep the others from their exact picture"
     assert not pages[0].shown[-1].exact
@@ -476,20 +478,20 @@ def test_each_sees_their_own_camera_in_turn() -> None:
 def test_the_same_camera_once_more_is_no_news() -> None:
     found, _, pages, _ = viewing(0.0)
     found.work()
-    found.moved(0, pose(0.0))
+    found.moved(pages[0].viewer, pose(0.0))
     assert not found.work()
-    found.moved(0, pose(0.0, (320, 200)))
+    found.moved(pages[0].viewer, pose(0.0, (320, 200)))
     assert found.work()
     assert len(pages[0].shown) == 2
 
 
 def test_another_look_is_shown() -> None:
-    found, model, _, _ = viewing(0.0)
+    found, model, pages, _ = viewing(0.0)
     found.work()
-    found.looks(0, Look("depth"))
+    found.looks(pages[0].viewer, Look("depth"))
     assert found.work()
     assert model.asked[-1][2] == Look("depth")
-    found.looks(0, Look("depth"))
+    found.looks(pages[0].viewer, Look("depth"))
     assert not found.work()
 
 
@@ -514,7 +516,7 @@ def test_trouble_is_told_once_and_the_next_picture_is_tried() -> None:
     assert pages[0].told == ["no room"]
     assert not found.work(), "no second try of the same"
     model.trouble = None
-    found.moved(0, pose(2.0))
+    found.moved(pages[0].viewer, pose(2.0))
     found.work()
     assert len(pages[0].shown) == 1
 
@@ -526,8 +528,8 @@ def test_jobs_go_first_and_their_trouble_is_told() -> None:
     def failing(_: object) -> None:
         raise InputError("too large")
 
-    found.ask(0, done.append)
-    found.ask(0, failing)
+    found.ask(pages[0].viewer, done.append)
+    found.ask(pages[0].viewer, failing)
     assert found.work() and found.work()
     assert done == [model]
     assert pages[0].told == ["too large"]
@@ -536,23 +538,22 @@ def test_jobs_go_first_and_their_trouble_is_told() -> None:
 
 def test_who_has_left_gets_nothing() -> None:
     found, _, pages, _ = viewing(0.0)
-    found.leave(0)
+    found.leave(pages[0].viewer)
     assert not found.work()
-    found.moved(0, pose(1.0))
-    found.looks(0, Look("alpha"))
-    assert found.pose(0) is None and found.look(0) == Look()
+    found.moved(pages[0].viewer, pose(1.0))
+    found.looks(pages[0].viewer, Look("alpha"))
+    assert not found.work()
     assert pages[0].shown == []
 
 
 def test_without_a_model_nobody_is_served() -> None:
     found = Viewing(None)
-    found.join(0, FakePage())
-    found.moved(0, pose())
+    found.moved(found.join(FakePage()), pose())
     assert not found.work()
 
 
 def test_a_training_gives_its_share_only() -> None:
-    found, _, _, clock = viewing(0.0)
+    found, _, pages, clock = viewing(0.0)
     share = Share((0.2, 0.05))
 
     class Slow(FakeModel):
@@ -564,7 +565,7 @@ def test_a_training_gives_its_share_only() -> None:
     spent, end = 0.0, 100.0
     while clock.now < end:
         before = clock.now
-        found.moved(0, pose(clock.now))
+        found.moved(pages[0].viewer, pose(clock.now))
         if found.work(share):
             spent += clock.now - before
         clock.now += 0.01
@@ -582,7 +583,7 @@ def test_a_training_gives_its_share_only() -> None:
 
 def test_waiting_ends_with_news(monkeypatch: pytest.MonkeyPatch) -> None:
     found = Viewing(FakeModel())
-    found.join(0, FakePage())
+    viewer = found.join(FakePage())
     waits, real = threading.Event(), found._news.wait
 
     def announced(most: float) -> bool:
@@ -591,7 +592,7 @@ def test_waiting_ends_with_news(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def move() -> None:
         waits.wait()
-        found.moved(0, pose())  # which needs the lock that waiting gives back
+        found.moved(viewer, pose())  # which needs the lock that waiting gives back
 
     monkeypatch.setattr(found._news, "wait", announced)
     mover = threading.Thread(target=move)

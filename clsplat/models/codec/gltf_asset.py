@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import base64
 import binascii
-import io
 import os
 import struct
-import warnings
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -23,13 +21,9 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import InputError, plain
+from clsplat.arrays import numbers
+from clsplat.errors import InputError
 from clsplat.files import MAX_DOCUMENT, open_input, parse_json, read_document
-from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
-from clsplat.models.codec import values as packing
-from clsplat.models.codec.axes import LEFT_UP, flip
-from clsplat.models.codec.values import BLOCK_ROWS
-from clsplat.models.formats import spz
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
@@ -94,8 +88,8 @@ class Asset:
             raise InputError(f"{self.path}: {kind} has no {index!r}; is it damaged?")
         if not isinstance(items[index], dict):
             raise InputError(f"{self.path}: {kind} {index} is no object; is it damaged?")
-        found: dict[str, Any] = items[index]
-        return found
+        result: dict[str, Any] = items[index]
+        return result
 
     def integer(self, holder: dict[str, Any], key: str, default: int | None = None) -> int:
         value = holder.get(key, default)
@@ -112,7 +106,7 @@ class Asset:
             roots = list(range(len(nodes))) if isinstance(nodes, list) else []
         todo: deque[tuple[object, NDArray[np.float64]]] = deque((root, np.eye(4)) for root in _list(roots))
         seen: set[int] = set()
-        found = 0
+        count = 0
         while todo:
             index, parent = todo.popleft()
             node = self.item("nodes", index)
@@ -128,93 +122,32 @@ class Asset:
                 continue
             for place, primitive in enumerate(_list(self.item("meshes", node["mesh"]).get("primitives", []))):
                 if isinstance(primitive, dict) and EXTENSION in as_object(primitive.get("extensions")):
-                    found += 1
-                    if found > MAX_PRIMITIVES:
+                    count += 1
+                    if count > MAX_PRIMITIVES:
                         raise InputError(f"{self.path}: has more than {MAX_PRIMITIVES} primitives of Gaussians")
                     yield f"primitive {place} of node {index}", matrix, primitive
 
     def matrix(self, node: dict[str, Any], index: int) -> NDArray[np.float64]:
         from scipy.spatial.transform import Rotation
 
-        def numbers(key: str, default: list[float]) -> NDArray[np.float64]:
-            value = node.get(key, default)
-            try:
-                found = np.array(value, np.float64)
-            except (TypeError, ValueError, OverflowError):
-                found = np.empty(0)
-            if found.shape != (len(default),) or not np.isfinite(found).all():
+        def vector(key: str, default: list[float]) -> NDArray[np.float64]:
+            values = numbers(node.get(key, default))
+            if values.shape != (len(default),) or not np.isfinite(values).all():
                 raise InputError(f"{self.path}: {key} of node {index} is no list of {len(default)} numbers")
-            return found
+            return values
 
         if "matrix" in node:
-            return numbers("matrix", list(np.eye(4).ravel())).reshape(4, 4).T
+            return vector("matrix", list(np.eye(4).ravel())).reshape(4, 4).T
         result = np.eye(4)
-        rotation = numbers("rotation", [0, 0, 0, 1])
+        rotation = vector("rotation", [0, 0, 0, 1])
         if not rotation.any():
             raise InputError(f"{self.path}: rotation of node {index} is 0, expected a quaternion")
-        result[:3, :3] = Rotation.from_quat(rotation).as_matrix() * numbers("scale", [1, 1, 1])
-        result[:3, 3] = numbers("translation", [0, 0, 0])
+        result[:3, :3] = Rotation.from_quat(rotation).as_matrix() * vector("scale", [1, 1, 1])
+        result[:3, 3] = vector("translation", [0, 0, 0])
         return result
 
     def extension(self, primitive: dict[str, Any]) -> dict[str, Any]:
         return as_object(primitive["extensions"][EXTENSION])
-
-    def gaussians(self, name: str, primitive: dict[str, Any]) -> Gaussians:
-        """The primitive's Gaussians in our frame."""
-        said = self.extension(primitive)
-        kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
-        if kernel != "ellipse":
-            raise InputError(f"{self.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse")
-        if space != COLOR_SPACES[0]:
-            warnings.warn(plain(f"{self.path}: the colours are in {str(space)[:40]}, kept as they are"), stacklevel=3)
-        nested = as_object(said.get("extensions", {}))
-        for extension in SPZ_EXTENSIONS:
-            if extension in nested:
-                blob = self.view(as_object(nested[extension]).get("bufferView"))
-                return spz.read_from(io.BytesIO(blob.data), len(blob), self.path)
-        return self.attributes(name, as_object(primitive.get("attributes")))
-
-    def attributes(self, name: str, indices: dict[str, Any]) -> Gaussians:
-        def array(semantic: str, width: int) -> Array:
-            if semantic not in indices:
-                raise InputError(f"{self.path}: {name} lacks the attribute {semantic}")
-            return self.accessor(indices[semantic], width, semantic)
-
-        position = array("POSITION", 3)
-        count = len(position)
-        self.total += count
-        size = self.size + sum(len(buffer) for buffer in self.buffers.values())
-        packing.require_count(self.path, self.total if count else 0, size)
-        names = [
-            [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
-            for degree in range(MAX_SH_DEGREE + 1)
-        ]
-        degree = max((degree for degree in range(4) if any(each in indices for each in names[degree])), default=0)
-        sources = {
-            "means": position,
-            "quaternions": array(f"{EXTENSION}:ROTATION", 4),
-            "log_scales": array(f"{EXTENSION}:SCALE", 3),
-            "opacities": array(f"{EXTENSION}:OPACITY", 1),
-        }
-        coefficients = [array(each, 3) for band in names[: degree + 1] for each in band]
-        for each in (*sources.values(), *coefficients):
-            if len(each) != count:
-                raise InputError(f"{self.path}: {name} has {len(each)} values of an attribute, expected {count}")
-        result = packing.empty(count, degree)
-        for first in range(0, count, BLOCK_ROWS):
-            rows = slice(first, min(first + BLOCK_ROWS, count))
-            result.means[rows] = _real(position[rows])
-            result.quaternions[rows] = _real(sources["quaternions"][rows])[:, [3, 0, 1, 2]]
-            scales = _real(sources["log_scales"][rows])
-            result.log_scales[rows] = packing.log_scales(scales, f"{self.path}: {name}", first)
-            opacity = _real(sources["opacities"][rows])[:, 0]
-            if not ((opacity >= 0) & (opacity <= 1)).all():
-                raise InputError(f"{self.path}: {name} has an opacity outside [0, 1]")
-            result.opacity_logits[rows] = packing.logits(opacity)
-            for index, coefficient in enumerate(coefficients):
-                result.sh[rows, index] = _real(coefficient[rows])
-        flip(result, LEFT_UP)
-        return result
 
     def accessor(self, index: object, width: int, semantic: str) -> Array:
         """(count, width), as it lies in the file."""
@@ -288,11 +221,17 @@ class Asset:
         return _map(file, 0, size)
 
 
+def sh_attributes(degree: int) -> list[str]:
+    """The attributes of one degree's coefficients, in our order."""
+    return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
+
+
 class _Normalised(np.ndarray[Any, Any]):
     """Integers that stand for fractions of their largest."""
 
 
-def _real(values: Array) -> NDArray[np.float32]:
+def real(values: Array) -> NDArray[np.float32]:
+    """Floats; of normalised integers, their fractions of the largest."""
     floats = np.asarray(values).astype(np.float32)
     if isinstance(values, _Normalised):
         floats = np.maximum(floats / np.float32(np.iinfo(values.dtype).max), np.float32(-1))

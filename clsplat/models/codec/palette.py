@@ -29,8 +29,7 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
     ordered = np.sort(values.ravel())
     distinct = np.unique(ordered) if len(ordered) <= SAMPLES else _thinned(ordered)
     if len(distinct) <= size:
-        padded: Float32 = np.pad(distinct, (0, size - len(distinct)), mode="edge").astype(np.float32)
-        return padded
+        return np.pad(distinct, (0, size - len(distinct)), mode="edge").astype(np.float32)
     samples = _thinned(ordered).astype(np.float64)
     wanted = np.cumsum(np.concatenate([[0.0], np.diff(samples) ** (2 / 3)]))
     entries = np.interp((np.arange(size) + 0.5) / size * wanted[-1], wanted, samples)
@@ -39,8 +38,7 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
         count = np.bincount(index, minlength=size)
         total = np.bincount(index, samples, minlength=size)
         entries = np.where(count > 0, total / np.maximum(count, 1), entries)
-    result: Float32 = entries.astype(np.float32)
-    return result
+    return np.asarray(entries.astype(np.float32))
 
 
 def _thinned(ordered: Float32) -> Float32:
@@ -58,8 +56,8 @@ def nearest(entries: NDArray[np.floating], values: NDArray[np.floating]) -> NDAr
 def palette(
     vectors: Float32, size: int, iterations: int = 10, progress: Callable[[float], None] = lambda part: None
 ) -> tuple[Float32, NDArray[np.int64]]:
-    """Up to `size` vectors, and which of them stands for each: (n, d) -> (size, d), (n,). progress: hears what part of
-    them has been found.
+    """Up to `size` vectors, and which of them stands for each: (n, d) -> (size, d), (n,). progress: called with the
+    part of them that has been found.
 
     k-means in two levels: clusters, and in each of them a share of the palette by its squared error, so that the work
     is n d sqrt(size) and not n d size.
@@ -83,10 +81,10 @@ def palette(
         progress(index / len(members))
         if not len(rows):
             continue
-        found, label = _k_means(vectors[rows], min(int(share), len(rows)), iterations)
-        centres.append(found)
+        clusters, label = _k_means(vectors[rows], min(int(share), len(rows)), iterations)
+        centres.append(clusters)
         labels[rows] = used + label
-        used += len(found)
+        used += len(clusters)
     result = np.zeros((size, width), np.float32)
     result[:used] = np.concatenate(centres)
     return result, labels
@@ -137,8 +135,8 @@ def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
     scores = np.empty((TILE, len(centres)), np.float32)
     for start in range(0, len(vectors), TILE):
         rows = vectors[start : start + TILE]
-        found = scores[: len(rows)]
+        products = scores[: len(rows)]
         for at, part in columns:
-            np.matmul(rows, part, out=found[:, at])
-        labels[start : start + TILE] = np.subtract(halves, found, out=found).argmin(axis=1)
+            np.matmul(rows, part, out=products[:, at])
+        labels[start : start + TILE] = np.subtract(halves, products, out=products).argmin(axis=1)
     return labels

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.models.codec.axes import UP_BACK, sh_signs
+from clsplat.models.codec.values import OTHERS, restore_largest
 
 Bytes = NDArray[np.uint8]
 
@@ -35,26 +36,17 @@ def smallest_three(block: Bytes) -> NDArray[np.float32]:
     fields = packed[:, None] >> np.array([20, 10, 0], np.uint32)
     three = (fields & 511).astype(np.float32) * np.float32(ROOT_HALF / 511)
     three = np.where(fields & 512, -three, three)
-    largest = np.sqrt(np.maximum(0, 1 - np.square(three).sum(axis=1)))
-    result = np.empty((len(block), 4), np.float32)
-    for index in range(4):  # of x y z w
-        chosen = (packed >> 30) == index
-        others = [place for place in range(4) if place != index]
-        result[np.ix_(chosen, [(place + 1) % 4 for place in others])] = three[chosen]
-        result[chosen, (index + 1) % 4] = largest[chosen]
-    return result
+    return restore_largest(packed >> 30, three)[:, [3, 0, 1, 2]]  # from x y z w
 
 
 def to_byte(values: NDArray[np.float32]) -> Bytes:
     """To the nearest from 0 to 255."""
-    rounded: Bytes = np.clip(np.floor(values + np.float32(0.5)), 0, 255).astype(np.uint8)
-    return rounded
+    return np.asarray(np.clip(np.floor(values + np.float32(0.5)), 0, 255).astype(np.uint8))
 
 
 def to_fixed(values: NDArray[np.float64]) -> Bytes:
     """(n, 3) that fit into 24 bits -> (n, 3, 3), the low bytes first."""
-    fixed: Bytes = np.rint(values).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
-    return fixed
+    return np.rint(values).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
 
 
 def to_first_three(unit: NDArray[np.float32]) -> Bytes:
@@ -70,11 +62,9 @@ def to_smallest_three(unit: NDArray[np.float32]) -> Bytes:
     negate = np.take_along_axis(q, largest[:, None], axis=1) < 0
     magnitude = np.minimum(np.floor(np.abs(q) * np.float32(511 / ROOT_HALF) + np.float32(0.5)), 511).astype(np.uint32)
     fields = magnitude | (((q < 0) ^ negate).astype(np.uint32) << 9)
-    others = np.array([[place for place in range(4) if place != index] for index in range(4)])[largest]
-    three = np.take_along_axis(fields, others, axis=1)
+    three = np.take_along_axis(fields, OTHERS[largest], axis=1)
     packed = largest.astype(np.uint32) << 30 | three[:, 0] << 20 | three[:, 1] << 10 | three[:, 2]
-    as_bytes: Bytes = packed.astype("<u4").view(np.uint8)
-    return as_bytes
+    return np.asarray(packed.astype("<u4").view(np.uint8))
 
 
 def to_sh(rest: NDArray[np.float32], sh_bits: tuple[int, int]) -> Bytes:
@@ -83,5 +73,4 @@ def to_sh(rest: NDArray[np.float32], sh_bits: tuple[int, int]) -> Bytes:
     steps = np.array([1 << (8 - sh_bits[0 if index < 3 else 1]) for index in range(coefficients)], np.int16)[:, None]
     signs = sh_signs(UP_BACK)[1 : coefficients + 1, None]
     values = np.clip(rest * (signs * np.float32(128)) + np.float32(128.5), 0, 256).astype(np.int16)
-    rounded: Bytes = np.minimum((values + steps // 2) & -steps, 255).astype(np.uint8)  # steps are powers of two
-    return rounded
+    return np.asarray(np.minimum((values + steps // 2) & -steps, 255).astype(np.uint8))  # steps are powers of two

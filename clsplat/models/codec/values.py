@@ -24,7 +24,11 @@ FREE_COUNT = 1 << 20
 """Gaussians that a compressed file may have whatever its length is; beyond them it may have one for each byte of it.
 That is more than any model of a scene, whose positions alone take several bytes each, and less than what a bomb would
 ask for."""
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Row i: the components of a quaternion but for number i."""
 MORTON_BITS = 21
+NAMES = ("a position", "a rotation", "a scale", "an opacity", "a colour")
+"""The arrays of `Gaussians`, for messages."""
 _SPREAD = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
@@ -36,23 +40,19 @@ _SPREAD = (
 
 def empty(count: int, degree: int) -> Gaussians:
     """Room for `count` Gaussians, to be filled."""
-
-    def room(*shape: int) -> Float32:
-        return np.empty(shape, np.float32)
-
-    return Gaussians(room(count, 3), room(count, 4), room(count, 3), room(count), room(count, (degree + 1) ** 2, 3))
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, (degree + 1) ** 2, 3))
+    arrays: list[Any] = [np.empty(shape, np.float32) for shape in shapes]
+    return Gaussians(*arrays)
 
 
 def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) -> Float64:
     """(n, 3) where they are in the world."""
-    means: Float64 = gaussians.means[rows] + gaussians.origin
-    return means
+    return gaussians.means[rows] + gaussians.origin
 
 
 def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
     """0 to 1 as 0 to 255, to the nearest; what lies outside is cut."""
-    found: NDArray[np.uint8] = np.clip(np.rint(values * 255), 0, 255).astype(np.uint8)
-    return found
+    return np.asarray(np.clip(np.rint(values * 255), 0, 255).astype(np.uint8))
 
 
 def opacities(logits: Float32) -> Float64:
@@ -83,8 +83,8 @@ def log_scales(linear: NDArray[Any], path: Path | str, first: int) -> Float64:
         bad = ~(linear >= 0).all(axis=1)
     if bad.any():
         at = int(bad.argmax())
-        found = " ".join(f"{value:g}" for value in linear[at])
-        raise InputError(f"{path}: Gaussian {first + at} has the scales {found}, expected numbers of at least 0")
+        scales = " ".join(f"{value:g}" for value in linear[at])
+        raise InputError(f"{path}: Gaussian {first + at} has the scales {scales}, expected numbers of at least 0")
     return np.asarray(np.log(np.maximum(linear, LEAST_SCALE, dtype=np.float64)))
 
 
@@ -105,6 +105,23 @@ def unit_quaternions(quaternions: NDArray[Any]) -> Float64:
     return np.where(length > 0, q / np.where(length > 0, length, 1), (1.0, 0.0, 0.0, 0.0))
 
 
+def restore_largest(which: NDArray[Any], three: Float32) -> Float32:
+    """(n, 4) unit quaternions, from the index (n,) of the component that was left out, the largest, and the others
+    (n, 3) in their order."""
+    result = np.empty((len(three), 4), np.float32)
+    largest = np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
+    np.put_along_axis(result, OTHERS[which], three, axis=1)
+    np.put_along_axis(result, which.astype(np.intp)[:, None], largest[:, None], axis=1)
+    return result
+
+
+def leave_out_largest(unit: Float64) -> tuple[NDArray[np.intp], Float64]:
+    """The inverse of `restore_largest`, with the signs of (n, 4) such that the component left out is positive."""
+    which = np.abs(unit).argmax(axis=1)
+    sign = np.where(np.take_along_axis(unit, which[:, None], axis=1) < 0, -1, 1)
+    return which, np.take_along_axis(unit, OTHERS[which], axis=1) * sign
+
+
 def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> NDArray[Any]:
     """The next `count` records of the file, whose size has been checked. Raises InputError where it shrank since."""
     data = file.read(count * kind.itemsize)
@@ -115,20 +132,22 @@ def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> ND
 
 def require_finite(path: Path, gaussians: Gaussians, *, writing: bool = False) -> None:
     """Raise InputError naming the first value that is not finite."""
-    named = {
-        "a position": gaussians.means,
-        "a rotation": gaussians.quaternions,
-        "a scale": gaussians.log_scales,
-        "an opacity": gaussians.opacity_logits,
-        "a colour": gaussians.sh,
-    }
-    for name, array in named.items():
+    for name, array in zip(NAMES, gaussians.arrays().values(), strict=True):
         with np.errstate(invalid="ignore"):  # of infinities of both signs
             total = array.sum(dtype=np.float64)  # a single pass; that of finite float32 is finite
         if not np.isfinite(total):
             row = int((~np.isfinite(array.reshape(len(array), -1)).all(axis=1)).argmax())
             verb = "cannot be written: " if writing else ""
             raise InputError(f"{path}: {verb}Gaussian {row} has {name} that is not finite")
+
+
+def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0) -> None:
+    """Raise ValueError for arrays that are not as `Gaussians` says; InputError for values that are not finite, and for
+    fewer than `least` Gaussians."""
+    gaussians.check()
+    require_finite(path, gaussians, writing=True)
+    if len(gaussians) < least:
+        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
 
 
 def require_count(path: Path, count: int, size: int) -> None:

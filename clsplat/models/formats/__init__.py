@@ -1,39 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Model files: a module for each format, chosen by the file's ending, or by its first bytes where these say otherwise.
 
-A format is a module of this package that has
-
-- `NAME`, what it is called, and `SUFFIXES`, the endings of its files in lower case, such as .compressed.ply,
-  the longest first; one without a dot is a whole name;
-- `read(path) -> Gaussians`, which raises InputError, one line with the path, for a file that is not as it should be;
-- `write(path, gaussians)`, atomic, with further settings as keyword arguments; absent where it is only read;
-- `recognises(head) -> bool`, whether these first bytes (`HEAD_BYTES` at most) are of the format; may be absent;
-- `describe(path) -> dict`, what `clsplat info` says beside what every model has; may be absent;
-- `order(gaussians) -> (n,)`, which Gaussian each row of a written file is, where that is not their own order;
-- `LOSES`, in a few words what the format does not keep, "nothing" for floats; and `FLOAT`, whether it keeps floats.
-
-Its docstring cites the specification and says what the format has in place of our conventions (docs/conventions.md).
-Modules load what they need of other packages when it is needed: all of them are imported to look for an ending.
+`FORMATS` is the table of the formats, a row each, and the only place that lists them. A format's module cites the
+specification in its docstring, and says there what the format has in place of our conventions (docs/conventions.md).
 """
 
 from __future__ import annotations
 
-import functools
 import inspect
 import os
-import pkgutil
-import warnings
-from importlib import import_module
+from collections.abc import Callable, Iterator
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
 from clsplat.camera import NEAR, NEARS
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, usd
 
 HEAD_BYTES = 1 << 16
 SAMPLED = 10_000
@@ -42,40 +31,91 @@ SMALL = 10.0
 """Near planes in the size of a model that the usual one does not suit."""
 
 
-@functools.cache
-def formats() -> dict[str, ModuleType]:
-    """Every format's module by its NAME."""
-    found = (import_module(f"{__name__}.{entry.name}") for entry in pkgutil.iter_modules(__path__))
-    modules = [module for module in found if hasattr(module, "SUFFIXES")]
-    return {module.NAME: module for module in modules}
+@dataclass(frozen=True)
+class Format:
+    """A row of the table.
+
+    name: for messages; suffixes: endings of its files in lower case, one without a dot is a whole name; read(path):
+    the Gaussians, raises InputError, one line with the path, for a file that is damaged; write(path, gaussians,
+    **options): atomic, None for a format that is only read; recognises(head): True if the first bytes, HEAD_BYTES at
+    most, are of the format, None where it has no beginning of its own.
+
+    loses: what the format does not keep, in a few words; floats: True if it keeps floats; sh_degree: the highest that
+    it holds; describe(path): the format's part of `clsplat info`; order(gaussians): (n,), the Gaussian of each row of
+    a written file, None for their own order; blocks(path): the origin, and the Gaussians in the world some rows at a
+    time, for a format that need not be held whole; side_files(path): the other files of a model of this name.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    read: Callable[[Path], Gaussians]
+    write: Callable[..., None] | None = None
+    recognises: Callable[[bytes], bool] | None = None
+    _: KW_ONLY
+    loses: str
+    floats: bool = False
+    sh_degree: int = MAX_SH_DEGREE
+    describe: Callable[[Path], dict[str, Any]] = lambda _: {}
+    order: Callable[[Gaussians], NDArray[np.int64]] | None = None
+    blocks: Callable[[Path], tuple[Float64, Iterator[Gaussians]]] | None = None
+    side_files: Callable[[Path], list[Path]] = lambda _: []
+
+
+UNIT_QUATERNIONS = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
+
+FORMATS: tuple[Format, ...] = (
+    Format("compressed PLY", (".compressed.ply",), compressed_ply.read, compressed_ply.write, compressed_ply.recognises,
+           loses="position and scale to 10 or 11 bits of a chunk's range, rotation to 10, colour and opacity to 8, SH "
+                 "to 1/32", describe=compressed_ply.describe, order=compressed_ply.order),
+    Format("glTF", (".gltf", ".glb"), gltf.read, gltf.write, gltf.recognises,
+           loses=UNIT_QUATERNIONS, floats=True, describe=gltf.describe, side_files=gltf.side_files),
+    Format("ksplat", (".ksplat",), ksplat.read, loses="not written here", describe=ksplat.describe),
+    Format("3DGS PLY", (".ply",), ply.read, ply.write, ply.recognises,
+           loses="nothing", floats=True, describe=ply.describe, blocks=ply.blocks),
+    Format("SOG", ("meta.json", ".sog"), sog.read, sog.write, sog.recognises,
+           loses="positions to 16 bits, the rest to 8, spherical harmonics to a palette",
+           describe=sog.describe, side_files=sog.side_files),
+    Format("splat", (".splat",), splat.read, splat.write,
+           loses="SH beyond degree 0; colour, opacity and rotation to 8 bits, colour beyond 0 to 1", sh_degree=0),
+    Format("SPZ", (".spz",), spz.read, spz.write, spz.recognises,
+           loses="positions to 24 bits fixed point, the rest to 8 or 10 bits, spherical harmonics to 6",
+           describe=spz.describe),
+    Format("OpenUSD", (".usda", ".usdc", ".usdz", ".usd"), usd.read, usd.write, usd.recognises,
+           loses=UNIT_QUATERNIONS, floats=True, describe=usd.describe),
+)  # fmt: skip
+"""All formats. Of two that recognise the same first bytes the earlier counts."""
 
 
 def suffixes(*, writable: bool = False) -> list[str]:
     """The endings that are known, or those of formats that can be written."""
-    modules = [module for module in formats().values() if hasattr(module, "write") or not writable]
-    return sorted(suffix for module in modules for suffix in module.SUFFIXES)
+    return sorted(suffix for row in FORMATS if row.write or not writable for suffix in row.suffixes)
 
 
-def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> ModuleType:
-    """The format of the longest ending that fits. Raises InputError for one that is not known, or not written if it
-    should be."""
-    name = Path(path).name.lower()
-    fits = [(len(suffix), module) for module in formats().values() for suffix in module.SUFFIXES if _has(name, suffix)]
-    if not fits:
-        known = " ".join(suffixes(writable=writable))
+def _named(path: Path) -> Format | None:
+    """The format of the longest ending that fits."""
+    name = path.name.lower()
+    fits = [
+        (len(suffix), row)
+        for row in FORMATS
+        for suffix in row.suffixes
+        if (name.endswith(suffix) if suffix.startswith(".") else name == suffix)
+    ]
+    return max(fits, key=lambda fit: fit[0])[1] if fits else None
+
+
+def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> Format:
+    """The format by the name alone. Raises InputError for an ending that is not known, or not written if it should
+    be."""
+    named = _named(Path(path))
+    known = " ".join(suffixes(writable=writable))
+    if named is None:
         raise InputError(f"{path}: the ending is none of a model file, expected one of {known}")
-    module = max(fits, key=lambda fit: fit[0])[1]
-    if writable and not hasattr(module, "write"):
-        known = " ".join(suffixes(writable=True))
-        raise InputError(f"{path}: {module.NAME} is read only, expected one of {known}")
-    return module
+    if writable and named.write is None:
+        raise InputError(f"{path}: {named.name} is read only, expected one of {known}")
+    return named
 
 
-def _has(name: str, suffix: str) -> bool:
-    return name.endswith(suffix) if suffix.startswith(".") else name == suffix
-
-
-def format_of(path: Path) -> ModuleType:
+def format_of(path: Path) -> Format:
     """The format by the name, unless the first bytes are another format's. Raises InputError, also where there is no
     such file."""
     named = _named(path)
@@ -84,36 +124,24 @@ def format_of(path: Path) -> ModuleType:
     with open_input(path, f"a model file, its ending one of {' '.join(suffixes())}") as file:
         head = file.read(HEAD_BYTES)
     # of a format without a beginning of its own another's counts, but for JSON's, which says too little
-    nameless = named is not None and not hasattr(named, "recognises") and head.lstrip()[:1] != b"{"
-    if named is None or nameless or not _recognised(named, head):
-        for module in formats().values():
-            if hasattr(module, "recognises") and module.recognises(head):
-                return module
-    return named or format_of_name(path)
+    fits = named and (named.recognises(head) if named.recognises else head.lstrip()[:1] == b"{")
+    others = () if fits else (row for row in FORMATS if row.recognises and row.recognises(head))
+    return next(iter(others), named) or format_of_name(path)
 
 
-def tell_kind(path: Path, module: ModuleType) -> None:
-    """Warn where the file's name says that it is of another format than it is."""
-    endings = {Path(f"x{suffix}").suffix for suffix in module.SUFFIXES}
-    if path.suffix.lower() not in endings:
-        warnings.warn(plain(f"{path}: is {module.NAME} by its content, whatever its name says"), stacklevel=3)
+def resolve(path: Path) -> tuple[Path, Format]:
+    """The model's file, where `path` may be the folder of one, and its format. Raises InputError as `format_of`. Warns
+    where the name says that the file is of another format."""
+    path = model_path(path)
+    row = format_of(path)
+    if path.suffix.lower() not in {Path(f"x{suffix}").suffix for suffix in row.suffixes}:
+        warn(f"{path}: is {row.name} by its content, whatever its name says")
+    return path, row
 
 
 def is_model_name(path: Path) -> bool:
     """True if the ending is one of a model file."""
     return _named(path) is not None
-
-
-def _named(path: Path) -> ModuleType | None:
-    try:
-        return format_of_name(path)
-    except InputError:
-        return None
-
-
-def _recognised(module: ModuleType, head: bytes) -> bool:
-    """True if nothing speaks against the format."""
-    return not hasattr(module, "recognises") or bool(module.recognises(head))
 
 
 def model_path(path: Path) -> Path:
@@ -124,10 +152,8 @@ def model_path(path: Path) -> Path:
 
 def load(path: str | os.PathLike[str]) -> Gaussians:
     """Read a model file of any format. Raises InputError naming the file and the trouble."""
-    path = model_path(Path(path))
-    module = format_of(path)
-    tell_kind(path, module)
-    gaussians: Gaussians = module.read(path)
+    path, row = resolve(Path(path))
+    gaussians = row.read(path)
     if gaussians.near == NEAR:
         gaussians.near = _near_of(gaussians)
     return gaussians
@@ -144,5 +170,6 @@ def save(path: str | os.PathLike[str], gaussians: Gaussians, **options: Any) -> 
     """Write a model file, atomically, in the format of the name. options: of the format's `write`; those that it has
     not are passed over. Raises InputError for an ending that is not written."""
     write = format_of_name(path, writable=True).write
+    assert write is not None
     known = inspect.signature(write).parameters
     write(Path(path), gaussians, **{name: value for name, value in options.items() if name in known})

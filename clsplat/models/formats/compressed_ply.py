@@ -32,11 +32,6 @@ from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import values as packing
 from clsplat.models.formats import ply
 
-NAME = "compressed PLY"
-SUFFIXES = (".compressed.ply",)
-FLOAT = False
-LOSES = "position and scale to 10 or 11 bits of a chunk's range, rotation to 10, colour and opacity to 8, SH to 1/32"
-
 CHUNK = 256
 BLOCK_ROWS = 64 * CHUNK
 MAX_LOG_SCALE = 20.0
@@ -62,24 +57,25 @@ def read(path: Path) -> Gaussians:
     not finite."""
     with open_input(path, "a compressed PLY") as file:
         header = ply.read_header(file, path)
-        chunks, vertex, sh = _elements(header, path)
-        starts = _starts(header, file, path)
-        bounds = _bounds(file, header, chunks, starts[chunks.name], path)
+        chunks, vertex, sh = _elements(header)
+        end, have = header.start(len(header.elements)), os.fstat(file.fileno()).st_size
+        if have < end:
+            raise InputError(f"{path}: truncated: its header promises {end} bytes, {have} are there")
+        bounds = _bounds(file, header, chunks)
         rest = [] if sh is None else [f"f_rest_{index}" for index in range(len(sh.properties))]
-        found = packing.empty(vertex.count, {0: 0, 9: 1, 24: 2, 45: 3}[len(rest)])
+        result = packing.empty(vertex.count, {0: 0, 9: 1, 24: 2, 45: 3}[len(rest)])
         for start in range(0, vertex.count, BLOCK_ROWS):
             count = min(BLOCK_ROWS, vertex.count - start)
-            block = _rows(file, header, vertex, starts["vertex"], start, count, path)
-            of_chunk = bounds[np.arange(start, start + count) // CHUNK]
-            _unpack(block, of_chunk, found, slice(start, start + count))
+            block = _rows(file, header, vertex, start, count)
+            _unpack(block, bounds[np.arange(start, start + count) // CHUNK], result, slice(start, start + count))
             if sh is not None:
-                table = _rows(file, header, sh, starts["sh"], start, count, path)
+                table = _rows(file, header, sh, start, count)
                 columns = np.stack([table[name] for name in rest], axis=1).astype(np.float32)
                 steps = np.where(columns == 0, 0, np.where(columns == 255, 256, columns + np.float32(0.5)))
                 values = (steps / 256 - 0.5) * 8
-                found.sh[start : start + count, 1:] = values.reshape(count, 3, -1).transpose(0, 2, 1)
-    packing.require_finite(path, found)
-    return found
+                result.sh[start : start + count, 1:] = values.reshape(count, 3, -1).transpose(0, 2, 1)
+    packing.require_finite(path, result)
+    return result
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -91,8 +87,7 @@ def describe(path: Path) -> dict[str, Any]:
 def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> None:
     """Write it, atomically, the Gaussians in the order of `order`. comments: lines of the header, in ASCII."""
     ply.check_comments(comments)
-    gaussians.check()
-    packing.require_finite(path, gaussians, writing=True)
+    packing.check_writable(path, gaussians)
     rows, count = order(gaussians), len(gaussians)
     rest = 3 * (gaussians.sh.shape[1] - 1)
     lines = ["ply", "format binary_little_endian 1.0", "comment clsplat"]
@@ -118,9 +113,9 @@ def order(gaussians: Gaussians) -> NDArray[np.int64]:
     return packing.morton_order(gaussians.means)
 
 
-def _elements(header: ply.Header, path: Path) -> tuple[ply.Element, ply.Element, ply.Element | None]:
+def _elements(header: ply.Header) -> tuple[ply.Element, ply.Element, ply.Element | None]:
     """chunk, vertex and sh, if there is one, their properties checked."""
-    names = [element.name for element in header.elements]
+    path, names = header.path, [element.name for element in header.elements]
     if header.format == "ascii":
         raise InputError(f"{path}: a compressed PLY in ascii, expected binary")
     for name in ("chunk", "vertex"):
@@ -128,8 +123,7 @@ def _elements(header: ply.Header, path: Path) -> tuple[ply.Element, ply.Element,
             raise InputError(f"{path}: {names.count(name)} elements {name!r} in the header, expected one")
     chunks, vertex = (header.elements[names.index(name)] for name in ("chunk", "vertex"))
     sh = header.elements[names.index("sh")] if "sh" in names else None
-    has = {name for name, _ in chunks.properties}
-    wanted = BOUNDS if has & set(BOUNDS[12:]) else BOUNDS[:12]
+    wanted = BOUNDS if set(dict(chunks.properties)) & set(BOUNDS[12:]) else BOUNDS[:12]
     if missing := [name for name in wanted if (name, "f4") not in chunks.properties]:
         raise InputError(f"{path}: element chunk lacks {' '.join(missing)}, expected floats")
     if missing := [name for name in PACKED if (name, "u4") not in vertex.properties]:
@@ -152,28 +146,15 @@ def _elements(header: ply.Header, path: Path) -> tuple[ply.Element, ply.Element,
     return chunks, vertex, sh
 
 
-def _starts(header: ply.Header, file: BinaryIO, path: Path) -> dict[str, int]:
-    """Start of each element in the file, whose size is checked for all of them."""
-    starts, at = {}, header.size
-    for element in header.elements:
-        starts[element.name] = at
-        at += element.count * header.row_type(element).itemsize
-    if (have := os.fstat(file.fileno()).st_size) < at:
-        raise InputError(f"{path}: truncated: its header promises {at} bytes, {have} are there")
-    return starts
-
-
-def _rows(
-    file: BinaryIO, header: ply.Header, element: ply.Element, at: int, start: int, count: int, path: Path
-) -> NDArray[Any]:
+def _rows(file: BinaryIO, header: ply.Header, element: ply.Element, start: int, count: int) -> NDArray[Any]:
     kind = header.row_type(element)
-    file.seek(at + start * kind.itemsize)
-    return packing.read_rows(file, kind, count, path)
+    file.seek(header.start(header.elements.index(element)) + start * kind.itemsize)
+    return packing.read_rows(file, kind, count, header.path)
 
 
-def _bounds(file: BinaryIO, header: ply.Header, chunks: ply.Element, at: int, path: Path) -> NDArray[np.float32]:
+def _bounds(file: BinaryIO, header: ply.Header, chunks: ply.Element) -> NDArray[np.float32]:
     """(chunks, 3, 2, 3): of position, log scale and colour, the least and the largest."""
-    table = _rows(file, header, chunks, at, 0, chunks.count, path)
+    table = _rows(file, header, chunks, 0, chunks.count)
     bounds = np.zeros((chunks.count, 18), np.float32)
     bounds[:, 15:] = 1
     for index, name in enumerate(BOUNDS):
@@ -181,7 +162,7 @@ def _bounds(file: BinaryIO, header: ply.Header, chunks: ply.Element, at: int, pa
             bounds[:, index] = table[name]
     if not np.isfinite(bounds).all():
         at_chunk = int((~np.isfinite(bounds).all(axis=1)).argmax())
-        raise InputError(f"{path}: chunk {at_chunk} has bounds that are not finite")
+        raise InputError(f"{header.path}: chunk {at_chunk} has bounds that are not finite")
     return bounds.reshape(-1, 3, 2, 3)
 
 
@@ -191,7 +172,7 @@ def _fields(words: NDArray[Any], layout: tuple[tuple[int, int], ...]) -> NDArray
     return np.stack(columns, axis=1).astype(np.float32)
 
 
-def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], found: Gaussians, rows: slice) -> None:
+def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], result: Gaussians, rows: slice) -> None:
     """block: rows of `vertex`; bounds (n, 3, 2, 3) of each."""
 
     def between(words: NDArray[Any], layout: tuple[tuple[int, int], ...], what: int) -> NDArray[np.float32]:
@@ -199,19 +180,13 @@ def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], found: Gaussians, 
         return bounds[:, what, 0] * (1 - part) + bounds[:, what, 1] * part
 
     words = {name: block[name].astype(np.uint32) for name in PACKED}
-    found.means[rows] = between(words["packed_position"], _111011, 0)
-    found.log_scales[rows] = between(words["packed_scale"], _111011, 1)
+    result.means[rows] = between(words["packed_position"], _111011, 0)
+    result.log_scales[rows] = between(words["packed_scale"], _111011, 1)
     with np.errstate(over="ignore"):  # refused below
-        found.sh[rows, 0] = packing.coefficients(between(words["packed_color"], _8888, 2))
-    found.opacity_logits[rows] = packing.byte_logits()[words["packed_color"] & 255]
+        result.sh[rows, 0] = packing.coefficients(between(words["packed_color"], _8888, 2))
+    result.opacity_logits[rows] = packing.byte_logits()[words["packed_color"] & 255]
     others = (_fields(words["packed_rotation"], _ROTATION) - np.float32(0.5)) * np.float32(np.sqrt(2))
-    largest = np.sqrt(np.maximum(1 - np.square(others).sum(axis=1), 0))
-    which = words["packed_rotation"] >> 30
-    quaternions = found.quaternions[rows]
-    for index in range(4):
-        of = which == index
-        quaternions[of, index] = largest[of]
-        quaternions[np.ix_(of, [each for each in range(4) if each != index])] = others[of]
+    result.quaternions[rows] = packing.restore_largest(words["packed_rotation"] >> 30, others)
 
 
 def _values(gaussians: Gaussians, rows: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
@@ -226,7 +201,7 @@ def _values(gaussians: Gaussians, rows: NDArray[np.int64]) -> tuple[NDArray[Any]
 def _ranges(*values: NDArray[Any]) -> NDArray[np.float32]:
     """(chunks, 3, 2, 3) as `_bounds`, of whole chunks but for the last."""
     at = np.arange(0, len(values[0]), CHUNK)
-    ends = [[np.minimum.reduceat(each, at), np.maximum.reduceat(each, at)] for each in values]
+    ends = [[np.minimum.reduceat(column, at), np.maximum.reduceat(column, at)] for column in values]
     return np.asarray(ends, np.float32).transpose(2, 0, 1, 3)
 
 
@@ -251,10 +226,6 @@ def _pack(gaussians: Gaussians, rows: NDArray[np.int64], ranges: NDArray[np.floa
     words[:, 2] = fields(part(scales, 1), _111011)
     opacity = packing.to_bytes(packing.opacities(gaussians.opacity_logits[rows]))
     words[:, 3] = fields(part(rgb, 2), _8888) | opacity
-    q = packing.unit_quaternions(gaussians.quaternions[rows])
-    which = np.abs(q).argmax(axis=1)
-    n = np.arange(len(q))
-    q *= np.where(q[n, which] < 0, -1, 1)[:, None]
-    others = q[np.arange(4) != which[:, None]].reshape(-1, 3)
+    which, others = packing.leave_out_largest(packing.unit_quaternions(gaussians.quaternions[rows]))
     words[:, 1] = fields(others / np.sqrt(2) + 0.5, _ROTATION) | which.astype(np.uint32) << np.uint32(30)
     return words

@@ -23,15 +23,15 @@ from __future__ import annotations
 import io
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, warn
 from clsplat.files import atomic_write, atomic_writer
-from clsplat.gaussians import Gaussians
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.colour import srgb_to_linear
 from clsplat.models.codec import axes, values
 from clsplat.models.codec.axes import LEFT_UP
@@ -45,16 +45,13 @@ from clsplat.models.codec.gltf_asset import (
     Array,
     Asset,
     as_object,
+    real,
+    sh_attributes,
 )
 from clsplat.models.codec.values import BLOCK_ROWS
 from clsplat.models.edit import merge
 from clsplat.models.formats import spz
 from clsplat.spherical_harmonics import C0
-
-NAME = "glTF"
-SUFFIXES = (".gltf", ".glb")
-LOSES = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
-FLOAT = True
 
 GLB_MAGIC = 0x46546C67
 FLOAT32, UINT16 = 5126, 5123
@@ -76,12 +73,17 @@ def describe(path: Path) -> dict[str, Any]:
     return {}
 
 
+def side_files(path: Path) -> list[Path]:
+    """The .bin of a .gltf."""
+    return [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
+
+
 def read(path: Path) -> Gaussians:
     """Read every primitive of Gaussians in the scene, as one model. Raises InputError."""
     asset = Asset.open(path)
     parts = []
     for name, matrix, primitive in list(asset.primitives()):  # all of them are counted first
-        part = asset.gaussians(name, primitive)
+        part = _gaussians(asset, name, primitive)
         # the node's matrix is in glTF's frame, the Gaussians are in ours already
         turn = np.diag([*LEFT_UP, 1.0])
         parts.append(axes.place(part, turn @ matrix @ turn, f"{path}: {name}"))
@@ -90,6 +92,62 @@ def read(path: Path) -> Gaussians:
     model = merge(parts)
     values.require_finite(path, model)
     return model
+
+
+def _gaussians(asset: Asset, name: str, primitive: dict[str, Any]) -> Gaussians:
+    """The primitive's Gaussians in our frame."""
+    said = asset.extension(primitive)
+    kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
+    if kernel != "ellipse":
+        raise InputError(f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse")
+    if space != COLOR_SPACES[0]:
+        warn(f"{asset.path}: the colours are in {str(space)[:40]}, kept as they are")
+    nested = as_object(said.get("extensions", {}))
+    for extension in SPZ_EXTENSIONS:
+        if extension in nested:
+            blob = asset.view(as_object(nested[extension]).get("bufferView"))
+            return spz.read_from(io.BytesIO(blob.data), len(blob), asset.path)
+    return _from_attributes(asset, name, as_object(primitive.get("attributes")))
+
+
+def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussians:
+    def array(semantic: str, width: int) -> Array:
+        if semantic not in indices:
+            raise InputError(f"{asset.path}: {name} lacks the attribute {semantic}")
+        return asset.accessor(indices[semantic], width, semantic)
+
+    position = array("POSITION", 3)
+    count = len(position)
+    asset.total += count
+    size = asset.size + sum(len(buffer) for buffer in asset.buffers.values())
+    values.require_count(asset.path, asset.total if count else 0, size)
+    names = [sh_attributes(degree) for degree in range(MAX_SH_DEGREE + 1)]
+    degree = max((degree for degree in range(4) if indices.keys() & set(names[degree])), default=0)
+    sources = {
+        "means": position,
+        "quaternions": array(f"{EXTENSION}:ROTATION", 4),
+        "log_scales": array(f"{EXTENSION}:SCALE", 3),
+        "opacities": array(f"{EXTENSION}:OPACITY", 1),
+    }
+    coefficients = [array(semantic, 3) for band in names[: degree + 1] for semantic in band]
+    for attribute in (*sources.values(), *coefficients):
+        if len(attribute) != count:
+            raise InputError(f"{asset.path}: {name} has {len(attribute)} values of an attribute, expected {count}")
+    result = values.empty(count, degree)
+    for first in range(0, count, BLOCK_ROWS):
+        rows = slice(first, min(first + BLOCK_ROWS, count))
+        result.means[rows] = real(position[rows])
+        result.quaternions[rows] = real(sources["quaternions"][rows])[:, [3, 0, 1, 2]]
+        scales = real(sources["log_scales"][rows])
+        result.log_scales[rows] = values.log_scales(scales, f"{asset.path}: {name}", first)
+        opacity = real(sources["opacities"][rows])[:, 0]
+        if not ((opacity >= 0) & (opacity <= 1)).all():
+            raise InputError(f"{asset.path}: {name} has an opacity outside [0, 1]")
+        result.opacity_logits[rows] = values.logits(opacity)
+        for index, coefficient in enumerate(coefficients):
+            result.sh[rows, index] = real(coefficient[rows])
+    axes.flip(result, LEFT_UP)
+    return result
 
 
 def write(
@@ -102,10 +160,7 @@ def write(
     """
     if color_space not in COLOR_SPACES:
         raise ValueError(f"color_space {color_space!r}: expected {' or '.join(COLOR_SPACES)}")
-    gaussians.check()
-    values.require_finite(path, gaussians, writing=True)
-    if not len(gaussians):
-        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    values.check_writable(path, gaussians, least=1)
     document, buffer = _document(path, gaussians, spz_compression, color_space)
     if path.suffix.lower() == ".gltf":
         binary = path.with_suffix(".bin")
@@ -194,10 +249,7 @@ def _document(
 ) -> tuple[dict[str, Any], _Buffer]:
     count = len(gaussians)
     attributes = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))]
-    degrees = range(gaussians.sh_degree + 1)
-    attributes += [
-        f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for degree in degrees for index in range(2 * degree + 1)
-    ]
+    attributes += [name for degree in range(gaussians.sh_degree + 1) for name in sh_attributes(degree)]
     attributes.append("COLOR_0")
     corners = [gaussians.means.min(axis=0) * LEFT_UP, gaussians.means.max(axis=0) * LEFT_UP]
     bounds = {"min": np.minimum(*corners).tolist(), "max": np.maximum(*corners).tolist()}
@@ -245,9 +297,7 @@ def _document(
 
 def _spz_blob(path: Path, gaussians: Gaussians) -> bytes:
     """Its means count from the node."""
-    local = Gaussians(
-        gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh
-    )
+    local = replace(gaussians, origin=np.zeros(3))
     blob = io.BytesIO()
     spz.write_to(blob, local, spz.header_for(path, local, 2))
     return blob.getvalue()

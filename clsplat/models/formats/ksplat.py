@@ -25,11 +25,6 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.codec import values as packing
 from clsplat.models.codec.values import BLOCK_ROWS
 
-NAME = "ksplat"
-SUFFIXES = (".ksplat",)
-FLOAT = False
-LOSES = "not written here"
-
 HEADER = np.dtype(
     {
         "names": ["major", "minor", "sections", "count", "level", "least_sh", "largest_sh"],
@@ -40,23 +35,13 @@ HEADER = np.dtype(
 )
 SECTION = np.dtype(
     {
-        "names": [
-            "count",
-            "room",
-            "bucket_size",
-            "buckets",
-            "block",
-            "bucket_bytes",
-            "range",
-            "full",
-            "partial",
-            "degree",
-        ],
+        "names": ["count", "room", "bucket_size", "buckets", "block",
+                  "bucket_bytes", "range", "full", "partial", "degree"],
         "formats": ["<u4", "<u4", "<u4", "<u4", "<f4", "<u2", "<u4", "<u4", "<u4", "<u2"],
         "offsets": [0, 4, 8, 12, 16, 20, 24, 32, 36, 40],
         "itemsize": 1024,
     }
-)
+)  # fmt: skip
 BUCKET_BYTES = 12
 DEFAULT_RANGE = 32767
 DEFAULT_SH = 1.5
@@ -89,8 +74,8 @@ def read(path: Path) -> Gaussians:
             raise InputError(f"{path}: truncated: has {size} bytes, expected a header of {HEADER.itemsize}")
         header = packing.read_rows(file, HEADER, 1, path)[0]
         if header["major"] != 0 or header["minor"] < 1 or header["level"] > 2:
-            found = f"version {header['major']}.{header['minor']}, compression level {header['level']}"
-            raise InputError(f"{path}: {found}, expected a .ksplat of version 0.1, level 0, 1 or 2")
+            version = f"version {header['major']}.{header['minor']}, compression level {header['level']}"
+            raise InputError(f"{path}: {version}, expected a .ksplat of version 0.1, level 0, 1 or 2")
         sections = _sections(file, int(header["sections"]), int(header["level"]), size, path)
         count = sum(section.count for section in sections)
         if count != header["count"] or not count:
@@ -129,7 +114,7 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
     at = HEADER.itemsize + sections * SECTION.itemsize
     if size < at:
         raise InputError(f"{path}: truncated: {sections} sections need {at} bytes, {size} are there")
-    found = []
+    result = []
     for index, fields in enumerate(packing.read_rows(file, SECTION, sections, path)):
         head = {name: fields[name].item() for name in SECTION.names or ()}
         name = f"{path}: section {index}"
@@ -151,9 +136,9 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
             ends = _ends(head, partial, name)
         scale_range = head["range"] or DEFAULT_RANGE
         step = head["block"] / 2 / scale_range
-        found.append(Section(head["count"], start, kind, head["degree"], step, scale_range, centres, ends))
+        result.append(Section(head["count"], start, kind, head["degree"], step, scale_range, centres, ends))
         at = end
-    return found
+    return result
 
 
 def _record(level: int, degree: int) -> np.dtype[Any]:
@@ -184,8 +169,7 @@ def _ends(head: dict[str, Any], partial: NDArray[np.int64], name: str) -> NDArra
 
 def _means(section: Section, block: NDArray[Any], start: int) -> NDArray[Any]:
     if section.centres is None or section.ends is None:
-        positions: NDArray[Any] = block["means"]
-        return positions
+        return block["means"]
     bucket = np.searchsorted(section.ends, np.arange(start, start + len(block)), side="right")
     return (block["means"].astype(np.float64) - section.middle) * section.step + section.centres[bucket]
 

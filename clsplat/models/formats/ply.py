@@ -14,28 +14,23 @@ over both.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR
-from clsplat.errors import InputError, examples, plain
+from clsplat.errors import InputError, examples, warn
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import values
+from clsplat.models.codec.values import BLOCK_ROWS
 
-NAME = "3DGS PLY"
-SUFFIXES = (".ply",)
-FLOAT = True
-LOSES = "nothing"
-
-BLOCK_ROWS = 1 << 15
 MAX_HEADER_LINES = 10_000
 MAX_LINE_BYTES = 1 << 20
 MAX_BLOCK_BYTES, MAX_BLOCK_WORDS = 1 << 26, 1 << 21
@@ -43,14 +38,22 @@ MAX_NUMBER_BYTES = 128
 """The longest number in text, as a row of them is made an array whose elements have the width of the widest."""
 
 TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
 }
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
@@ -76,21 +79,44 @@ class Element:
     properties: list[tuple[str, str]] = field(default_factory=list)
 
     @property
+    def row_bytes(self) -> int:
+        """Bytes of a row, for an element without lists."""
+        return sum(np.dtype(code).itemsize for _, code in self.properties)
+
+    @property
     def has_list(self) -> bool:
         return any(code == "" for _, code in self.properties)
 
 
 @dataclass
 class Header:
-    """format: "ascii" or a key of BYTE_ORDERS; size: the header's length in bytes, `end_header` included; origin: of
-    the element LOCAL; near: the near plane, where it is not the usual one."""
+    """path: of the file, for messages; format: "ascii" or a key of BYTE_ORDERS; size: the header's length in bytes,
+    `end_header` included; origin: of the element LOCAL; near: the near plane, where it is not the usual one."""
 
+    path: Path
     format: str
     elements: list[Element]
     size: int
-    origin: NDArray[np.float64] | None = None
+    origin: Float64 | None = None
     near: float = NEAR
     comments: list[str] = field(default_factory=list)
+
+    @property
+    def vertex(self) -> Element:
+        """The element of the Gaussians. Raises InputError where there is none."""
+        if vertices := [element for element in self.elements if element.name == "vertex"]:
+            return vertices[0]
+        names = examples(element.name for element in self.elements) or "none"
+        raise InputError(f"{self.path}: PLY has no element 'vertex' (elements: {names})")
+
+    @property
+    def before(self) -> list[Element]:
+        """The elements stored before the vertices."""
+        return self.elements[: self.elements.index(self.vertex)]
+
+    def start(self, index: int) -> int:
+        """The place in a binary file of the element at this index, or of the end behind the last one."""
+        return self.size + sum(element.count * element.row_bytes for element in self.elements[:index])
 
     def row_type(self, element: Element) -> np.dtype[Any]:
         """The packed record of one row of a binary file."""
@@ -113,54 +139,52 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     path = Path(path)
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
-        vertex, skipped = _vertex_element(header, path)
-        rest = _check_properties(vertex, path)
+        vertex = header.vertex
+        rest = _check_properties(header)
         if FILTER in dict(vertex.properties):
-            warnings.warn(plain(f"{path}: {FILTER}, mip-splatting's filter, is ignored; fuse it first"), stacklevel=4)
+            warn(f"{path}: {FILTER}, mip-splatting's filter, is ignored; fuse it first")
         if vertex.count == 0:
             raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
-        gaussians = _assemble(read_vertices(file, header, path, "Gaussian"), vertex.count, rest, path)
+        gaussians = _assemble(read_vertices(file, header, "Gaussian"), vertex.count, rest, path)
         if header.origin is not None:
-            _count_from(header.origin, gaussians, _local_means(file, header, vertex, skipped, path), path)
+            _count_from(header.origin, gaussians, _local_means(file, header), path)
         gaussians.near = header.near
         return gaussians
 
 
-def read_blocks(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians in the file's order, some rows at a time, in the world; values that are not finite are passed on.
-    Raises InputError as `read`."""
+def blocks(path: Path) -> tuple[Float64, Iterator[Gaussians]]:
+    """The origin, and the Gaussians in the file's order, some rows at a time, in the world; values that are not finite
+    are passed on. Raises InputError as `read`."""
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
-        vertex, _ = _vertex_element(header, path)
-        rest = _check_properties(vertex, path)
+    return np.zeros(3) if header.origin is None else header.origin, _read_blocks(path)
+
+
+def _read_blocks(path: Path) -> Iterator[Gaussians]:
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+        rest = _check_properties(header)
         higher, kept = rest // 3, min(rest // 3, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
         names = [*DC, *(f"f_rest_{c * higher + k}" for k in range(kept) for c in range(3))]
-        if vertex.count == 0:
-            yield _none(kept)
-        for block in read_vertices(file, header, path, "Gaussian") if vertex.count else ():
+        if header.vertex.count == 0:
+            yield values.empty(0, round((1 + kept) ** 0.5) - 1)
+        for block in read_vertices(file, header, "Gaussian") if header.vertex.count else ():
 
-            def columns(*of: str, block: Block = block) -> NDArray[np.float32]:
+            def columns(*wanted: str, block: Block = block) -> Float32:
                 with np.errstate(over="ignore", invalid="ignore"):
-                    return np.stack([block[name].astype(np.float32) for name in of], axis=1)
+                    return np.stack([block[name].astype(np.float32) for name in wanted], axis=1)
 
             sh = columns(*names).reshape(-1, 1 + kept, 3)
             yield Gaussians(columns(*POSITION), columns(*ROTATION), columns(*SCALE), columns("opacity")[:, 0], sh)
 
 
-def _none(kept: int) -> Gaussians:
-    def array(*shape: int) -> NDArray[np.float32]:
-        return np.empty((0, *shape), np.float32)
-
-    return Gaussians(array(3), array(4), array(3), array(), array(1 + kept, 3))
-
-
 def describe(path: Path) -> dict[str, Any]:
     """The format's part of `clsplat info`: encoding, comments, properties that are ignored, and `near`."""
+    known = {*REQUIRED, "nx", "ny", "nz"}
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
-    vertex, _ = _vertex_element(header, path)
-    known = {*REQUIRED, "nx", "ny", "nz"}
-    ignored = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
+    properties = header.vertex.properties
+    ignored = [name for name, _ in properties if name not in known and not name.startswith("f_rest_")]
     return {"encoding": header.format, "comments": header.comments, "ignored": ignored, "near": header.near}
 
 
@@ -178,8 +202,7 @@ def write(
     line of ASCII, or an array is not as `Gaussians` says; InputError for values that are not finite.
     """
     check_comments(comments)
-    gaussians.check()
-    values.require_finite(Path(path), gaussians, writing=True)
+    values.check_writable(Path(path), gaussians)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
         raise ValueError(f"sh_degree {degree}: expected {gaussians.sh_degree} (the model's) to {MAX_SH_DEGREE}")
@@ -234,15 +257,18 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             break
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
-            origin = _origin(words) if words[:3] == ORIGIN else origin
-            near = _near(words) if words[:3] == NEAR_PLANE else near
+            numbers = _numbers(words[3:])
+            if words[:3] == ORIGIN:
+                origin = numbers if len(numbers) == 3 else None
+            if words[:3] == NEAR_PLANE:
+                near = float(numbers[0]) if len(numbers) == 1 and numbers[0] > 0 else NEAR
             comments += [" ".join(words[1:])] if words else []
             continue
         if words == ["end_header"]:
             if form not in ("ascii", *BYTE_ORDERS):
                 expected = "ascii, binary_little_endian or binary_big_endian"
                 raise InputError(f"{path}: PLY header has the format {form or 'missing'!r}, expected {expected}")
-            return Header(form, elements, file.tell(), origin, near, comments)
+            return Header(path, form, elements, file.tell(), origin, near, comments)
         try:
             match words:
                 case ["format", name, _]:
@@ -262,46 +288,32 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     raise InputError(f"{path}: PLY header is truncated or damaged (no line 'end_header')")
 
 
-def _origin(words: list[str]) -> NDArray[np.float64] | None:
-    """None where the comment is not one of ours after all."""
+def _numbers(words: list[str]) -> Float64:
+    """Finite numbers; none where the comment is not one of ours after all."""
     try:
-        origin = np.array([float(word) for word in words[3:]])
+        values = np.array([float(word) for word in words])
     except ValueError:
-        return None
-    return origin if origin.shape == (3,) and np.isfinite(origin).all() else None
+        return np.empty(0)
+    return values if np.isfinite(values).all() else np.empty(0)
 
 
-def _near(words: list[str]) -> float:
-    """The usual one where the comment is not one of ours after all."""
-    try:
-        near = float(words[3])
-    except (ValueError, IndexError):
-        return NEAR
-    return near if len(words) == 4 and 0 < near < np.inf else NEAR
-
-
-def _local_means(
-    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path
-) -> NDArray[np.float32] | None:
+def _local_means(file: BinaryIO, header: Header) -> Float32 | None:
     """The element LOCAL, if it is right behind the vertices. Raises InputError where it is cut."""
-    behind = header.elements[len(skipped) + 1 :]
-    wanted = Element(LOCAL, vertex.count, [(name, "f4") for name in POSITION])
-    if header.format == "ascii" or not behind or behind[0] != wanted:
+    wanted = Element(LOCAL, header.vertex.count, [(name, "f4") for name in POSITION])
+    behind = len(header.before) + 1
+    if header.format == "ascii" or header.elements[behind : behind + 1] != [wanted]:
         return None
-    before = [*skipped, vertex]
-    file.seek(header.size + sum(element.count * header.row_type(element).itemsize for element in before))
+    file.seek(header.start(behind))
     row = header.row_type(wanted)
-    data = file.read(vertex.count * row.itemsize)
-    if len(data) != vertex.count * row.itemsize:
-        need = vertex.count * row.itemsize
-        raise InputError(f"{path}: truncated: element {LOCAL} needs {need} bytes, {len(data)} are there")
+    need = wanted.count * row.itemsize
+    data = file.read(need)
+    if len(data) != need:
+        raise InputError(f"{header.path}: truncated: element {LOCAL} needs {need} bytes, {len(data)} are there")
     rows = np.frombuffer(data, row)
     return np.stack([rows[name] for name in POSITION], axis=1).astype(np.float32)
 
 
-def _count_from(
-    origin: NDArray[np.float64], gaussians: Gaussians, local: NDArray[np.float32] | None, path: Path
-) -> None:
+def _count_from(origin: Float64, gaussians: Gaussians, local: Float32 | None, path: Path) -> None:
     """Have the means count from the origin: as they were written, unless the vertices were moved since."""
     world = gaussians.means.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -320,19 +332,9 @@ def _count(text: str) -> int:
     return count
 
 
-def _vertex_element(header: Header, path: Path) -> tuple[Element, list[Element]]:
-    """The vertex element and those stored before it."""
-    names = [element.name for element in header.elements]
-    if "vertex" not in names:
-        found = examples(names) or "none"
-        raise InputError(f"{path}: PLY has no element 'vertex' (elements: {found})")
-    at = names.index("vertex")
-    return header.elements[at], header.elements[:at]
-
-
-def _check_properties(vertex: Element, path: Path) -> int:
+def _check_properties(header: Header) -> int:
     """The number of f_rest properties. Raises InputError where the layout is not a 3DGS model's."""
-    names = [name for name, _ in vertex.properties]
+    path, names = header.path, [name for name, _ in header.vertex.properties]
     missing = [name for name in REQUIRED if name not in names]
     if missing:
         noun = "property" if len(missing) == 1 else "properties"
@@ -346,37 +348,35 @@ def _check_properties(vertex: Element, path: Path) -> int:
             raise InputError(f"{path}: PLY lacks the property f_rest_{index}, though it has {rest} of f_rest")
     if rest == counts[-1]:
         left_out = f"SH of degree {MAX_SH_DEGREE + 1} is left out, {MAX_SH_DEGREE} is the highest that is known"
-        warnings.warn(plain(f"{path}: {left_out}"), stacklevel=3)
+        warn(f"{path}: {left_out}")
     return rest
 
 
 Block = dict[str, NDArray[Any]]
 
 
-def read_vertices(file: BinaryIO, header: Header, path: Path, what: str) -> Iterator[Block]:
+def read_vertices(file: BinaryIO, header: Header, what: str) -> Iterator[Block]:
     """Columns of the vertices by name, a block of rows at a time; `what` a vertex is, for messages.
 
     That the file has as many as its header says is checked before the first block, binary files to the byte and ascii
     ones as far as their length can tell, so that `count` rows may be allocated then. Raises InputError.
     """
-    vertex, skipped = _vertex_element(header, path)
+    path, vertex = header.path, header.vertex
     names = [name for name, _ in vertex.properties]
     if double := next((name for name in names if names.count(name) > 1), None):
         raise InputError(f"{path}: PLY has the property {double} twice")
     if vertex.has_list:
         raise InputError(f"{path}: PLY has a list property in its vertices, expected numbers only")
     read = _ascii_blocks if header.format == "ascii" else _binary_blocks
-    return read(file, header, vertex, skipped, path, what)
+    return read(file, header, what)
 
 
-def _binary_blocks(
-    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path, what: str
-) -> Iterator[Block]:
-    start = header.size
-    for element in skipped:
+def _binary_blocks(file: BinaryIO, header: Header, what: str) -> Iterator[Block]:
+    path, vertex = header.path, header.vertex
+    for element in header.before:
         if element.has_list:
             raise InputError(f"{path}: PLY has lists (element {element.name!r}) before its vertices, not supported")
-        start += element.count * sum(np.dtype(code).itemsize for _, code in element.properties)
+    start = header.start(len(header.before))
     row = header.row_type(vertex)
     need, have = vertex.count * row.itemsize, max(0, os.fstat(file.fileno()).st_size - start)
     if have < need:
@@ -385,15 +385,12 @@ def _binary_blocks(
             f"{path}: truncated: {vertex.count} {what}s need {need} bytes, {have} are there ({whole} {what}s)"
         )
     if have > need and header.elements[-1] is vertex:
-        warnings.warn(plain(f"{path}: {have - need} bytes after the last {what} ignored"), stacklevel=4)
+        warn(f"{path}: {have - need} bytes after the last {what} ignored")
     file.seek(start)
     block = min(BLOCK_ROWS, max(MAX_BLOCK_BYTES // max(row.itemsize, 1), 1))
     for first in range(0, vertex.count, block):
         count = min(block, vertex.count - first)
-        data = file.read(count * row.itemsize)
-        if len(data) != count * row.itemsize:
-            raise InputError(f"{path}: truncated while it was read")
-        rows = np.frombuffer(data, row)
+        rows = values.read_rows(file, row, count, path)
         yield {name: rows[name] for name, _ in vertex.properties}
 
 
@@ -406,14 +403,13 @@ def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
             yield line
 
 
-def _ascii_blocks(
-    file: BinaryIO, header: Header, vertex: Element, skipped: list[Element], path: Path, what: str
-) -> Iterator[Block]:
+def _ascii_blocks(file: BinaryIO, header: Header, what: str) -> Iterator[Block]:
     """float64. A row is at least a character and a blank for each property."""
+    path, vertex = header.path, header.vertex
     lines = _text_lines(file, path)
     least, have = 2 * vertex.count * len(vertex.properties) - 1, os.fstat(file.fileno()).st_size - header.size
     too_many = have < least
-    for element in skipped:
+    for element in header.before:
         for _ in islice(lines, element.count):
             pass
     width = len(vertex.properties)
@@ -436,7 +432,7 @@ def _ascii_blocks(
             raise InputError(f"{path}: a value after {what} {first} is no number ({error})") from None
         yield {name: table[:, index] for index, (name, _) in enumerate(vertex.properties)}
     if header.elements[-1] is vertex and next(lines, None) is not None:
-        warnings.warn(plain(f"{path}: text after the last {what} ignored"), stacklevel=4)
+        warn(f"{path}: text after the last {what} ignored")
 
 
 def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gaussians:
@@ -445,20 +441,18 @@ def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gau
     kept = min(higher, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
     # The first block is read before anything is allocated: an ascii file's count is only a claim.
     first_block = next(blocks)
-    means, scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
-    quaternions, opacities = np.empty((count, 4), np.float32), np.empty(count, np.float32)
-    sh = np.empty((count, 1 + kept, 3), np.float32)
-    columns: dict[str, NDArray[np.float32]] = {"opacity": opacities}
-    for names, array in ((POSITION, means), (SCALE, scales), (ROTATION, quaternions), (DC, sh[:, 0])):
+    result = values.empty(count, round((1 + kept) ** 0.5) - 1)
+    columns: dict[str, Float32] = {"opacity": result.opacity_logits}
+    arrays = (result.means, result.log_scales, result.quaternions, result.sh[:, 0])
+    for names, array in zip((POSITION, SCALE, ROTATION, DC), arrays, strict=True):
         columns.update({name: array[:, index] for index, name in enumerate(names)})
     for index in range(rest):
         if index % higher < kept:
-            columns[f"f_rest_{index}"] = sh[:, 1 + index % higher, index // higher]
+            columns[f"f_rest_{index}"] = result.sh[:, 1 + index % higher, index // higher]
 
     start, bad_positions, first_bad = 0, 0, -1
     other: tuple[int, str] | None = None
-    block: Block | None = first_block
-    while block is not None:
+    for block in chain([first_block], blocks):
         stop = start + len(block["x"])
         bad = np.zeros(stop - start, bool)
         for name, column in columns.items():
@@ -472,7 +466,7 @@ def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gau
         if bad.any():
             first_bad = first_bad if bad_positions else start + int(bad.argmax())
             bad_positions += int(bad.sum())
-        start, block = stop, next(blocks, None)
+        start = stop
 
     if bad_positions:
         raise InputError(
@@ -480,4 +474,4 @@ def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gau
         )
     if other is not None:
         raise InputError(f"{path}: {other[1]} of Gaussian {other[0]} is not finite")
-    return Gaussians(means, quaternions, scales, opacities, sh)
+    return result

@@ -18,8 +18,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
-import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -31,8 +29,8 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float32, Float64
-from clsplat.errors import InputError, plain
+from clsplat.arrays import Float32, Float64, numbers
+from clsplat.errors import InputError, plain, warn
 from clsplat.files import (
     MAX_DOCUMENT,
     atomic_write,
@@ -49,19 +47,13 @@ from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.reading import error_of, open_image
 from clsplat.models.codec import values as packing
 from clsplat.models.codec.palette import codebook, nearest, palette
-
-NAME = "SOG"
-SUFFIXES = ("meta.json", ".sog")
-LOSES = "positions to 16 bits, the rest to 8, spherical harmonics to a palette"
-FLOAT = False
+from clsplat.progress import Progress, no_progress
 
 Bytes = NDArray[np.uint8]
 
-Progress = Callable[[str, float | None], None]
-
 META = "meta.json"
 PICTURES = ("means", "quats", "scales", "sh0", "shN")
-"""Beginnings of the pictures' names that are written."""
+"""Beginnings of the pictures' names."""
 SH_PICTURES = ("shN_centroids.webp", "shN_labels.webp")
 MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
@@ -83,6 +75,12 @@ def describe(path: Path) -> dict[str, Any]:
     return {"version": meta.get("version", 1), "antialiased": bool(meta.get("antialias", False))}
 
 
+def side_files(path: Path) -> list[Path]:
+    """The pictures of a meta.json."""
+    pictures = sorted(path.parent.glob("*.webp")) if path.name == META else []
+    return [picture for picture in pictures if picture.stem.partition("_")[0] in PICTURES]
+
+
 def read(path: Path) -> Gaussians:
     """Read a .sog, or a meta.json with its pictures, or the folder that has them. Raises InputError."""
     with _opened(path) as files:
@@ -97,7 +95,6 @@ class _Files:
 
     def __init__(self, path: Path) -> None:
         self.path = path / META if path.is_dir() else path
-        self.size = 0
 
     def meta(self) -> dict[str, Any]:
         return self.parsed(read_document(self.path, "SOG's meta.json"))
@@ -114,15 +111,14 @@ class _Files:
     def file(self, name: str, limit: int) -> Path:  # noqa: ARG002  # an archive needs the limit
         folder = Path(os.path.realpath(self.path)).parent
         try:
-            found = Path(os.path.realpath(folder / name))
+            picture = Path(os.path.realpath(folder / name))
         except ValueError:  # a zero byte
-            found = folder
-        if found.parent != folder:
+            picture = folder
+        if picture.parent != folder:
             raise InputError(f"{self.path}: has a picture {name[:80]!r}, expected one beside it")
-        if not is_file(found):
+        if not is_file(picture):
             raise InputError(f"{self.path}: its picture {name} is missing")
-        self.size += found.stat().st_size
-        return found
+        return picture
 
 
 class _Archive(_Files):
@@ -133,14 +129,9 @@ class _Archive(_Files):
         self.archive, self.folder = archive, folder
 
     def meta(self) -> dict[str, Any]:
-        return self.parsed(self.unpacked(META, MAX_DOCUMENT).read_bytes())
+        return self.parsed(self.file(META, MAX_DOCUMENT).read_bytes())
 
     def file(self, name: str, limit: int) -> Path:
-        found = self.unpacked(name, limit)
-        self.size += found.stat().st_size
-        return found
-
-    def unpacked(self, name: str, limit: int) -> Path:
         target = self.folder / f"file{META[-5:] if name == META else '.webp'}"
         try:
             with self.archive.open(name) as source, target.open("wb") as file:
@@ -193,25 +184,20 @@ class _Meta:
             raise InputError(f"{self.path}: has {str(count)[:20]} Gaussians, expected at least one")
         self.count = count
         if meta.get("antialias"):
-            warnings.warn(
-                plain(f"{self.path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=4
-            )
+            warn(f"{self.path}: trained with anti-aliasing, which this renderer does not do")
 
     def section(self, name: str) -> dict[str, Any]:
-        found = self.meta.get(name)
-        if not isinstance(found, dict):
+        value = self.meta.get(name)
+        if not isinstance(value, dict):
             raise InputError(f"{self.path}: {META} has no {name}")
-        return found
+        return value
 
     def numbers(self, section: str, key: str, least: int, most: int) -> NDArray[np.float64]:
         value = self.section(section).get(key)
-        try:
-            found = np.atleast_1d(np.array(value, np.float64))
-        except (TypeError, ValueError, OverflowError):
-            found = np.empty(0)
-        if found.ndim != 1 or not least <= len(found) <= most or not np.isfinite(found).all():
+        array = numbers(value if isinstance(value, list) else [value])
+        if array.ndim != 1 or not least <= len(array) <= most or not np.isfinite(array).all():
             raise InputError(f"{self.path}: {key} of {section} in {META} are not {least} numbers")
-        return found
+        return array
 
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
         """(height, width, channels) of the bytes, with room for every Gaussian, or `least` pixels."""
@@ -229,14 +215,14 @@ class _Meta:
                     f"{file}: is {spec.width} x {spec.height} with {spec.nchannels} channels, expected at least "
                     f"{least} pixels with {channels}"
                 )
-            found = source.read_image(oiio.UINT8)
+            decoded = source.read_image(oiio.UINT8)
             reason = error_of(source)
             source.close()
-            if found is None or reason:
+            if decoded is None or reason:
                 raise InputError(f"{file}: does not decode: {reason or 'the decoder gives no reason'}")
         except InputError as error:
             raise InputError(str(error).replace(str(file), f"{self.path}: {names[index][:80]}", 1)) from None
-        return np.asarray(found).reshape(spec.height, spec.width, -1)[:, :, :channels]
+        return np.asarray(decoded).reshape(spec.height, spec.width, -1)[:, :, :channels]
 
     def pixels(self, section: str, index: int, channels: int) -> Bytes:
         return self.picture(section, index, channels).reshape(-1, channels)[: self.count]
@@ -281,65 +267,51 @@ class _Meta:
         table = self.picture("shN", 0, 3, least=needed)
         width = table.shape[1] // PALETTE_COLUMNS
         said = self.section("shN").get("bands") if self.version == 2 else None
-        bands = next((degree for degree, each in COEFFICIENTS.items() if each == width and degree), 0)
+        bands = next((degree for degree, coefficients in COEFFICIENTS.items() if coefficients == width and degree), 0)
         if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
             raise InputError(f"{self.path}: shN's palette is {table.shape[1]} pixels wide for {str(said)[:20]} bands")
         colours = table.reshape(-1, width, 3)
         if needed > len(colours):
             raise InputError(f"{self.path}: shN has an index {needed - 1} into a palette of {len(colours)}")
-        rest: Float32 = self.dequantised("shN", colours)[label]
-        return rest
+        return np.asarray(self.dequantised("shN", colours)[label])
 
 
 def _unpacked_quaternions(pixels: Bytes) -> Float32:
     tag = pixels[:, 3].astype(np.int64) - LARGEST_TAG
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
-    largest = np.sqrt(np.maximum(0, 1 - np.square(three).sum(axis=1)))
-    result = np.zeros((len(pixels), 4), np.float32)
-    result[tag < 0, 0] = 1  # no rotation, like the other reader
-    for index in range(4):
-        chosen = tag == index
-        result[np.ix_(chosen, [each for each in range(4) if each != index])] = three[chosen]
-        result[chosen, index] = largest[chosen]
+    result = packing.restore_largest(np.maximum(tag, 0), three)
+    result[tag < 0] = (1, 0, 0, 0)  # no rotation, like the other reader
     return result
 
 
-def _no_progress(stage: str, part: float | None = None) -> None:
-    """Do nothing: progress that nobody reads."""
-
-
 def write(
-    path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool = False, progress: Progress = _no_progress
+    path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool = False, progress: Progress = no_progress
 ) -> None:
     """Write version 2: a .sog archive, or a meta.json with its pictures beside it, which are there before it is.
 
     iterations: of k-means for the palette. sort: by place (Morton's order), so that the pictures compress better; the
-    Gaussians come back in that order. progress: hears what is made, and what part of it is there. Means count from the
+    Gaussians come back in that order. progress: called with what is made, and the part of it. Means count from the
     world's origin: far from it they lose more. The same Gaussians give the same values. Raises InputError for values
     that are not finite.
     """
-    gaussians.check()
-    packing.require_finite(path, gaussians, writing=True)
-    if not len(gaussians):
-        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    packing.check_writable(path, gaussians, least=1)
     with scratch_folder(_room(len(gaussians))) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)
         meta = _pictures(folder, gaussians, order, iterations, progress)
         text = json.dumps(meta, separators=(",", ":")).encode()
         files = sorted(folder.iterdir())
         if path.name.lower().endswith(".json"):
-            for each in files:
-                with atomic_writer(path.with_name(each.name), each.stat().st_size) as file, each.open("rb") as source:
-                    shutil.copyfileobj(source, file)
+            for picture in files:
+                atomic_write(path.with_name(picture.name), picture.read_bytes())
             atomic_write(path, text)
-            for name in {*SH_PICTURES} - {each.name for each in files}:  # of a model that had more SH
+            for name in {*SH_PICTURES} - {picture.name for picture in files}:  # of a model that had more SH
                 path.with_name(name).unlink(missing_ok=True)
             return
-        total = sum(each.stat().st_size for each in files)
+        total = sum(picture.stat().st_size for picture in files)
         with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:  # stored: WebP is compressed
             archive.writestr(zipfile.ZipInfo(META), text)
-            for each in files:
-                archive.writestr(zipfile.ZipInfo(each.name), each.read_bytes())
+            for picture in files:
+                archive.writestr(zipfile.ZipInfo(picture.name), picture.read_bytes())
 
 
 def _room(count: int) -> int:
@@ -354,7 +326,7 @@ def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, p
     height = 4 * math.ceil(count / width / 4)
 
     def picture(name: str, columns: list[Bytes]) -> str:
-        pixels = np.zeros((height * width, sum(each.shape[1] for each in columns)), np.uint8)
+        pixels = np.zeros((height * width, sum(column.shape[1] for column in columns)), np.uint8)
         pixels[:count] = np.concatenate(columns, axis=1)
         _write_webp(folder / name, pixels.reshape(height, width, -1))
         return name
@@ -416,10 +388,7 @@ def _indices(entries: Float32, values: Float32) -> Bytes:
 
 
 def _packed_quaternions(unit: Float64) -> Bytes:
-    largest = np.abs(unit).argmax(axis=1)
-    sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1, 1)
-    others = np.array([[each for each in range(4) if each != index] for index in range(4)])[largest]
-    three = np.take_along_axis(unit, others, axis=1) * sign
+    largest, three = packing.leave_out_largest(unit)
     steps = np.rint(np.clip(three * 2**0.5 * 0.5 + 0.5, 0, 1) * 255)
     return np.column_stack([steps, largest + LARGEST_TAG]).astype(np.uint8)
 

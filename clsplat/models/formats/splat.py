@@ -21,11 +21,6 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.codec import values
 from clsplat.models.codec.values import BLOCK_ROWS
 
-NAME = "splat"
-SUFFIXES = (".splat",)
-FLOAT = False
-LOSES = "SH beyond degree 0; colour, opacity and rotation to 8 bits, colour beyond 0 to 1"
-MAX_SH_DEGREE = 0
 UNIT_SLACK = 0.1
 """Bytes make unit quaternions longer by 0.02 at most."""
 
@@ -41,17 +36,17 @@ def read(path: Path) -> Gaussians:
             raise InputError(f"{path}: has {size} bytes, expected some Gaussians of {ROW.itemsize} bytes each")
         _check_first(values.read_rows(file, ROW, min(BLOCK_ROWS, count), path), path)
         file.seek(0)
-        found = values.empty(count, 0)
+        result = values.empty(count, 0)
         for start in range(0, count, BLOCK_ROWS):
             block = values.read_rows(file, ROW, min(BLOCK_ROWS, count - start), path)
             rows = slice(start, start + len(block))
-            found.means[rows] = block["means"]
-            found.log_scales[rows] = values.log_scales(block["scales"], path, start)
-            found.sh[rows, 0] = values.coefficients(block["rgba"][:, :3] / 255)
-            found.opacity_logits[rows] = values.byte_logits()[block["rgba"][:, 3]]
-            found.quaternions[rows] = block["quaternions"].astype(np.float32) / 128 - 1
-    values.require_finite(path, found)
-    return found
+            result.means[rows] = block["means"]
+            result.log_scales[rows] = values.log_scales(block["scales"], path, start)
+            result.sh[rows, 0] = values.coefficients(block["rgba"][:, :3] / 255)
+            result.opacity_logits[rows] = values.byte_logits()[block["rgba"][:, 3]]
+            result.quaternions[rows] = block["quaternions"].astype(np.float32) / 128 - 1
+    values.require_finite(path, result)
+    return result
 
 
 def _check_first(block: Any, path: Path) -> None:
@@ -63,8 +58,7 @@ def _check_first(block: Any, path: Path) -> None:
 
 def write(path: Path, gaussians: Gaussians) -> None:
     """Write it, atomically."""
-    gaussians.check()
-    values.require_finite(path, gaussians, writing=True)
+    values.check_writable(path, gaussians)
     with atomic_writer(path, ROW.itemsize * len(gaussians)) as file:
         for start in range(0, len(gaussians), BLOCK_ROWS):
             rows = slice(start, start + BLOCK_ROWS)

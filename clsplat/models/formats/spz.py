@@ -21,29 +21,25 @@ import gzip
 import io
 import os
 import struct
-import warnings
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, warn
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import spz_bytes, values
 from clsplat.models.codec.axes import UP_BACK, Signs, flip, quaternion_signs, sh_signs
 from clsplat.models.codec.values import BLOCK_ROWS
 
-NAME = "SPZ"
-SUFFIXES = (".spz",)
-LOSES = "positions to 24 bits fixed point, the rest to 8 or 10 bits, spherical harmonics to 6"
-FLOAT = False
-
 MAGIC = b"NGSP"
+Stream = Any
+"""A file, or a reader of gzip or Zstandard."""
 VERSIONS = (2, 3, 4)
 DEFAULT_VERSION = 4
 """Version that the format's library and splat-transform write."""
@@ -63,10 +59,6 @@ MAX_WINDOW = 1 << 27
 COLOUR_SCALE = 0.15 * 255
 
 
-class Stream(Protocol):
-    def readinto(self, buffer: memoryview, /) -> int | None: ...
-
-
 @dataclass(frozen=True)
 class Header:
     version: int
@@ -82,7 +74,8 @@ class Header:
         """Bytes that a Gaussian has of each attribute, in the file's order."""
         rest = 3 * (self.degree * (self.degree + 2))
         rotations = 3 if self.version == 2 else 4
-        return {"positions": 9, "alphas": 1, "colours": 3, "scales": 3, "rotations": rotations, "sh": rest}
+        widths = {"positions": 9, "alphas": 1, "colours": 3, "scales": 3, "rotations": rotations}
+        return widths | ({"sh": rest} if rest else {})
 
 
 def recognises(head: bytes) -> bool:
@@ -114,23 +107,21 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     header, stream = _open(file, size, path)
     values.require_count(path, header.count, size)
     if header.degree > MAX_SH_DEGREE:
-        warnings.warn(
-            plain(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out"), stacklevel=3
-        )
+        warn(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out")
     if header.flags & ANTIALIASED:
-        warnings.warn(plain(f"{path}: trained with anti-aliasing, which this renderer does not do"), stacklevel=3)
+        warn(f"{path}: trained with anti-aliasing, which this renderer does not do")
     result = values.empty(header.count, min(header.degree, MAX_SH_DEGREE))
     if header.version == 4:
         signs = _frame(_records(file.read(header.table - 32), path), path) if header.flags & HAS_EXTENSIONS else UP_BACK
         _unpack(_zstd_streams(file, header, size, path), header, signs, result, path)
         return result
     assert stream is not None
-    _unpack(((name, stream) for name, width in header.widths.items() if width), header, UP_BACK, result, path)
+    _unpack(((name, stream) for name in header.widths), header, UP_BACK, result, path)
     behind = _rest(stream, path)
     if header.flags & HAS_EXTENSIONS and (signs := _frame(_records(behind, path), path)) != UP_BACK:
         flip(result, (signs[0] * UP_BACK[0], signs[1] * UP_BACK[1], signs[2] * UP_BACK[2]))
     elif behind and not header.flags & HAS_EXTENSIONS:
-        warnings.warn(plain(f"{path}: bytes after the last Gaussian ignored"), stacklevel=3)
+        warn(f"{path}: bytes after the last Gaussian ignored")
     return result
 
 
@@ -142,7 +133,7 @@ def _open(file: BinaryIO, size: int, path: Path) -> tuple[Header, Any]:
             raise InputError(f"{path}: truncated: {len(head)} bytes, expected a header of 32")
         header = Header(4, *struct.unpack("<IBBBBI", head[8:20]))
         _check(header, path)
-        expected = sum(width > 0 for width in header.widths.values())
+        expected = len(header.widths)
         if header.streams != expected:
             raise InputError(f"{path}: SPZ has {header.streams} streams, expected {expected}")
         if not 32 <= header.table <= min(32 + MAX_EXTENSIONS, size - 16 * expected):
@@ -176,20 +167,20 @@ def _check(header: Header, path: Path) -> None:
 
 def _records(data: bytes, path: Path) -> dict[int, bytes]:
     """Extensions by their type. Each is its type and its length, 32 bits each, and then its bytes."""
-    found, at = {}, 0
+    records, at = {}, 0
     while len(data) - at >= 8:
         kind, length = struct.unpack_from("<II", data, at)
         if length > len(data) - at - 8:
             raise InputError(f"{path}: truncated: SPZ extension {kind:#x} of {length} bytes")
-        found[kind] = data[at + 8 : at + 8 + length]
+        records[kind] = data[at + 8 : at + 8 + length]
         at += 8 + length
-    return found
+    return records
 
 
 def _frame(records: dict[int, bytes], path: Path) -> Signs:
-    if len(found := records.get(COORDINATE_SYSTEM, b"")) != 4:
+    if len(system := records.get(COORDINATE_SYSTEM, b"")) != 4:
         return UP_BACK
-    (value,) = struct.unpack("<I", found)
+    (value,) = struct.unpack("<I", system)
     if value >= len(FRAMES):
         raise InputError(f"{path}: SPZ in the coordinate system {value}, expected one with y up or down (0 to 8)")
     return FRAMES[value]
@@ -214,8 +205,7 @@ def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iter
     file.seek(header.table)
     table = file.read(16 * header.streams)
     at = header.table + len(table)
-    names = [name for name, width in header.widths.items() if width]
-    for name, (packed, unpacked) in zip(names, struct.iter_unpack("<QQ", table), strict=True):
+    for name, (packed, unpacked) in zip(header.widths, struct.iter_unpack("<QQ", table), strict=True):
         wanted = header.count * header.widths[name]
         if packed > size - at:
             raise InputError(f"{path}: truncated: {name} have {packed} bytes, {size - at} are there")
@@ -229,40 +219,42 @@ def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iter
             if _rest(stream, path):
                 raise InputError(f"{path}: {name} have more than {wanted} bytes unpacked")
     if at != size:
-        warnings.warn(plain(f"{path}: {size - at} bytes after the last Gaussian ignored"), stacklevel=5)
+        warn(f"{path}: {size - at} bytes after the last Gaussian ignored")
 
 
 def _fill(stream: Stream, buffer: memoryview, path: Path, what: str) -> None:
-    import zstandard
-
     at = 0
-    try:
+    with _decompressing(path, f"within {what}"):
         while at < len(buffer):
             got = stream.readinto(buffer[at:])
             if not got:
                 raise EOFError
             at += got
-    except EOFError:
-        raise InputError(f"{path}: truncated within {what}") from None
-    except (zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as error:
-        raise InputError(f"{path}: does not decompress within {what} ({error}); is it damaged?") from None
 
 
 def _rest(stream: Any, path: Path) -> bytes:
     """The bytes after the Gaussians, up to MAX_EXTENSIONS; gzip checks its sum at the end."""
+    with _decompressing(path, "at its end"):
+        return bytes(stream.read(MAX_EXTENSIONS))
+
+
+@contextmanager
+def _decompressing(path: Path, place: str) -> Iterator[None]:
+    """Raise InputError for a stream that ends, or is damaged, at this place."""
     import zstandard
 
     try:
-        return bytes(stream.read(MAX_EXTENSIONS))
+        yield
     except EOFError:
-        raise InputError(f"{path}: truncated at its end") from None
+        raise InputError(f"{path}: truncated {place}") from None
     except (zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as error:
-        raise InputError(f"{path}: does not decompress to its end ({error}); is it damaged?") from None
+        raise InputError(f"{path}: does not decompress {place} ({error}); is it damaged?") from None
 
 
 def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs, result: Gaussians, path: Path) -> None:
     buffer = bytearray(BLOCK_ROWS * max(header.widths.values()))
     alpha_logits = values.byte_logits()
+    means_factor = np.array(signs, np.float32) * np.float32(0.5**header.fractional_bits)
     # as wide as the array: NumPy is several times slower where the last axis is short
     sh_factor = np.repeat(sh_signs(signs)[1 : result.sh.shape[1], None] / np.float32(128), 3, axis=1)
     for name, stream in streams:
@@ -274,7 +266,7 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
             block = np.frombuffer(view, np.uint8).reshape(-1, width)
             match name:
                 case "positions":
-                    result.means[rows] = spz_bytes.fixed(block) * _means_factor(header, signs)
+                    result.means[rows] = spz_bytes.fixed(block) * means_factor
                 case "alphas":
                     result.opacity_logits[rows] = alpha_logits[block[:, 0]]
                 case "colours":
@@ -289,10 +281,6 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
                     rest = result.sh[rows, 1:]
                     np.subtract(block.reshape(len(block), -1, 3)[:, : kept - 1], np.float32(128), out=rest)
                     rest *= sh_factor
-
-
-def _means_factor(header: Header, signs: Signs) -> NDArray[np.float32]:
-    return np.array(signs, np.float32) * np.float32(0.5**header.fractional_bits)
 
 
 def write(
@@ -313,8 +301,7 @@ def write(
     """
     if version not in VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
-    gaussians.check()
-    values.require_finite(path, gaussians, writing=True)
+    values.check_writable(path, gaussians, least=1)
     header = header_for(path, gaussians, version, fractional_bits, ANTIALIASED if antialiased else 0)
     with atomic_writer(path) as file:
         write_to(file, gaussians, header, sh_bits)
@@ -323,9 +310,7 @@ def write(
 def header_for(
     path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None, flags: int = 0
 ) -> Header:
-    """The header for `write_to`. Raises InputError for positions that do not fit, and for no Gaussians."""
-    if not len(gaussians):
-        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    """The header for `write_to`, of at least one Gaussian. Raises InputError for positions that do not fit."""
     bits = _fractional_bits(path, gaussians, fractional_bits)
     return Header(version, len(gaussians), gaussians.sh_degree, bits, flags)
 
@@ -336,12 +321,12 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
         fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:
             stream.write(MAGIC + struct.pack("<IIBBBB", *fields))
-            for name in (name for name, width in header.widths.items() if width):
+            for name in header.widths:
                 _pack(name, gaussians, header, sh_bits, stream.write)
         return
     import zstandard
 
-    names = [name for name, width in header.widths.items() if width]
+    names = list(header.widths)
     numbers = (4, header.count, header.degree, header.fractional_bits, header.flags, len(names), 32)
     file.write(MAGIC + struct.pack("<IIBBBBI12x", *numbers))
     table = file.tell()

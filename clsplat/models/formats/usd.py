@@ -19,7 +19,6 @@ import os
 import shutil
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -29,17 +28,12 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from clsplat.arrays import Float32
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, warn
 from clsplat.files import atomic_writer, native_name, open_input, scratch_folder
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import axes
 from clsplat.models.codec import values as packing
 from clsplat.models.edit import merge
-
-NAME = "OpenUSD"
-SUFFIXES = (".usda", ".usdc", ".usdz", ".usd")
-LOSES = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
-FLOAT = True
 
 TYPE = "ParticleField3DGaussianSplat"
 TYPES = (TYPE, "ParticleField_3DGaussianSplat")
@@ -69,9 +63,9 @@ def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **ar
     binary file says to anywhere, and so deep into a file that its stack ends."""
     _pxr(path)
     with open_input(path, "a USD stage") as file:
-        alone, found = _stands_alone(file), os.fstat(file.fileno())
+        alone, status = _stands_alone(file), os.fstat(file.fileno())
     words = json.dumps(arguments)
-    if not (alone or _lives(call, words, os.path.realpath(path), found.st_mtime_ns, found.st_size)):
+    if not (alone or _lives(call, words, os.path.realpath(path), status.st_mtime_ns, status.st_size)):
         raise InputError(f"{path}: USD's library crashes when it reads it; is it damaged, or a file that it refers to?")
 
 
@@ -172,16 +166,16 @@ def read_here(path: Path) -> Gaussians:
 
 def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int | None) -> Float32 | None:
     """(count, width), from the attribute of floats or that of halves; None where neither has a value."""
-    for each in (name, f"{name}h"):
-        attribute = prim.GetAttribute(each)
+    for key in (name, f"{name}h"):
+        attribute = prim.GetAttribute(key)
         value = attribute.Get(time) if attribute else None
         if value is not None:
-            found = np.asarray(value)
-            if found.size % width or not np.issubdtype(found.dtype, np.floating):
-                raise InputError(f"{where}: {each} are {found.dtype} {found.shape}, expected rows of {width} numbers")
-            rows = found.reshape(-1, width)
+            array = np.asarray(value)
+            if array.size % width or not np.issubdtype(array.dtype, np.floating):
+                raise InputError(f"{where}: {key} are {array.dtype} {array.shape}, expected rows of {width} numbers")
+            rows = array.reshape(-1, width)
             if count is not None and len(rows) < count:
-                raise InputError(f"{where}: has {len(rows)} {each}, expected {count}")
+                raise InputError(f"{where}: has {len(rows)} {key}, expected {count}")
             return rows[:count].astype(np.float32)
     return None
 
@@ -200,7 +194,7 @@ def _gaussians(where: str, prim: Any, time: Any) -> Gaussians:
         raise InputError(f"{where}: lacks {COEFFICIENTS}")
     sh = sh.reshape(count, coefficients, 3)
     if degree > MAX_SH_DEGREE:
-        warnings.warn(plain(f"{where}: SH of degree {degree}, those above {MAX_SH_DEGREE} left out"), stacklevel=3)
+        warn(f"{where}: SH of degree {degree}, those above {MAX_SH_DEGREE} left out")
         sh = np.ascontiguousarray(sh[:, : (MAX_SH_DEGREE + 1) ** 2])
     # what the schema says where an attribute is absent: no rotation, unit scale, opaque
     quaternions = _array(where, prim, "orientations", time, 4, count)
@@ -227,15 +221,12 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     """
     if up_axis not in ("Y", "Z") or not meters_per_unit > 0:
         raise ValueError(f"up_axis {up_axis!r}, meters_per_unit {meters_per_unit}: expected Y or Z, and more than 0")
-    gaussians.check()
-    packing.require_finite(path, gaussians, writing=True)
-    if not len(gaussians):
-        raise InputError(f"{path}: cannot be written: the model has no Gaussians")
+    packing.check_writable(path, gaussians, least=1)
     _pxr(path)
     from pxr import Usd, UsdUtils
 
     suffix = path.suffix.lower()
-    with scratch_folder(4 * sum(array.size for array in _arrays(gaussians))) as folder:
+    with scratch_folder(4 * sum(array.size for array in gaussians.arrays().values())) as folder:
         made = folder / ("gaussians.usdc" if suffix == ".usdz" else f"gaussians{suffix}")
         stage = Usd.Stage.CreateNew(native_name(made))
         _author(stage, gaussians, up_axis, meters_per_unit)
@@ -248,16 +239,6 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
             made = package
         with atomic_writer(path, made.stat().st_size) as file, made.open("rb") as source:
             shutil.copyfileobj(source, file, 1 << 20)
-
-
-def _arrays(gaussians: Gaussians) -> tuple[Float32, ...]:
-    return (
-        gaussians.means,
-        gaussians.quaternions,
-        gaussians.log_scales,
-        gaussians.opacity_logits,
-        gaussians.sh,
-    )
 
 
 def _author(stage: Any, gaussians: Gaussians, up_axis: str, meters_per_unit: float) -> None:
