@@ -38,7 +38,7 @@ from clsplat.runs.settings import config_text, parse_config
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.stages.project import Slots
-from clsplat.training.density.strategies import STRATEGIES
+from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.health import Incident, finite_or_zero
 from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
 
@@ -194,7 +194,7 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     parameters, first, second = (_upload(device, bundle.models[kind]) for kind in _KINDS)
     gradients = allocate_gaussians(device, parameters.count, parameters.coefficients, zero=True)
     probe.counts["parameters"] = _wrong_in(parameters)
-    fields = slot_fields(STRATEGIES["adaptive"](config).needs(record["step"]))
+    fields = slot_fields(Adaptive(config).needs(record["step"]))
     step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
     background = upload(device, bundle.background)
     step.run((parameters, first, second), gradients, bundle.photograph, bundle.camera, background, probe)

@@ -49,7 +49,7 @@ from clsplat.stages.device_gaussians import (
 )
 from clsplat.stages.loss import Loss
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
-from clsplat.training.density.strategies import STRATEGIES
+from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.photographs import Photographs
@@ -128,7 +128,7 @@ class Trainer:
         config: TrainConfig,
         device: Device,
         initial: Gaussians | None = None,
-        strategy: Callable[[TrainConfig], Strategy] = STRATEGIES["adaptive"],
+        strategy: Callable[[TrainConfig], Strategy] = Adaptive,
     ) -> None:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
