@@ -344,18 +344,16 @@ def _adam(bench: Bench) -> Outcome:
 
         _, outcome = bench.twice(launch, take)
         rows = bench.visible if sparse else np.ones(count, np.bool_)
+        after = dict(zip(((kind, group) for kind in made for group in GROUPS), outcome.arrays, strict=True))
         parts: dict[str, tuple[Array, Array]] = {}
         kept = 0
-        for index, group in enumerate(GROUPS):
-            given = [made[kind][group].astype(np.float64) for kind in ends]
-            p, g, m, v = given
+        for group in GROUPS:
+            p, g, m, v = (made[kind][group].astype(np.float64) for kind in made)
             wanted = reference_adam.adam(p, g, m, v, step, _RATES[group], config.beta1, config.beta2, config.epsilon)
-            got = [outcome.arrays[index + len(GROUPS) * kind] for kind in (0, 2, 3)]
-            for name, a, b, before in zip(
-                ("parameters", "first", "second"), got, wanted, (given[0], *given[2:]), strict=True
-            ):
-                parts[f"{name} of {group}"] = (a[rows], b[rows])
-                kept += int((a[~rows] != before[~rows]).sum())
+            for kind, exact in zip(("parameters", "first", "second"), wanted, strict=True):
+                got = after[kind, group]
+                parts[f"{kind} of {group}"] = (got[rows], exact[rows])
+                kept += int((got[~rows] != made[kind][group][~rows]).sum())
         outcomes.append(outcome.compared(parts, hidden_rows=kept))
     return joined(outcomes)
 
