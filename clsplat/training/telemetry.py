@@ -7,6 +7,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -38,10 +39,8 @@ def session(device: Device, step: int) -> dict[str, Any]:
     others."""
     versions = {"clsplat": clsplat.__version__, "Python": platform.python_version()}
     for package in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return {
         "from_step": step,
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),

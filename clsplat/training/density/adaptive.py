@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,29 +44,20 @@ class Adaptive(Strategy):
     def before_step(self, model: ModelState) -> RowPlan:
         """Densify or prune, then reset opacities, whichever is due."""
         config, step = self.config, model.step
-        chosen: Plan | None = None
-        if densifies := is_due(config, step):
-            chosen = plan(config, model)
-        elif is_pruning_due(config, step):
-            chosen = plan_pruning(config, model)
-        logits, values = model.parameters["opacity_logits"].get(), {}
-        if chosen is not None:
+        logits, made = model.parameters["opacity_logits"].get(), RowPlan()
+        if (densifies := is_due(config, step)) or is_pruning_due(config, step):
+            chosen = plan(config, model) if densifies else plan_pruning(config, model)
             if len(chosen.rows) == 0:
                 raise ClsplatError(
                     f"step {step}: every Gaussian was pruned; lower --density.min-opacity"
                     + (" or --density.min-contribution" if config.min_contribution > 0 else "")
                 )
-            logits, values = logits[chosen.rows], _halves(config, chosen, model)
-        if resets := is_reset_due(config, step, white=self.white):
-            values["opacity_logits"] = np.arange(len(logits)), reset_opacities(config, logits)
-        return RowPlan(
-            rows=chosen.rows if chosen is not None else None,
-            fresh=chosen.fresh if chosen is not None else None,
-            values=values,
-            restarted=("opacity_logits",) if resets else (),
-            new_statistics=densifies,
-            forget_contributions=resets,
-        )
+            logits = logits[chosen.rows]
+            made = RowPlan(chosen.rows, chosen.fresh, _halves(config, chosen, model), new_statistics=densifies)
+        if is_reset_due(config, step, white=self.white):
+            values = {**made.values, "opacity_logits": (np.arange(len(logits)), reset_opacities(config, logits))}
+            made = replace(made, values=values, restarted=("opacity_logits",), forget_contributions=True)
+        return made
 
 
 def _halves(config: DensityConfig, chosen: Plan, model: ModelState) -> dict[str, tuple[NDArray[Any], Float32]]:
