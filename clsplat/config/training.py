@@ -127,7 +127,7 @@ class DensityConfig:
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
         rules: tuple[Rule, ...] = (
-            (("every", "start", "stop", "opacity_reset_every"), lambda value: value >= 0, "at least 0"),
+            (("every", "start", "stop", "opacity_reset_every", "prune_every"), lambda value: value >= 0, "at least 0"),
             (
                 ("gradient_threshold", "max_world_fraction"),
                 lambda value: 0 < value < inf,
@@ -136,10 +136,8 @@ class DensityConfig:
             (("dense_fraction",), lambda value: 0 < value <= 1, "more than 0, at most 1"),
             (("split_factor",), lambda value: 1 < value < inf, "a finite number, more than 1"),
             (("min_opacity", "opacity_reset_to"), lambda value: 0 < value < 1, "more than 0, less than 1"),
-            (("max_screen_radius",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
+            (("max_screen_radius", "min_contribution"), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("max_gaussians", "views_agree"), lambda value: value >= 1, "at least 1"),
-            (("min_contribution",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
-            (("prune_every",), lambda value: value >= 0, "at least 0"),
             (("prune_fraction",), lambda value: 0 <= value < 1, "at least 0, less than 1"),
         )
         check_kinds(self, "--density.")

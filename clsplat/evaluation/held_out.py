@@ -70,10 +70,10 @@ def evaluate(
     return result
 
 
-def picture_names(names: Sequence[str], extension: str = ".png") -> list[str]:
-    """Relative file names for views, in their sub-folders, with the extension replaced. It is added instead where two
-    names would be one, also on a file system that ignores case."""
+def picture_names(names: Sequence[str]) -> list[str]:
+    """Relative names of PNG files for views, in their sub-folders. Their extension takes the place of the view's, and
+    is added where two names would be one, also on a file system that ignores case."""
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
     keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names on every system
     uses = Counter(keys)
-    return [(stem if uses[key] == 1 else name) + extension for stem, key, name in zip(stems, keys, names, strict=True)]
+    return [(stem if uses[key] == 1 else name) + ".png" for stem, key, name in zip(stems, keys, names, strict=True)]

@@ -9,13 +9,12 @@ import os
 import socket
 import sys
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, warn
 from clsplat.files import parse_json
 
 NAME = ".clsplat-lock"
@@ -72,7 +71,7 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
                 file.close()
                 raise
             why = error.strerror or str(error)
-            warnings.warn(plain(f"{folder}: is on a file system without locks ({why}), others may write there too"))
+            warn(f"{folder}: is on a file system without locks ({why}), others may write there too")
             return file
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):

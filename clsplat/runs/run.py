@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 import clsplat
 from clsplat.config.training import TrainConfig
-from clsplat.errors import ClsplatError, InputError, plain
+from clsplat.errors import ClsplatError, InputError, warn
 from clsplat.files import (
     TEMPORARY_SUFFIX,
     atomic_write,
@@ -75,10 +74,9 @@ class Run:
                 earlier = cls.open(path)
                 check_resumed(earlier, config)
                 if (was := earlier.config.background) != config.background:
-                    warnings.warn(
-                        plain(f"{path}: the background was {was} so far and is {config.background} from here on: ")
-                        + "Gaussians that stand for the old one have to be learnt anew",
-                        stacklevel=2,
+                    warn(
+                        f"{path}: the background was {was} so far and is {config.background} from here on: "
+                        "Gaussians that stand for the old one have to be learnt anew"
                     )
                 scene = scene or earlier.scene
             elif overwrite and is_run(path):
@@ -208,14 +206,11 @@ class Run:
                 break
             except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly anything for a flipped bit
                 why = str(error) or type(error).__name__
-                warnings.warn(plain(f"{path}: checkpoint is damaged and was passed over ({why})"), stacklevel=2)
+                warn(f"{path}: checkpoint is damaged and was passed over ({why})")
         if checkpoints and checkpoint is None:
             raise InputError(f"{self.checkpoints_path}: no checkpoint there is whole, use --overwrite to start again")
         if checkpoint is None and (lost := max((record.get("step", 0) for record in self.read_metrics()), default=0)):
-            warnings.warn(
-                plain(f"{self.path}: has no checkpoint: training begins again, the {lost} steps before are lost"),
-                stacklevel=2,
-            )
+            warn(f"{self.path}: has no checkpoint: training begins again, the {lost} steps before are lost")
         if self.resuming:
             for left in self.path.rglob(".*" + TEMPORARY_SUFFIX):
                 remove(left)

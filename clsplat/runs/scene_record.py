@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import clsplat
-from clsplat.errors import InputError, examples, plain
+from clsplat.errors import InputError, examples, warn
 from clsplat.files import atomic_write, parse_json, read_document, short_digest
 
 if TYPE_CHECKING:
@@ -93,7 +92,10 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
         _listed("new", [name for name in new if name not in was]),
     ]
     both = [name for name in was if name in new]
-    other: dict[str, list[str]] = {"another camera": [], "another size": [], "another photograph": [], "split": []}
+    held_out = "held out in one and not in the other"
+    other: dict[str, list[str]] = {
+        what: [] for what in ("another photograph", "another camera", "another size", held_out)
+    }
     for name in both:
         a, b = was[name], new[name]
         same_file = (a["file"], a["folder"]) == (b["file"], b["folder"])
@@ -105,9 +107,8 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
         if a["blake2b"] != b["blake2b"] and (same_file or not resized):
             other["another photograph"].append(name)
         if a["split"] != b["split"]:
-            other["split"].append(name)
-    changes += [_listed(what, other[what]) for what in ("another photograph", "another camera", "another size")]
-    changes.append(_listed("held out in one and not in the other", other["split"]))
+            other[held_out].append(name)
+    changes += [_listed(what, names) for what, names in other.items()]
     if earlier["points"] != now["points"] and not any(changes):
         counts = f"{earlier['points']['count']:,} then, {now['points']['count']:,} now"
         changes.append(f"other points ({counts})")
@@ -126,10 +127,8 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
     changes = differences(earlier, now)
     if changes and not accept:
         raise InputError(
-            plain(
-                f"{path}: is not the scene that {run.path} began with: {'; '.join(changes)}; expected the same views "
-            )
-            + "and photographs; --accept-changes goes on with these"
+            f"{path}: is not the scene that {run.path} began with: {'; '.join(changes)}; expected the same views and "
+            "photographs; --accept-changes goes on with these"
         )
     if earlier["origin"] != now["origin"]:
         raise InputError(
@@ -145,11 +144,9 @@ def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
     if known is not None and known["resolution"] == run.config.resolution:
         return
     if known is None and resuming and run.checkpoints():
-        warnings.warn(
-            plain(
-                f"{run.path}: has no {NAME}, as runs of earlier versions: whether this is the scene it began with is "
-                "not known; from now on it is"
-            )
+        warn(
+            f"{run.path}: has no {NAME}, as runs of earlier versions: whether this is the scene it began with is "
+            "not known; from now on it is"
         )
     write(run, scene)
 
@@ -190,5 +187,4 @@ def _listed(what: str, names: list[str]) -> str:
     """Such as "3 views not there any more (a.png, b.png, c.png)"; empty where there are none."""
     if not names:
         return ""
-    more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
-    return f"{len(names):,} {'view' if len(names) == 1 else 'views'} {what} ({', '.join(names[:3])}{more})"
+    return f"{len(names):,} {'view' if len(names) == 1 else 'views'} {what} ({examples(names)})"

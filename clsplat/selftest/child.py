@@ -73,7 +73,7 @@ def run(
                 raise
             except Exception as error:  # noqa: BLE001  # drivers, and sizes that a wrong kernel has made, raise anything
                 text = " ".join(str(error).split())[:300]
-                outcomes.append(Outcome([], {}, 0.0, f"{type(error).__name__}: {text}"))
+                outcomes.append(Outcome(trouble=f"{type(error).__name__}: {text}"))
         if digests is not None:
             for bench, outcome in zip(benches, outcomes, strict=True):
                 digests[f"{bench.frozen.name}/{name}"] = digest_of(outcome.arrays)

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -41,11 +41,28 @@ class Outcome:
     """The outcome of one stage on one scene: arrays that the digest is of, errors by the name of what was compared,
     absolute and in ulp; trouble in words; otherwise: operations that round in another way than IEEE 754's."""
 
-    arrays: Sequence[Array]
-    errors: dict[str, tuple[float, float]]
-    ms: float
+    arrays: list[Array] = field(default_factory=list)
+    errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    ms: float = 0.0
     trouble: str = ""
     otherwise: tuple[str, ...] = ()
+
+    def compared(self, parts: Mapping[str, tuple[Array, Array]], **wrong: int) -> Outcome:
+        """The same with `error_of` what was got and what is wanted, by name. wrong: how many whole numbers are."""
+        errors = {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
+        counts = ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in wrong.items() if count)
+        return replace(self, errors=errors, trouble=self.trouble or counts)
+
+
+def joined(outcomes: Sequence[Outcome]) -> Outcome:
+    """The outcome of a stage that is run in several ways: every array, the worst errors, the first trouble."""
+    every = [item for outcome in outcomes for item in outcome.errors.items()]
+    return Outcome(
+        [array for outcome in outcomes for array in outcome.arrays],
+        {name: max(error for other, error in every if other == name) for name, _ in every},
+        sum(outcome.ms for outcome in outcomes),
+        next((outcome.trouble for outcome in outcomes if outcome.trouble), ""),
+    )
 
 
 def error_of(got: Array, wanted: Array) -> tuple[float, float]:
@@ -60,16 +77,6 @@ def error_of(got: Array, wanted: Array) -> tuple[float, float]:
     if not np.isfinite(error).all():
         return float("inf"), float("inf")
     return float(error.max()), float(ulp.max())
-
-
-def worst(parts: dict[str, tuple[Array, Array]]) -> dict[str, tuple[float, float]]:
-    """`error_of` what was got and what is wanted, by name."""
-    return {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
-
-
-def wrong_counts(**counts: int) -> str:
-    """The counts that are not 0, in words; nothing where every count is 0."""
-    return ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in counts.items() if count)
 
 
 def digest_of(arrays: Sequence[Array]) -> str:
@@ -105,9 +112,9 @@ class Bench:
         self.blended: Blended
         self.features: DeviceArray
 
-    def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, list[Array], float, str]:
-        """The stage's value, its arrays on the host and ms, of a second run; trouble where that differs from the first,
-        which had the kernels to build."""
+    def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, Outcome]:
+        """The stage's value, and its arrays on the host and ms, of a second run; trouble where that differs from the
+        first, which had the kernels to build."""
         first = take(launch())
         self.device.finish()
         start = time.perf_counter()
@@ -116,7 +123,8 @@ class Bench:
         ms = 1e3 * (time.perf_counter() - start)
         arrays = take(value)
         same = digest_of(first) == digest_of(arrays)
-        return value, arrays, ms, "" if same else "two runs on the same input gave different bits"
+        trouble = "" if same else "two runs on the same input gave different bits"
+        return value, Outcome(arrays, ms=ms, trouble=trouble)
 
     @property
     def visible(self) -> NDArray[np.bool_]:
@@ -146,9 +154,11 @@ class Bench:
             visible=visible,
         )
 
-    def blend_reference(self) -> reference_blend.Blended:
-        """The frame of the splats that the device made."""
+    def blend_reference(self) -> tuple[reference_blend.Blended, NDArray[np.bool_]]:
+        """The frame of the splats that the device made, and the pixels that are compared (MARGIN)."""
         splats = self.splats()
         order = depth_order(splats.depths, splats.visible)
         camera, background = self.camera, self.frozen.background.astype(np.float64)
-        return reference_blend.blend(splats, order, camera.width, camera.height, background, margins=True)
+        frame = reference_blend.blend(splats, order, camera.width, camera.height, background, margins=True)
+        assert frame.margin is not None
+        return frame, frame.margin > MARGIN

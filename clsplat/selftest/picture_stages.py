@@ -20,7 +20,7 @@ from clsplat.reference import every_pixel
 from clsplat.reference import rays as reference_rays
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
-from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, worst, wrong_counts
+from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, joined
 from clsplat.stages.blend import Blended, blend
 from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
 from clsplat.stages.deep import deep
@@ -52,10 +52,11 @@ def _geometry(bench: Bench) -> dict[str, Float64]:
 def _features(bench: Bench) -> Outcome:
     device, camera, visible = bench.device, bench.camera, bench.visible
     after = upload(device, pack_camera(_after(camera)))
-    bench.features, (got,), ms, trouble = bench.twice(
+    bench.features, outcome = bench.twice(
         lambda: features(device, bench.work, ALL, bench.model, bench.camera_array, after, bench.projected),
         lambda rows: [rows.get()[visible]],
     )
+    (got,) = outcome.arrays
     shown = {name: values[visible] for name, values in _geometry(bench).items()}
     normals = reference_channels.normals(**shown, camera=camera)
     away = shown["means"] - camera.position
@@ -70,21 +71,20 @@ def _features(bench: Bench) -> Outcome:
         name: (got[:, at : at + WIDTHS[name]], np.asarray(wanted[name], np.float64)) for name, at in ALL.offsets.items()
     }
     parts["normal"] = (parts["normal"][0][clear], normals[clear])
-    return Outcome([got], worst(parts), ms, trouble)
+    return outcome.compared(parts)
 
 
 def _channels(bench: Bench) -> Outcome:
     device, camera = bench.device, bench.camera
     arguments = (bench.features, bench.lists, bench.projected, bench.blended, camera.height)
-    _, arrays, ms, trouble = bench.twice(
+    _, outcome = bench.twice(
         lambda: channels(device, bench.work, ALL, *arguments), lambda planes: [planes.means.get(), planes.whole.get()]
     )
-    splats, frame = bench.splats(), bench.blend_reference()
+    splats, (frame, clear) = bench.splats(), bench.blend_reference()
     order = depth_order(splats.depths, splats.visible)
     wanted = reference_channels.channels(splats, order, camera, _after(camera), **_geometry(bench))
-    means, whole = (cropped(planes, camera) for planes in arrays)
-    assert frame.margin is not None
-    sure = (frame.margin > MARGIN) & (wanted.doubt > DOUBT)
+    means, whole = (cropped(planes, camera) for planes in outcome.arrays)
+    sure = clear & (wanted.doubt > DOUBT)
     # a sum that cancels, as normals may where little is opaque, has no digits of its own
     solid = sure & (frame.transmittance < 0.5)
     parts = {
@@ -95,7 +95,7 @@ def _channels(bench: Bench) -> Outcome:
     parts["first"] = (means[sure, -1], wanted.first[sure])
     counts = int((whole[sure, 0] != wanted.count[sure]).sum())
     indices = int((whole[sure, 1] != wanted.index[sure]).sum())
-    return Outcome(arrays, worst(parts), ms, trouble or wrong_counts(counts=counts, indices=indices))
+    return outcome.compared(parts, counts=counts, indices=indices)
 
 
 def _deep(bench: Bench) -> Outcome:
@@ -103,27 +103,18 @@ def _deep(bench: Bench) -> Outcome:
     bounds = np.array([1.75, 2.5, 4.0], np.float32)
     given = upload(device, np.append(bounds, np.float32(0)))
     arguments = (bench.lists, bench.projected.splats, bench.blended, camera.height)
-    _, (planes,), ms, trouble = bench.twice(
-        lambda: deep(device, bench.work, given, *arguments), lambda slices: [slices.get()]
-    )
-    splats, margin = bench.splats(), bench.blend_reference().margin
-    assert margin is not None
+    _, outcome = bench.twice(lambda: deep(device, bench.work, given, *arguments), lambda slices: [slices.get()])
+    (planes,), splats, (_, clear) = outcome.arrays, bench.splats(), bench.blend_reference()
     order = depth_order(splats.depths, splats.visible)
-    wanted = reference_deep.deep(splats, order, camera.width, camera.height, bounds)[:, margin > MARGIN]
-    got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, margin > MARGIN]
+    wanted = reference_deep.deep(splats, order, camera.width, camera.height, bounds)[:, clear]
+    got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, clear]
     fields = {"colour": slice(0, 3), "alpha": slice(3, 4), "depths": slice(4, 6)}
-    return Outcome([planes], worst({name: (got[..., at], wanted[..., at]) for name, at in fields.items()}), ms, trouble)
+    return outcome.compared({name: (got[..., at], wanted[..., at]) for name, at in fields.items()})
 
 
 def _rays(bench: Bench) -> Outcome:
     """Projection to tangent planes, and a frame with a channel of it, for both kinds of camera."""
-    outcomes = [_of_rays(bench, name) for name, kind in PROJECTIONS.items() if not kind.flat]
-    return Outcome(
-        [array for outcome in outcomes for array in outcome.arrays],
-        {name: error for outcome in outcomes for name, error in outcome.errors.items()},
-        sum(outcome.ms for outcome in outcomes),
-        next((outcome.trouble for outcome in outcomes if outcome.trouble), ""),
-    )
+    return joined([_of_rays(bench, name) for name, kind in PROJECTIONS.items() if not kind.flat])
 
 
 def _amid(camera: Camera, projection: Projection) -> Camera:
@@ -161,8 +152,8 @@ def _of_rays(bench: Bench, projection: Projection) -> Outcome:
         arrays = (blended.image, blended.transmittance, planes.means, planes.whole)
         return [projected.splats.get()[counts > 0], counts, *(array.get() for array in arrays)]
 
-    _, arrays, ms, trouble = bench.twice(launch, take)
-    splats, counts, image, left, means, _ = arrays
+    _, outcome = bench.twice(launch, take)
+    splats, counts, image, left, means, _ = outcome.arrays
     tangents, shown = reference_rays.tangents(gaussians, camera), counts > 0
     parts = _tangent_parts(tangents, shown, splats)
     if bench.model.count <= FEW:
@@ -173,8 +164,7 @@ def _of_rays(bench: Bench, projection: Projection) -> Outcome:
         parts["transmittance"] = (cropped(left, camera)[clear], 1 - picture.alpha[clear])
         parts["mean depth"] = (cropped(means, camera)[solid, 0], picture.depth[solid])
     hidden = int((shown & ~tangents.visible).sum())
-    errors = {f"{name}, {projection}": error for name, error in worst(parts).items()}
-    return Outcome(arrays, errors, ms, trouble or wrong_counts(hidden_Gaussians=hidden))
+    return outcome.compared({f"{name}, {projection}": part for name, part in parts.items()}, hidden_Gaussians=hidden)
 
 
 def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array) -> dict[str, tuple[Array, Array]]:

@@ -82,9 +82,10 @@ def cloud(name: str, count: int, width: int, height: int, seed: int) -> Frozen:
     return _frozen(name, model, camera)
 
 
-def wall(name: str = "wall", count: int = 64, width: int = 40, height: int = 36) -> Frozen:
+def wall() -> Frozen:
     """Nearly opaque layers, two and two at the same depth: alpha is at its cap, pixels end after a few of them, and the
     order of equals is that of their indices."""
+    count, width, height = 64, 40, 36
     depths = 1.5 + 0.0625 * (np.arange(count) // 2)
     sides = evenly(11, (count, 2), -0.5, 0.5)
     means = np.stack([depths * sides[:, 0], depths * sides[:, 1], depths], axis=1)
@@ -95,7 +96,7 @@ def wall(name: str = "wall", count: int = 64, width: int = 40, height: int = 36)
     sh[:, 0] = evenly(16, (count, 3), -1.5, 1.5)
     model = _gaussians(means, quaternions, log_scales, evenly(17, (count,), 2.0, 9.0), sh)
     camera = Camera(width, height, float(width), float(width), width / 2, height / 2, np.eye(3), np.zeros(3))
-    return _frozen(name, model, camera)
+    return _frozen("wall", model, camera)
 
 
 def scenes(*, quick: bool) -> list[Frozen]:
@@ -114,11 +115,5 @@ def _gaussians(*arrays: NDArray[np.float64]) -> Gaussians:
 
 
 def _rotation() -> NDArray[np.float64]:
-    """The rotation of the quaternion (15, 2, -3, 1): every entry is one division of whole numbers."""
-    w, x, y, z = 15.0, 2.0, -3.0, 1.0
-    rows = [
-        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-    ]
-    return np.array(rows) / (w * w + x * x + y * y + z * z)
+    """The rotation of the quaternion (15, 2, -3, 1), w first: every entry is one division of whole numbers."""
+    return np.array([[219, -42, -86], [18, 229, -66], [94, 54, 213]]) / 239

@@ -5,6 +5,7 @@ float64 reference."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
 from clsplat.reference.tiles import touched_tiles
-from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, worst, wrong_counts
+from clsplat.selftest.harness import WHITEN, Array, Bench, Outcome, cropped, joined
 from clsplat.selftest.picture_stages import PICTURES
 from clsplat.selftest.scenes import evenly, keys, padded
 from clsplat.stages.adam import adam
@@ -53,7 +54,8 @@ def _arithmetic(bench: Bench) -> Outcome:
         launch_items(device, kernel, n // device.shape.lanes, n, *arrays, out)
         return out
 
-    _, (got,), ms, trouble = bench.twice(launch, lambda out: [out.get()])
+    _, outcome = bench.twice(launch, lambda out: [out.get()])
+    (got,), trouble = outcome.arrays, outcome.trouble
     exact = {"division": a / b, "square root": np.sqrt(b), "fused multiply-add": a * b + c}
     errors = {}
     for (name, wanted), row in zip(exact.items(), got[:3], strict=True):
@@ -66,7 +68,7 @@ def _arithmetic(bench: Bench) -> Outcome:
     ]
     if (got[3] != (a * 2.0**-140).astype(np.float32)).any():
         otherwise.append("denormal numbers")
-    return Outcome([got[:3]], errors, ms, trouble, tuple(otherwise))
+    return Outcome([got[:3]], errors, outcome.ms, trouble, tuple(otherwise))
 
 
 def _project(bench: Bench) -> Outcome:
@@ -77,31 +79,26 @@ def _project(bench: Bench) -> Outcome:
         counts = projected.tile_counts.get()
         return [projected.splats.get()[counts > 0][:, columns], counts]
 
-    bench.projected, arrays, ms, trouble = bench.twice(
+    bench.projected, outcome = bench.twice(
         lambda: project(device, bench.work, bench.model, camera, bench.camera_array), take
     )
     gaussians = bench.frozen.gaussians
     wanted = reference_project.project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
     got, shown = bench.splats(), bench.visible & wanted.visible
     log2o = bench.projected.splats.get()[shown, SPLAT.index("LOG2O")]
-    errors = worst(
-        {
-            "mean": (got.means2d[shown], wanted.means2d[shown]),
-            "whitening": (got.whitening[shown], wanted.whitening[shown]),
-            "log2 of opacity": (log2o, np.log2(wanted.opacities[shown])),
-            "depth": (got.depths[shown], wanted.depths[shown]),
-            "colour": (got.colors[shown], wanted.colors[shown]),
-            "extent": (got.half_extents[shown], wanted.half_extents[shown]),
-        }
-    )
+    parts = {
+        "mean": (got.means2d[shown], wanted.means2d[shown]),
+        "whitening": (got.whitening[shown], wanted.whitening[shown]),
+        "log2 of opacity": (log2o, np.log2(wanted.opacities[shown])),
+        "depth": (got.depths[shown], wanted.depths[shown]),
+        "colour": (got.colors[shown], wanted.colors[shown]),
+        "extent": (got.half_extents[shown], wanted.half_extents[shown]),
+    }
     touched = touched_tiles(wanted, camera.width, camera.height, TILE, reference_project.ALPHA_MIN * (1 + 1e-5))
-    too_few = sum(len(tiles) > listed for tiles, listed in zip(touched, arrays[1], strict=True))
-    return Outcome(
-        arrays,
-        errors,
-        ms,
-        trouble or wrong_counts(tile_counts=too_few + int((arrays[1] > _box_tiles(wanted, bench.tiles)).sum())),
-    )
+    _, counts = outcome.arrays
+    too_few = sum(len(tiles) > listed for tiles, listed in zip(touched, counts, strict=True))
+    too_many = int((counts > _box_tiles(wanted, bench.tiles)).sum())
+    return outcome.compared(parts, tile_counts=too_few + too_many)
 
 
 def _box_tiles(projected: reference_project.Projected, tiles: tuple[int, int]) -> NDArray[np.int64]:
@@ -120,10 +117,10 @@ def _duplicate(bench: Bench) -> Outcome:
         bench.counted = count(device, work, projected)
         return duplicate(device, work, projected.splats, bench.counted, bench.tiles, bench.band)
 
-    bench.pairs, arrays, ms, trouble = bench.twice(
+    bench.pairs, outcome = bench.twice(
         launch, lambda pairs: [pairs.tile_keys.get(), pairs.pair_ids.get(), pairs.first_slots.get()]
     )
-    tile_keys, ids, first_slots = arrays
+    tile_keys, ids, first_slots = outcome.arrays
     counts, got = projected.tile_counts.get().astype(np.int64), bench.splats()
     order = depth_order(got.depths, got.visible)
     owners = np.repeat(order, counts[order])
@@ -131,7 +128,7 @@ def _duplicate(bench: Bench) -> Outcome:
     scanned = np.cumsum(counts) - counts
     wrong = int((first_slots != scanned).sum())
     if len(ids) != len(owners):
-        return Outcome(arrays, {}, ms, f"{len(ids)} pairs instead of {len(owners)}")
+        return replace(outcome, trouble=f"{len(ids)} pairs instead of {len(owners)}")
     wrong += int((ids[:, 1] != owners).sum()) + int((ids[:, 0] != scanned[owners] + place).sum())
     # each Gaussian's tiles ascend; all that it reaches are among them
     wrong += int((np.diff(tile_keys.astype(np.int64))[place[1:] > 0] <= 0).sum()) + int(
@@ -141,7 +138,7 @@ def _duplicate(bench: Bench) -> Outcome:
     touched = touched_tiles(got, bench.camera.width, bench.camera.height, TILE, threshold)
     listed = set(zip(owners.tolist(), tile_keys.tolist(), strict=True))
     missing = sum((gaussian, tile) not in listed for gaussian, tiles in enumerate(touched) for tile in tiles.tolist())
-    return Outcome(arrays, {}, ms, trouble or wrong_counts(pairs=wrong + missing))
+    return outcome.compared({}, pairs=wrong + missing)
 
 
 def _sort(bench: Bench) -> Outcome:
@@ -159,16 +156,16 @@ def _sort(bench: Bench) -> Outcome:
             results += both
         return results
 
-    _, arrays, ms, trouble = bench.twice(launch, lambda results: [array.get() for array in results])
-    wrong = 0
+    _, outcome = bench.twice(launch, lambda results: [array.get() for array in results])
+    arrays, wrong = outcome.arrays, 0
     for values, got, positions in zip(given, arrays[::2], arrays[1::2], strict=True):
         order = np.argsort(values, kind="stable")
         wrong += int((got != values[order]).sum()) + int((positions != order).sum())
-    return Outcome(arrays, {}, ms, trouble or wrong_counts(sorted_keys=wrong))
+    return outcome.compared({}, sorted_keys=wrong)
 
 
 def _ranges(bench: Bench) -> Outcome:
-    bench.lists, arrays, ms, trouble = bench.twice(
+    bench.lists, outcome = bench.twice(
         lambda: tile_lists(bench.device, bench.work, bench.pairs, bench.band),
         lambda lists: [lists.ranges.get(), lists.gaussian_from_sorted.get(), lists.slot_from_sorted.get()],
     )
@@ -177,47 +174,36 @@ def _ranges(bench: Bench) -> Outcome:
     ends = np.searchsorted(tile_keys[order], np.arange(bench.band.tiles), side="right")
     begins = np.searchsorted(tile_keys[order], np.arange(bench.band.tiles), side="left")
     wanted = np.where((ends > begins)[:, None], np.stack([begins, ends], axis=1), 0)
-    wrong = int((arrays[0] != wanted).sum())
-    wrong += int((arrays[1] != ids[order, 1]).sum()) + int((arrays[2] != ids[order, 0]).sum())
-    return Outcome(arrays, {}, ms, trouble or wrong_counts(list_entries=wrong))
+    exact = (wanted, ids[order, 1], ids[order, 0])
+    wrong = sum(int((got != values).sum()) for got, values in zip(outcome.arrays, exact, strict=True))
+    return outcome.compared({}, list_entries=wrong)
 
 
 def _blend(bench: Bench) -> Outcome:
     device, camera = bench.device, bench.camera
     arguments = (bench.lists, bench.projected.splats, bench.background, camera.width, camera.height)
-    bench.blended, arrays, ms, trouble = bench.twice(
+    bench.blended, outcome = bench.twice(
         lambda: blend(device, bench.work, *arguments),
         lambda blended: [blended.image.get(), blended.transmittance.get(), blended.stops.get()],
     )
-    wanted = bench.blend_reference()
-    assert wanted.margin is not None
-    clear = wanted.margin > MARGIN
-    image, transmittance = (cropped(planes, camera)[clear] for planes in arrays[:2])
-    parts = {
-        "image": (image, wanted.image[clear]),
-        "transmittance": (transmittance, wanted.transmittance[clear]),
-    }
-    return Outcome(arrays, worst(parts), ms, trouble)
+    wanted, clear = bench.blend_reference()
+    image, transmittance = (cropped(planes, camera)[clear] for planes in outcome.arrays[:2])
+    exact = (wanted.image[clear], wanted.transmittance[clear])
+    return outcome.compared({"image": (image, exact[0]), "transmittance": (transmittance, exact[1])})
 
 
 def _loss(bench: Bench) -> Outcome:
     device, camera = bench.device, bench.camera
     image, photograph = bench.blended.image, upload(device, bench.frozen.photograph)
     sides = (camera.width, camera.height)
-    result, arrays, ms, trouble = bench.twice(
+    result, outcome = bench.twice(
         lambda: loss(device, bench.work, image, photograph, *sides, 0.2),
         lambda result: [result.gradient.get()[:, : camera.height]],  # the rows below are not written
     )
     x, y = (_pixels(bench, planes) for planes in (image.get(), bench.frozen.photograph))
     value, gradient = reference_loss.l1_dssim(x, y)
-    mean_square = np.square(x - y).mean()
-    errors = worst(
-        {
-            "gradient": (_pixels(bench, arrays[0]), gradient),
-            "loss and error": (np.array(result.read()), np.array([value, mean_square])),
-        }
-    )
-    return Outcome(arrays, errors, ms, trouble)
+    sums = (np.array(result.read()), np.array([value, np.square(x - y).mean()]))
+    return outcome.compared({"gradient": (_pixels(bench, outcome.arrays[0]), gradient), "loss and error": sums})
 
 
 def _pixels(bench: Bench, planes: Array) -> Float64:
@@ -227,33 +213,30 @@ def _pixels(bench: Bench, planes: Array) -> Float64:
 
 def _blend_grad(bench: Bench) -> Outcome:
     device, camera, splats = bench.device, bench.camera, bench.splats()
-    margin = bench.blend_reference().margin
-    assert margin is not None
+    _, clear = bench.blend_reference()
     planes = padded(camera, 31, -0.5, 0.5)
     exact = planes.copy()
-    exact[:, : camera.height, : camera.width] *= margin > MARGIN
+    exact[:, : camera.height, : camera.width] *= clear
     arguments = (bench.lists, bench.projected.splats, bench.background, bench.blended)
 
     def launch(gradient: DeviceArray) -> DeviceArray:
         return blend_grad(device, bench.work, *arguments, gradient)
 
     given = upload(device, planes)
-    _, arrays, ms, trouble = bench.twice(lambda: launch(given), lambda slots: [slots.get()])
+    _, outcome = bench.twice(lambda: launch(given), lambda slots: [slots.get()])
     got = _slot_sums(bench, launch(upload(device, exact)).get())
     order = depth_order(splats.depths, splats.visible)
     background = bench.frozen.background.astype(np.float64)
     wanted = reference_blend.blend_grad(splats, order, camera.width, camera.height, background, _pixels(bench, exact))
     shown = splats.visible
     moments = _moments(splats, wanted)
-    errors = worst(
-        {
-            "sum of g": (got[shown, :1], moments[shown, :1]),
-            "first moments": (got[shown, 1:3], moments[shown, 1:3]),
-            "second moments": (got[shown, 3:6], moments[shown, 3:6]),
-            "colour": (got[shown, COLOUR], wanted.colors[shown]),
-        }
-    )
-    return Outcome(arrays, errors, ms, trouble)
+    parts = {
+        "sum of g": (got[shown, :1], moments[shown, :1]),
+        "first moments": (got[shown, 1:3], moments[shown, 1:3]),
+        "second moments": (got[shown, 3:6], moments[shown, 3:6]),
+        "colour": (got[shown, COLOUR], wanted.colors[shown]),
+    }
+    return outcome.compared(parts)
 
 
 def _slot_sums(bench: Bench, slots: Array) -> Float64:
@@ -295,7 +278,8 @@ def _project_grad(bench: Bench) -> Outcome:
     def take(results: tuple[DeviceGaussians, Screen]) -> list[Array]:
         return [*(results[0][group].get() for group in GROUPS), results[1].gradients.get()[visible]]
 
-    _, arrays, ms, trouble = bench.twice(launch, take)
+    _, outcome = bench.twice(launch, take)
+    *by_group, on_image = outcome.arrays
     sums = _slot_sums(bench, values)
     splats = bench.splats()
     l11, l12, l22 = (WHITEN * splats.whitening).T
@@ -316,12 +300,12 @@ def _project_grad(bench: Bench) -> Outcome:
         d_opacities=sums[:, SLOT.index("G")] / np.where(visible, true.opacities, 1.0),
         d_colors=sums[:, COLOUR],
     )
-    got = dict(zip(GROUPS, arrays[: len(GROUPS)], strict=True))
+    got = dict(zip(GROUPS, by_group, strict=True))
     parts = {name: (got[name][visible], wanted[name][visible]) for name in got if name in wanted}
     sh = np.concatenate([got["sh_dc"][:, None], got["sh_rest"]], axis=1)
     parts["SH"] = (sh[visible], wanted["sh"][visible])
-    parts["means on the image"] = (arrays[-1], d_means[visible])
-    return Outcome(arrays, worst(parts), ms, trouble)
+    parts["means on the image"] = (on_image, d_means[visible])
+    return outcome.compared(parts)
 
 
 _RATES = {name: 2.0**-power for power, name in enumerate(GROUPS, 3)}
@@ -358,24 +342,20 @@ def _adam(bench: Bench) -> Outcome:
         def take(models: list[DeviceGaussians]) -> list[Array]:
             return [model[group].get() for model in models for group in GROUPS]
 
-        _, arrays, ms, trouble = bench.twice(launch, take)
+        _, outcome = bench.twice(launch, take)
         rows = bench.visible if sparse else np.ones(count, np.bool_)
+        after = dict(zip(((kind, group) for kind in made for group in GROUPS), outcome.arrays, strict=True))
         parts: dict[str, tuple[Array, Array]] = {}
         kept = 0
-        for index, group in enumerate(GROUPS):
-            given = [made[kind][group].astype(np.float64) for kind in ends]
-            p, g, m, v = given
+        for group in GROUPS:
+            p, g, m, v = (made[kind][group].astype(np.float64) for kind in made)
             wanted = reference_adam.adam(p, g, m, v, step, _RATES[group], config.beta1, config.beta2, config.epsilon)
-            got = [arrays[index + len(GROUPS) * kind] for kind in (0, 2, 3)]
-            for name, a, b, before in zip(
-                ("parameters", "first", "second"), got, wanted, (given[0], *given[2:]), strict=True
-            ):
-                parts[f"{name} of {group}"] = (a[rows], b[rows])
-                kept += int((a[~rows] != before[~rows]).sum())
-        outcomes.append(Outcome(arrays, worst(parts), ms, trouble or wrong_counts(hidden_rows=kept)))
-    first, second = outcomes
-    errors = {name: max(first.errors[name], second.errors[name]) for name in first.errors}
-    return Outcome([*first.arrays, *second.arrays], errors, first.ms, first.trouble or second.trouble)
+            for kind, exact in zip(("parameters", "first", "second"), wanted, strict=True):
+                got = after[kind, group]
+                parts[f"{kind} of {group}"] = (got[rows], exact[rows])
+                kept += int((got[~rows] != made[kind][group][~rows]).sum())
+        outcomes.append(outcome.compared(parts, hidden_rows=kept))
+    return joined(outcomes)
 
 
 def _statistics(bench: Bench) -> Outcome:
@@ -389,17 +369,15 @@ def _statistics(bench: Bench) -> Outcome:
             add_statistics(device, statistics, camera, bench.projected, screen, 1.0)
         return statistics
 
-    statistics, arrays, ms, trouble = bench.twice(launch, lambda s: [array.get() for array in s.named().values()])
-    got = dict(zip(statistics.named(), arrays, strict=True))
+    statistics, outcome = bench.twice(launch, lambda s: [array.get() for array in s.named().values()])
+    got = dict(zip(statistics.named(), outcome.arrays, strict=True))
     norms = np.hypot(*(0.5 * np.array([camera.width, camera.height]) * values.astype(np.float64)).T) * visible
     sxx, sxy, syy = bench.splats().covariances.T
     radii = np.ceil(3 * np.sqrt(0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy))) * visible
     near = np.abs(norms - 1.0) < 1e-5
     wrong = int((got["seen"] != 2 * visible).sum()) + int((got["agreeing"] != 2 * (norms >= 1.0))[~near].sum())
     wrong += int((np.abs(got["radii"] - radii) > 1).sum()) + int((got["radii"] != radii).sum() > 1 + n // 100)
-    return Outcome(
-        arrays, worst({"gradient sums": (got["gradient_sums"], 2 * norms)}), ms, trouble or wrong_counts(counts=wrong)
-    )
+    return outcome.compared({"gradient sums": (got["gradient_sums"], 2 * norms)}, counts=wrong)
 
 
 RUN: dict[str, Callable[[Bench], Outcome]] = {

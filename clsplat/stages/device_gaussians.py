@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -151,6 +151,19 @@ def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None)
     sh = sh or ShStorage(gaussians.sh.shape[1])
     arrays = {name: HostArray(values) for name, values in _grouped(gaussians, sh).items()}
     return HostGaussians(len(gaussians), sh.coefficients, arrays, rows)
+
+
+def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
+    """Those of the arrays that are called `kind`/means and so on. Raises ValueError where they are no Gaussians."""
+    if missing := [group for group in GROUPS if f"{kind}/{group}" not in arrays]:
+        raise ValueError(f"has no {kind}/{missing[0]}")
+    host = {group: HostArray(arrays[f"{kind}/{group}"]) for group in GROUPS}
+    count, coefficients = len(host["means"].values), host["sh_rest"].shape[1] + 1
+    for group, shape in group_shapes(count, coefficients).items():
+        values = host[group].values
+        if values.shape != shape or values.dtype != np.float32 or count == 0:
+            raise ValueError(f"{kind}/{group} has shape {values.shape} of {values.dtype}, expected {shape} of float32")
+    return HostGaussians(count, coefficients, host, count)
 
 
 def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:

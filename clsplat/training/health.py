@@ -30,26 +30,9 @@ Model = Mapping[str, NDArray[np.float32]]
 """Arrays by parameter group, the first axis of each being the Gaussians."""
 
 
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """broken (n,): Gaussians with a parameter that is not finite or over its limit; refused (n,): those with a moment
-    that is not finite, which is also `adam`'s mark for a Gaussian that it has refused a step."""
-
-    broken: NDArray[np.bool_]
-    refused: NDArray[np.bool_]
-
-    @property
-    def any(self) -> bool:
-        """True if something is to be done."""
-        return bool(self.broken.any() or self.refused.any())
-
-    def lost(self, stage: str) -> NDArray[np.bool_]:
-        """Gaussians to remove. A loss that is not finite is no fault of the Gaussians that got no gradient from it."""
-        return self.broken if stage == "loss" else self.broken | self.refused
-
-
-def examine(parameters: Model, first: Model, second: Model) -> Findings:
-    """Look at every number of a model and its moments."""
+def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The Gaussians with a parameter that is not finite or over its limit (n,), and those with a moment that is not
+    finite (n,), which is also `adam`'s mark for a Gaussian that it has refused a step."""
     count = len(parameters["means"])
     broken, refused = np.zeros(count, bool), np.zeros(count, bool)
     for group, values in parameters.items():
@@ -57,7 +40,12 @@ def examine(parameters: Model, first: Model, second: Model) -> Findings:
     for moments in (first, second):
         for values in moments.values():
             refused |= ~np.isfinite(values).reshape(count, -1).all(axis=1)
-    return Findings(broken, refused)
+    return broken, refused
+
+
+def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Gaussians to remove. A loss that is not finite is no fault of the Gaussians that got no gradient from it."""
+    return broken if stage == "loss" else broken | refused
 
 
 def finite_or_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:

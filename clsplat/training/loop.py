@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,6 @@ from clsplat.training import telemetry
 from clsplat.training.health import RETURNS, WINDOW
 from clsplat.training.repro import write_bundle
 from clsplat.training.trainer import Trainer, unusable
-
-if TYPE_CHECKING:
-    from clsplat.scenes.scene import View
 
 REPORT_EVERY = 10
 """Steps between readings of the loss, which make host and device wait for each other."""
@@ -113,16 +110,6 @@ class _Session:
         self.saved = 0
         self.warned_stages: set[str] = set()
         self.untold = 0
-
-    def __enter__(self) -> _Session:  # noqa: PYI034  # Self came with 3.11
-        return self
-
-    def __exit__(self, _kind: object, error: BaseException | None, _where: object) -> None:
-        """Write a checkpoint if a driver's trial ends the training, so that nothing is lost."""
-        if isinstance(error, DriverError | TrialInterrupted):
-            written = self.rescue()
-            if written and isinstance(error, DriverError):
-                raise DriverError(f"{error}{written}") from error
 
     def resume(self) -> None:
         """Go on from the latest checkpoint, if there is one."""
@@ -227,17 +214,19 @@ class _Session:
         psnr = float(-10 * np.log10(max(squared, 1e-12)))
         return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
 
+    def draw(self, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Image and alpha of the model as it is, before the background of evaluations."""
+        trainer, background = self.trainer, background_colour(self.trainer.config.background)
+        result = self.renderer.render(trainer.parameters, trainer.local(camera), background)
+        return result.image, result.alpha
+
     def evaluate(self, *, keep: bool) -> dict[str, Any]:
         """The held-out views; their renders are kept in the run's test/ if asked for."""
-        trainer, background = self.trainer, background_colour(self.trainer.config.background)
-
-        def render(view: View) -> NDArray[Any]:
-            return self.renderer.render(trainer.parameters, trainer.local(view.camera), background).image
-
+        trainer = self.trainer
         return evaluate(
-            render,
+            lambda view: self.draw(view.camera)[0],
             trainer.scene.test_views,
-            background,
+            background_colour(trainer.config.background),
             self.run.test_path if keep and self.run is not None else None,
             step=trainer.step,
             gaussians=trainer.parameters.count,
@@ -267,16 +256,9 @@ class _Session:
 
     def doubt(self) -> None:
         """A warning if the renders show nothing; no look at them if the memory is too small for one."""
-        trainer, renderer = self.trainer, self.renderer
-        background = background_colour(trainer.config.background)
-
-        def draw(camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-            drawn = renderer.render(trainer.parameters, trainer.local(camera), background)
-            return drawn.image, drawn.alpha
-
         with suppress(CapacityError):
-            if text := doubts.of_pictures(draw, trainer.views):
-                warnings.warn(f"step {trainer.step}: {text}")
+            if text := doubts.of_pictures(self.draw, self.trainer.views):
+                warnings.warn(f"step {self.trainer.step}: {text}")
 
     def times_stages(self, step: int) -> bool:
         """True if each stage of the step is to be timed: only where the times are written down."""
@@ -309,6 +291,23 @@ class _Session:
                 self.record(report, evaluating=evaluating, stages=stages)
         if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
             self.save()
+
+    def make_steps(self, between: Between | None) -> None:
+        """All steps that are left, and what is due at their end. Raises Interrupted, after a checkpoint."""
+        trainer, last = self.trainer, self.trainer.config.iterations
+        with _Interruption() as interrupted:
+            while True:
+                while trainer.step < last and not interrupted():
+                    if between is not None:
+                        between(trainer, interrupted)
+                    self.step()
+                self.save()
+                if trainer.step < last or not self.go_back():
+                    break
+            self.tell_the_rest()
+            if trainer.step < last:
+                raise Interrupted(interrupted.number)
+            self.doubt()
 
 
 def _begin(run: Run, scene: Scene, config: TrainConfig, *, resume: bool) -> None:
@@ -392,19 +391,13 @@ def train(
     session.first_step = trainer.step
     _tell_idle_settings(trainer)
     session.tell_plan()
-    with session, _Interruption() as interrupted:
-        while True:
-            while trainer.step < config.iterations and not interrupted():
-                if between is not None:
-                    between(trainer, interrupted)
-                session.step()
-            session.save()
-            if trainer.step < config.iterations or not session.go_back():
-                break
-        session.tell_the_rest()
-        if trainer.step < config.iterations:
-            raise Interrupted(interrupted.number)
-        session.doubt()
+    try:
+        session.make_steps(between)
+    except (DriverError, TrialInterrupted) as error:  # with a checkpoint nothing is lost
+        written = session.rescue()
+        if written and isinstance(error, DriverError):
+            raise DriverError(f"{error}{written}") from error
+        raise
     model = trainer.gaussians()
     if run is not None:
         run.save_model(model, photos_space(view.path for view in scene.views))

@@ -92,16 +92,16 @@ class Watch:
         """The remedy, or None, after a look at every number, met by `adam` or not; arrays by "parameters/means" and so
         on."""
         host = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in ("parameters", "first", "second")}
-        if self._last is None or self.patience.lost or not health.examine(**host).any:
+        if self._last is None or self.patience.lost or not np.any(health.examine(**host)):
             return None
         return self._judge(self._last, "parameters", 0, host)
 
     def _judge(
         self, last: _Last, stage: str, elements: int, host: Mapping[str, Mapping[str, NDArray[np.float32]]]
     ) -> Remedy | None:
-        findings = health.examine(**host)
-        lost = findings.lost(stage)
-        concerned = np.flatnonzero(findings.broken | findings.refused)
+        broken, refused = health.examine(**host)
+        lost = health.lost(stage, broken, refused)
+        concerned = np.flatnonzero(broken | refused)
         hopeless = bool(np.mean(lost) > health.MOST_LOST)
         self.latest = Incident(
             step=last.step,
@@ -119,7 +119,7 @@ class Watch:
             return None
         moments = {k: {g: health.finite_or_zero(v) for g, v in host[k].items()} for k in ("first", "second")}
         rows = np.flatnonzero(~lost).astype(np.uint32)
-        return Remedy(rows if lost.any() else None, moments if findings.refused.any() else {})
+        return Remedy(rows if lost.any() else None, moments if refused.any() else {})
 
 
 def _done(stage: str, lost: int, count: int, *, hopeless: bool) -> str:

@@ -15,7 +15,7 @@ import json
 import platform
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,14 +31,22 @@ from clsplat.device.context import Device, open_device
 from clsplat.device.layout import REFUSED, SPLAT
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import atomic_writer, parse_json
-from clsplat.gaussians import GROUPS, group_shapes
+from clsplat.gaussians import GROUPS
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.runs.checkpoints import read_arrays
 from clsplat.runs.settings import config_text, parse_config
-from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
+from clsplat.stages.device_gaussians import (
+    DeviceGaussians,
+    HostArray,
+    HostGaussians,
+    allocate_gaussians,
+    host_model,
+    to_device,
+    to_host,
+)
 from clsplat.stages.loss import Loss
 from clsplat.stages.project import Slots
-from clsplat.training.density.strategies import STRATEGIES
+from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.health import Incident, finite_or_zero
 from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
 
@@ -60,7 +68,7 @@ class Bundle:
     camera: Camera
     photograph: NDArray[Any]
     background: NDArray[np.float32]
-    models: dict[str, dict[str, NDArray[np.float32]]]
+    models: dict[str, HostGaussians]
 
 
 def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
@@ -87,21 +95,20 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
     }
     pixels = {"photograph": photograph, "background": incident.background}
     pose = {"rotation": camera.rotation, "translation": camera.translation}
-    models = {kind: {g: incident.gaussians[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS if incident.gaussians}
 
-    def bundle() -> Bundle:
-        return Bundle(record, trainer.config, camera, photograph, incident.background, models)
+    def reproduced(models: dict[str, HostGaussians]) -> bool:
+        bundle = Bundle(record, trainer.config, camera, photograph, incident.background, models)
+        return bool(first_trouble(replay(bundle, device)))
 
-    alone = bool(models) and len(models["parameters"]["means"]) > 0
-    if alone:
-        _forget_marks(models)
-        alone = bool(first_trouble(replay(bundle(), device)))
+    models, alone = {}, False
+    if len(incident.gaussians.get("parameters/means", ())):
+        models = _unmarked({kind: host_model(incident.gaussians, kind) for kind in _KINDS})
+        alone = reproduced(models)
     if not alone:
-        models = {kind: {g: model[g].get() for g in GROUPS} for kind, model in trainer.models().items()}
-        _forget_marks(models)
-    record["of"] = len(models["parameters"]["means"]), trainer.parameters.count
-    record["reproduced"] = alone or bool(first_trouble(replay(bundle(), device)))
-    arrays = {f"{kind}/{g}": values for kind, groups in models.items() for g, values in groups.items()}
+        models = _unmarked({kind: to_host(model) for kind, model in trainer.models().items()})
+    record["of"] = models["parameters"].count, trainer.parameters.count
+    record["reproduced"] = alone or reproduced(models)
+    arrays = {f"{kind}/{g}": array.values for kind, model in models.items() for g, array in model.arrays.items()}
     path = folder / f"trouble-step-{incident.step:07d}.npz"
     text = np.frombuffer(json.dumps(record).encode(), np.uint8)
     members = {RECORD: text, **pixels, **pose, **arrays}
@@ -110,10 +117,12 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
     return path
 
 
-def _forget_marks(models: dict[str, dict[str, NDArray[np.float32]]]) -> None:
-    """Moments as they were before `adam` refused a step, as far as they are known."""
+def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
+    """The models with moments as they were before `adam` refused a step, as far as they are known."""
     for kind in ("first", "second"):
-        models[kind] = {group: finite_or_zero(values) for group, values in models[kind].items()}
+        arrays = {g: HostArray(finite_or_zero(array.values)) for g, array in models[kind].arrays.items()}
+        models[kind] = replace(models[kind], arrays=arrays)
+    return models
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -131,7 +140,7 @@ def _bundle_of(arrays: dict[str, NDArray[Any]], path: Path) -> Bundle:
     record = parse_json(arrays[RECORD].tobytes())
     config, _ = parse_config(record["settings"], path)
     camera = Camera(**record["camera"], rotation=arrays["rotation"], translation=arrays["translation"])
-    models = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in _KINDS}
+    models = {kind: host_model(arrays, kind) for kind in _KINDS}
     return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
 
 
@@ -152,11 +161,6 @@ def _checked(bundle: Bundle) -> Bundle:
     rates = record["rates"]
     if type(record["step"]) is not int or not np.isfinite([float(rates[group]) for group in GROUPS]).all():
         raise ValueError("no step and no learning rates")
-    for arrays in bundle.models.values():
-        count, coefficients = len(arrays["means"]), arrays["sh_rest"].shape[1] + 1
-        for group, shape in group_shapes(count, coefficients).items():
-            if arrays[group].shape != shape or arrays[group].dtype != np.float32:
-                raise ValueError(f"{group} are {arrays[group].shape} of {arrays[group].dtype}, expected {shape}")
     return bundle
 
 
@@ -191,10 +195,10 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     """Make the step once more: after each stage how many numbers are not finite, and how many steps `adam` refuses."""
     config, record = bundle.config, bundle.record
     rasterizer, probe = Rasterizer(device, config.rasterizer), _Counts(bundle.camera)
-    parameters, first, second = (_upload(device, bundle.models[kind]) for kind in _KINDS)
+    parameters, first, second = (to_device(device, bundle.models[kind]) for kind in _KINDS)
     gradients = allocate_gaussians(device, parameters.count, parameters.coefficients, zero=True)
     probe.counts["parameters"] = _wrong_in(parameters)
-    fields = slot_fields(STRATEGIES["adaptive"](config).needs(record["step"]))
+    fields = slot_fields(Adaptive(config).needs(record["step"]))
     step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
     background = upload(device, bundle.background)
     step.run((parameters, first, second), gradients, bundle.photograph, bundle.camera, background, probe)
@@ -204,11 +208,6 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
 def first_trouble(counts: dict[str, int]) -> str | None:
     """The first stage after which something is not finite."""
     return next((stage for stage, count in counts.items() if count), None)
-
-
-def _upload(device: Device, arrays: dict[str, NDArray[np.float32]]) -> DeviceGaussians:
-    count, coefficients = len(arrays["means"]), arrays["sh_rest"].shape[1] + 1
-    return DeviceGaussians(count, coefficients, {group: upload(device, arrays[group]) for group in GROUPS})
 
 
 def _wrong(values: NDArray[Any]) -> int:

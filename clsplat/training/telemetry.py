@@ -7,6 +7,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,10 +18,9 @@ from numpy.typing import NDArray
 import clsplat
 from clsplat.device import cl
 from clsplat.device.context import Device
-from clsplat.device.layout import SlotFields
 from clsplat.errors import CapacityError
+from clsplat.rendering.contributions import sums_of_weights
 from clsplat.stages.device_gaussians import HostGaussians
-from clsplat.stages.project import add_slots
 
 if TYPE_CHECKING:
     from clsplat.training.trainer import Trainer
@@ -39,10 +39,8 @@ def session(device: Device, step: int) -> dict[str, Any]:
     others."""
     versions = {"clsplat": clsplat.__version__, "Python": platform.python_version()}
     for package in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return {
         "from_step": step,
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -94,24 +92,17 @@ def contributions(trainer: Trainer, seconds: float = SECONDS) -> dict[str, Any] 
 
 
 def largest_contributions(trainer: Trainer, seconds: float = SECONDS) -> tuple[NDArray[np.float32], int]:
-    """Largest contribution of each Gaussian (n,) to one of the views, and the number of views. A contribution is the
-    sum of blending weights, in pixels of the working size, which --density.min-contribution goes by.
+    """Largest contribution of each Gaussian (n,) to one of the views (`sums_of_weights`), and the number of views.
 
     It looks at as many training views, spread evenly, as `seconds` allow. Changes nothing that training goes by. Raises
     CapacityError.
     """
-    device, rasterizer, views = trainer.device, trainer.rasterizer, trainer.views
-    fields, looked = SlotFields(contributions=True), 0
+    rasterizer, views, looked = trainer.rasterizer, trainer.views, 0
     largest: NDArray[np.float32] = np.zeros(trainer.parameters.count, np.float32)
     start = time.perf_counter()
     for index in _spread(len(views)):
-        camera = trainer.local(views[index].camera)
-        frame = rasterizer.forward(trainer.parameters, camera, trainer.background)
-        slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=fields)  # weights are of any gradient
-        sums = slots.values
-        if slots.first_slots is not None:
-            sums = add_slots(device, rasterizer.work, frame.projected.tile_counts, slots, None, fields=fields)
-        np.maximum(largest, sums.get()[:, -1], out=largest)
+        frame = rasterizer.forward(trainer.parameters, trainer.local(views[index].camera), trainer.background)
+        np.maximum(largest, sums_of_weights(rasterizer, frame), out=largest)
         looked += 1
         if looked == 1:
             start = time.perf_counter()  # kernels may have been built

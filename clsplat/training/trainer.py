@@ -17,7 +17,7 @@ from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.errors import InputError
-from clsplat.gaussians import GROUPS, Gaussians, group_shapes
+from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.rasterizer import Frame, Rasterizer
@@ -37,11 +37,11 @@ from clsplat.stages.density import (
 from clsplat.stages.device_gaussians import (
     AnyGaussians,
     DeviceGaussians,
-    HostArray,
     HostGaussians,
     allocate_gaussians,
     download_gaussians,
     host_gaussians,
+    host_model,
     host_zeros,
     to_device,
     to_host,
@@ -49,7 +49,7 @@ from clsplat.stages.device_gaussians import (
 )
 from clsplat.stages.loss import Loss
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
-from clsplat.training.density.strategies import STRATEGIES
+from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.photographs import Photographs
@@ -128,7 +128,7 @@ class Trainer:
         config: TrainConfig,
         device: Device,
         initial: Gaussians | None = None,
-        strategy: Callable[[TrainConfig], Strategy] = STRATEGIES["adaptive"],
+        strategy: Callable[[TrainConfig], Strategy] = Adaptive,
     ) -> None:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
@@ -426,22 +426,14 @@ class Trainer:
         self.strategy.load(_named(checkpoint, "strategy/"))
 
     def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
-        for group in GROUPS:
-            if f"{kind}/{group}" not in checkpoint.arrays:
-                raise unusable(checkpoint, f"has no {kind}/{group}")
-        host = {group: checkpoint.arrays[f"{kind}/{group}"] for group in GROUPS}
-        count, coefficients = len(host["means"]), host["sh_rest"].shape[1] + 1
-        for group, shape in group_shapes(count, coefficients).items():
-            if host[group].shape != shape or host[group].dtype != np.float32 or count == 0:
-                raise unusable(checkpoint, f"{kind}/{group} has shape {host[group].shape} of {host[group].dtype}")
-        most = (self.config.sh_degree + 1) ** 2
-        if coefficients > most:
-            raise unusable(
-                checkpoint,
-                f"has {coefficients} SH coefficients, more than the {most} of --sh-degree {self.config.sh_degree}",
-            )
-        arrays = {group: HostArray(values) for group, values in host.items()}
-        return HostGaussians(count, coefficients, arrays, count)
+        most, degree = (self.config.sh_degree + 1) ** 2, self.config.sh_degree
+        try:
+            model = host_model(checkpoint.arrays, kind)
+            if (n := model.coefficients) > most:
+                raise ValueError(f"has {n} SH coefficients, more than the {most} of --sh-degree {degree}")
+        except ValueError as error:
+            raise unusable(checkpoint, str(error)) from None
+        return model
 
 
 def _named(checkpoint: Checkpoint, prefix: str) -> dict[str, NDArray[Any]]:

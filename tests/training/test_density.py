@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from clsplat.config.training import DensityConfig
 from clsplat.stages.device_gaussians import HostArray
-from clsplat.training.density import ModelState
-from clsplat.training.density.adaptive import Plan, is_due, is_reset_due, plan, reset_opacities, split_halves
+from clsplat.training.density import ModelState, RowPlan
+from clsplat.training.density.adaptive import is_due, is_reset_due, plan, reset_opacities, split_halves
 
 CONFIG = DensityConfig()
 EXTENT = 10.0
@@ -40,7 +40,7 @@ def make_plan(
     seen: ArrayLike = 4,
     radii: ArrayLike = 5,
     opacities: ArrayLike = 0.5,
-) -> Plan:
+) -> RowPlan:
     """sizes: the largest axis of each; the others are a tenth of it."""
     largest = np.asarray(sizes, np.float32)
     n = len(largest)
@@ -52,13 +52,27 @@ def make_plan(
         "radii": np.broadcast_to(np.asarray(radii, np.float32), n),
     }
     parameters = {"log_scales": log_scales, "opacity_logits": np.broadcast_to(logit(opacities), n)}
+    parameters |= {"means": np.zeros((n, 3), np.float32), "quaternions": np.ones((n, 4), np.float32)}
     return plan(config, state(step, EXTENT, parameters, statistics))
 
 
-def assert_plan(got: Plan, rows: list[int], fresh: list[int], split: list[int]) -> None:
+def split_of(made: RowPlan) -> np.ndarray:
+    """True for rows that are halves: they get other means and sizes."""
+    assert made.rows is not None
+    halves, _ = made.values.get("means", (np.zeros(0, int), None))
+    if len(halves):
+        np.testing.assert_array_equal(made.values["log_scales"][0], halves)
+    return np.isin(np.arange(len(made.rows)), halves)
+
+
+def assert_plan(got: RowPlan, rows: list[int], fresh: list[int], split: list[int]) -> None:
     """fresh, split: 0 or 1 for each of the rows."""
     assert got.rows.dtype == np.uint32
-    assert (got.rows.tolist(), got.fresh.astype(int).tolist(), got.split.astype(int).tolist()) == (rows, fresh, split)
+    assert (got.rows.tolist(), got.fresh.astype(int).tolist(), split_of(got).astype(int).tolist()) == (
+        rows,
+        fresh,
+        split,
+    )
 
 
 def test_small_ones_are_cloned_and_large_ones_split() -> None:

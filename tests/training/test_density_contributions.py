@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike
 from test_density import state
 
 from clsplat.config.training import DensityConfig, TrainConfig
-from clsplat.training.density import StatisticsNeeds
+from clsplat.training.density import RowPlan, StatisticsNeeds
 from clsplat.training.density.adaptive import (
     Adaptive,
-    Plan,
     budget,
     is_due,
     is_pruning_due,
@@ -43,7 +42,7 @@ def make_plan(
     opacities: ArrayLike = 0.5,
     agreeing: ArrayLike | None = None,
     known: dict[str, np.ndarray] | None = None,
-) -> Plan:
+) -> RowPlan:
     """All small, so that who is densified is cloned, and seen in four views."""
     sums = 4 * np.asarray(gradients, np.float32)
     n = len(sums)
@@ -55,12 +54,12 @@ def make_plan(
     return plan(config, state(step, 10.0, parameters, {**statistics, **(known or {})}))
 
 
-def cloned(made: Plan) -> list[int]:
+def cloned(made: RowPlan) -> list[int]:
     rows: list[int] = made.rows[made.fresh].tolist()
     return rows
 
 
-def kept(made: Plan) -> list[int]:
+def kept(made: RowPlan) -> list[int]:
     rows: list[int] = made.rows[~made.fresh].tolist()
     return rows
 
@@ -160,7 +159,7 @@ def test_pruning_alone_adds_nothing_and_asks_for_less() -> None:
     opacities = np.array([0.5, 0.004, 0.5, 0.5])
     logits = np.log(opacities / (1 - opacities)).astype(np.float32)
     made = plan_pruning(config, state(20_000, 10.0, {"opacity_logits": logits}, contributions([9, 9, 0.4, 9])))
-    assert (made.rows.tolist(), made.fresh.any(), made.split.any()) == ([0, 3], False, False)
+    assert (made.rows.tolist(), made.fresh.any(), made.values) == ([0, 3], False, {})
     assert made.rows.dtype == np.uint32
     made = plan_pruning(
         replace(config, min_contribution=0.0), state(20_000, 10.0, {"opacity_logits": np.zeros(3, np.float32)}, {})

@@ -23,8 +23,7 @@ from clsplat.reference.render import render_grad
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_gaussians import HostGaussians
-from clsplat.training.density import ModelState, adaptive
-from clsplat.training.density.adaptive import Plan
+from clsplat.training.density import ModelState, RowPlan, adaptive
 from clsplat.training.trainer import Trainer
 
 EVERYTHING = short(
@@ -54,14 +53,14 @@ def undisturbed(scene: Scene, default_device: Device, tmp_path_factory: pytest.T
 
 def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the tests below stop and repeat."""
-    made: dict[tuple[str, int], tuple[int, Plan]] = {}
+    made: dict[tuple[str, int], tuple[int, RowPlan]] = {}
     known: list[int] = []
 
     def noted(name: str) -> Any:
         real = getattr(adaptive, name)
 
-        def call(config: Any, model: ModelState) -> Plan:
-            result: Plan = real(config, model)
+        def call(config: Any, model: ModelState) -> RowPlan:
+            result: RowPlan = real(config, model)
             made[name, model.step] = (model.count, result)
             largest = [model.statistics[f"{epoch}_largest"].get() for epoch in ("current", "whole")]
             known.append(int(np.isfinite(np.maximum(*largest)).sum()))

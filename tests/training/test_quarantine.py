@@ -30,7 +30,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.spherical_harmonics import sh_basis
 from clsplat.training import repro
-from clsplat.training.health import PATIENCE, RETURNS, SMALLER, WINDOW, Patience, examine, finite_or_zero
+from clsplat.training.health import PATIENCE, RETURNS, SMALLER, WINDOW, Patience, examine, finite_or_zero, lost
 from clsplat.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
@@ -85,19 +85,17 @@ def model(count: int = 6) -> dict[str, np.ndarray]:
 
 def test_what_is_broken_and_what_is_refused() -> None:
     parameters, first, second = model(), model(), model()
-    found = examine(parameters, first, second)
-    assert not found.any
+    assert not np.any(examine(parameters, first, second))
     parameters["means"][1, 2] = np.nan
     parameters["sh_rest"][2, 1, 0] = -SH_LIMIT
     parameters["means"][3] = 1e18  # far away, but a place
     first["sh_dc"][4, 1] = np.inf
     second["opacity_logits"][5] = np.nan
-    found = examine(parameters, first, second)
-    assert found.any
-    assert found.broken.tolist() == [False, True, True, False, False, False]
-    assert found.refused.tolist() == [False, False, False, False, True, True]
-    assert found.lost("loss").tolist() == [False, True, True, False, False, False]
-    assert found.lost("adam").tolist() == [False, True, True, False, True, True]
+    broken, refused = examine(parameters, first, second)
+    assert broken.tolist() == [False, True, True, False, False, False]
+    assert refused.tolist() == [False, False, False, False, True, True]
+    assert lost("loss", broken, refused).tolist() == [False, True, True, False, False, False]
+    assert lost("adam", broken, refused).tolist() == [False, True, True, False, True, True]
     assert finite_or_zero(first["sh_dc"])[4].tolist() == [first["sh_dc"][4, 0], 0, first["sh_dc"][4, 2]]
 
 
@@ -276,7 +274,7 @@ def test_a_bundle_has_no_more_than_it_needs(
     bundle = repro.read_bundle(path)
     kept, of = bundle.record["of"]
     assert kept == 1 < of
-    assert {len(values) for groups in bundle.models.values() for values in groups.values()} == {1}
+    assert {model.count for model in bundle.models.values()} == {1}
     assert bundle.photograph.shape[:2] == (bundle.camera.height, bundle.camera.width)
     assert path.stat().st_size < 50_000
     assert repro.main([str(path)]) == 0

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from compare import assert_close, assert_same_bits
+from test_density import split_of
 from tiny import CONFIG, EVENTS, HEIGHT, WIDTH, hidden_model, short, write_scene
 
 from clsplat.api import train
@@ -22,8 +23,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_gaussians import DeviceGaussians, upload_gaussians
 from clsplat.stages.loss import Loss
-from clsplat.training.density import ModelState, adaptive
-from clsplat.training.density.adaptive import Plan
+from clsplat.training.density import ModelState, RowPlan, adaptive
 from clsplat.training.loop import StepReport
 from clsplat.training.trainer import Trainer
 
@@ -135,10 +135,10 @@ def test_the_test_run_has_everything_in_it(
     scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the tests below stop and repeat: without this, they would show less than they seem to."""
-    plans: dict[int, Plan] = {}
+    plans: dict[int, RowPlan] = {}
     resets, counts, real = [], [], adaptive.plan
 
-    def plan(config: DensityConfig, model: ModelState) -> Plan:
+    def plan(config: DensityConfig, model: ModelState) -> RowPlan:
         counts.append(model.count)
         plans[model.step] = real(config, model)
         return plans[model.step]
@@ -156,10 +156,12 @@ def test_the_test_run_has_everything_in_it(
     assert list(plans) == [15, 20, 25, 30, 35]
     assert resets == [20]
     assert coefficients == [1] * 11 + [4] * 12 + [9] * 17
-    assert any((p.fresh & ~p.split).any() for p in plans.values()), "clones"
-    assert any(p.split.any() for p in plans.values()), "splits"
+    splits = [split_of(p) for p in plans.values()]
+    clones = [p.fresh & ~split for p, split in zip(plans.values(), splits, strict=True)]
+    assert any(clone.any() for clone in clones)
+    assert any(split.any() for split in splits)
     after = [len(p.rows) for p in plans.values()]
-    added = [int((p.fresh & ~p.split).sum() + p.split.sum() // 2) for p in plans.values()]
+    added = [int(clone.sum() + split.sum() // 2) for clone, split in zip(clones, splits, strict=True)]
     assert any(n + a > m for n, a, m in zip(counts, added, after, strict=True)), "something is pruned"
 
 
@@ -368,9 +370,9 @@ def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monk
     before = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
     trainer._control_density()
     (plan,) = plans
-    fresh, rows = plan.fresh, plan.rows
-    assert plan.split.any()
-    assert (fresh & ~plan.split).any()
+    fresh, rows, split = plan.fresh, plan.rows, split_of(plan)
+    assert split.any()
+    assert (fresh & ~split).any()
     assert (~fresh).any()
     for kind in ("first", "second"):
         after = host(getattr(trainer, kind))
@@ -380,14 +382,14 @@ def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monk
             assert not after[group][fresh].any(), f"{kind} {group}: a fresh row has moments"
     after = host(trainer.parameters)
     for group in GROUPS:
-        moved = plan.split if group in ("means", "log_scales") else np.zeros_like(plan.split)
+        moved = split if group in ("means", "log_scales") else np.zeros_like(split)
         assert_same_bits(after[group][~moved], before["parameters"][group][rows[~moved]], group)
         if moved.any():
             assert np.all(np.any(after[group][moved] != before["parameters"][group][rows[moved]], axis=1)), group
     # a half is smaller by the factor: one rounding of a logarithm
-    halves = rows[plan.split]
+    halves = rows[split]
     wanted = before["parameters"]["log_scales"][halves] - np.log(CONFIG.density.split_factor)
-    assert_close(after["log_scales"][plan.split], wanted, absolute=1e-6)
+    assert_close(after["log_scales"][split], wanted, absolute=1e-6)
     for name in ("gradient_sums", "seen", "radii"):
         values = getattr(trainer.statistics, name).get()
         assert values.shape == rows.shape

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,53 +44,19 @@ class Adaptive(Strategy):
     def before_step(self, model: ModelState) -> RowPlan:
         """Densify or prune, then reset opacities, whichever is due."""
         config, step = self.config, model.step
-        chosen: Plan | None = None
-        if densifies := is_due(config, step):
-            chosen = plan(config, model)
-        elif is_pruning_due(config, step):
-            chosen = plan_pruning(config, model)
-        logits, values = model.parameters["opacity_logits"].get(), {}
-        if chosen is not None:
-            if len(chosen.rows) == 0:
+        logits, made = model.parameters["opacity_logits"].get(), RowPlan()
+        if (densifies := is_due(config, step)) or is_pruning_due(config, step):
+            made = plan(config, model) if densifies else plan_pruning(config, model)
+            logits = logits[made.rows]
+            if len(logits) == 0:
                 raise ClsplatError(
                     f"step {step}: every Gaussian was pruned; lower --density.min-opacity"
                     + (" or --density.min-contribution" if config.min_contribution > 0 else "")
                 )
-            logits, values = logits[chosen.rows], _halves(config, chosen, model)
-        if resets := is_reset_due(config, step, white=self.white):
-            values["opacity_logits"] = np.arange(len(logits)), reset_opacities(config, logits)
-        return RowPlan(
-            rows=chosen.rows if chosen is not None else None,
-            fresh=chosen.fresh if chosen is not None else None,
-            values=values,
-            restarted=("opacity_logits",) if resets else (),
-            new_statistics=densifies,
-            forget_contributions=resets,
-        )
-
-
-def _halves(config: DensityConfig, chosen: Plan, model: ModelState) -> dict[str, tuple[NDArray[Any], Float32]]:
-    """Rows of the halves of what is split, and their means and log scales."""
-    halves = np.flatnonzero(chosen.split)
-    if len(halves) == 0:
-        return {}
-    names = ("means", "quaternions", "log_scales")
-    origins = {name: model.parameters[name].get()[chosen.rows[halves]] for name in names}
-    means, log_scales = split_halves(config, **origins, rng=model.rng)
-    return {"means": (halves, means), "log_scales": (halves, log_scales)}
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """The Gaussians after density control.
-
-    rows (m,) uint32: which Gaussian each comes from, kept ones first and in order; fresh (m,) bool: clones and halves
-    of splits, whose moments start at zero; split (m,) bool: halves, to be moved and shrunk.
-    """
-
-    rows: NDArray[np.uint32]
-    fresh: NDArray[np.bool_]
-    split: NDArray[np.bool_]
+        if is_reset_due(config, step, white=self.white):
+            values = {**made.values, "opacity_logits": (np.arange(len(logits)), reset_opacities(config, logits))}
+            made = replace(made, values=values, restarted=("opacity_logits",), forget_contributions=True)
+        return made
 
 
 def is_due(config: DensityConfig, step: int) -> bool:
@@ -113,9 +79,9 @@ def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
     )
 
 
-def plan(config: DensityConfig, model: ModelState) -> Plan:
+def plan(config: DensityConfig, model: ModelState) -> RowPlan:
     """Clone the small and split the large among those with a large mean gradient; prune the transparent, the oversized
-    and what hardly contributes."""
+    and what hardly contributes. Kept ones come first and in order; fresh are clones and halves of splits."""
     gradient_sums, seen, radii = (model.statistics[name].get() for name in ("gradient_sums", "seen", "radii"))
     useless = _useless(config, model)
     with np.errstate(invalid="ignore"):
@@ -135,15 +101,26 @@ def plan(config: DensityConfig, model: ModelState) -> Plan:
         prune |= sizes_after > config.max_world_fraction * model.extent
         if config.max_screen_radius > 0:
             prune |= (radii[rows] > config.max_screen_radius) & (origin == 0)
-    rows, origin = rows[~prune], origin[~prune]
-    return Plan(rows.astype(np.uint32), origin > 0, origin == 2)
+    rows, origin = rows[~prune].astype(np.uint32), origin[~prune]
+    return RowPlan(rows, origin > 0, _halves(config, model, rows, np.flatnonzero(origin == 2)), new_statistics=True)
 
 
-def plan_pruning(config: DensityConfig, model: ModelState) -> Plan:
+def plan_pruning(config: DensityConfig, model: ModelState) -> RowPlan:
     """Prune the transparent and what hardly contributes, and nothing else."""
     rows = np.flatnonzero(~(_transparent(config, model) | _useless(config, model))).astype(np.uint32)
-    none = np.zeros(len(rows), bool)
-    return Plan(rows, none, none)
+    return RowPlan(rows, np.zeros(len(rows), bool))
+
+
+def _halves(
+    config: DensityConfig, model: ModelState, rows: NDArray[np.uint32], halves: NDArray[np.intp]
+) -> dict[str, tuple[NDArray[Any], Float32]]:
+    """New means and log scales of the halves of what is split, which are some of `rows`."""
+    if len(halves) == 0:
+        return {}
+    names = ("means", "quaternions", "log_scales")
+    origins = {name: model.parameters[name].get()[rows[halves]] for name in names}
+    means, log_scales = split_halves(config, **origins, rng=model.rng)
+    return {"means": (halves, means), "log_scales": (halves, log_scales)}
 
 
 def _transparent(config: DensityConfig, model: ModelState) -> NDArray[np.bool_]:
