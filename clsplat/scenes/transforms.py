@@ -195,15 +195,21 @@ class Keys:
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
-            raise InputError(f"{self.where}: '{key}' is {short(value)}, expected a number")
+            raise self.wrong(key, "a number")
         return float(value)
 
     def require(self, key: str) -> float:
         """The number of `key`; InputError for what `number` refuses, and where there is none."""
-        value = self.number(key)
-        if value is None:
-            raise InputError(f"{self.where}: has no '{key}', expected a number")
+        if (value := self.number(key)) is None:
+            raise self.wrong(key, "a number")
         return value
+
+    def wrong(self, key: str, expected: str) -> InputError:
+        """The error for a value that is missing or cannot be."""
+        value = self.get(key)
+        shown = f"{value:g}" if isinstance(value, float) else short(value)
+        problem = f"has no '{key}'" if value is None else f"'{key}' is {shown}"
+        return InputError(f"{self.where}: {problem}, expected {expected}")
 
 
 def short(value: object) -> str:
@@ -298,7 +304,7 @@ def _focal(keys: Keys, focal: str, angle: str, size: float) -> float | None:
     if (value := keys.number(angle)) is None:
         return None
     if not 0 < value < math.pi:
-        raise InputError(f"{keys.where}: '{angle}' is {value}, expected an angle between 0 and pi, in radians")
+        raise keys.wrong(angle, "an angle between 0 and pi, in radians")
     return 0.5 * size / math.tan(0.5 * value)
 
 

@@ -12,7 +12,7 @@ from clsplat.arrays import Float64, numbers
 from clsplat.camera import Projection, focal_length
 from clsplat.errors import InputError
 from clsplat.scenes.lens import MAX_SIZE
-from clsplat.scenes.transforms import Keys, short
+from clsplat.scenes.transforms import Keys
 from clsplat.shots.shot import MOST_FRAMES
 
 
@@ -40,13 +40,6 @@ class Entry(Keys):
             return focal_length(math.radians(self.require(key)), size, projection)
         except ValueError as error:
             raise InputError(f"{self.where}: '{key}': {error}") from None
-
-    def wrong(self, key: str, expected: str) -> InputError:
-        """The error for a value that is missing or cannot be."""
-        value = self.get(key)
-        shown = f"{value:g}" if isinstance(value, float) else short(value)
-        problem = f"has no '{key}'" if value is None else f"'{key}' is {shown}"
-        return InputError(f"{self.where}: {problem}, expected {expected}")
 
 
 def objects(document: dict[str, Any], key: str) -> list[dict[str, Any]]:

@@ -58,7 +58,6 @@ SH_PICTURES = ("shN_centroids.webp", "shN_labels.webp")
 MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
 LARGEST_TAG = 252
-COEFFICIENTS = {degree: (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
 FREE_BYTES = 16 << 20
 """Bytes that a picture in an archive may have; beyond that 8 for each Gaussian, twice what its pixels have."""
 
@@ -84,8 +83,7 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read a .sog, or a meta.json with its pictures, or the folder that has them. Raises InputError."""
     with _opened(path) as files:
-        meta = _Meta(files, files.meta())
-        model = meta.gaussians()
+        model = _Meta(files).gaussians()
     packing.require_finite(path, model)
     return model
 
@@ -173,8 +171,9 @@ def _opened(path: Path) -> Iterator[_Files]:
 class _Meta:
     """meta.json, and what it leads to."""
 
-    def __init__(self, files: _Files, meta: dict[str, Any]) -> None:
-        self.files, self.meta, self.path = files, meta, files.path
+    def __init__(self, files: _Files) -> None:
+        self.files, self.path, meta = files, files.path, files.meta()
+        self.meta = meta
         self.version = meta.get("version", 1)
         if self.version not in (1, 2):
             raise InputError(f"{self.path}: SOG version {str(self.version)[:20]}, expected 1 or 2")
@@ -207,7 +206,7 @@ class _Meta:
         least = self.count if least is None else least
         file = self.files.file(names[index], FREE_BYTES + 8 * least)
         try:
-            source = open_image(file, straight=True)
+            source = open_image(file)
             spec = source.spec()
             pixels = spec.width * spec.height
             if pixels < least or spec.nchannels < channels:
@@ -267,7 +266,7 @@ class _Meta:
         table = self.picture("shN", 0, 3, least=needed)
         width = table.shape[1] // PALETTE_COLUMNS
         said = self.section("shN").get("bands") if self.version == 2 else None
-        bands = next((degree for degree, coefficients in COEFFICIENTS.items() if coefficients == width and degree), 0)
+        bands = next((degree for degree in range(1, MAX_SH_DEGREE + 1) if degree * (degree + 2) == width), 0)
         if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
             raise InputError(f"{self.path}: shN's palette is {table.shape[1]} pixels wide for {str(said)[:20]} bands")
         colours = table.reshape(-1, width, 3)

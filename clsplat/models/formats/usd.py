@@ -20,7 +20,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -114,17 +114,22 @@ def readable(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: has values that USD cannot read; is it damaged?") from None
 
 
+def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
+    """The stage of this name. Raises InputError about the path."""
+    from pxr import Tf, Usd
+
+    with suppress(Tf.ErrorException):
+        if stage := Usd.Stage.Open(native_name(name), *load):
+            return stage
+    raise InputError(f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more")
+
+
 def _open(path: Path) -> Any:
     """The stage, without payloads, all of whose layers are in the file's folder or below it."""
-    from pxr import Ar, Tf, Usd, UsdUtils
+    from pxr import Ar, Usd, UsdUtils
 
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
-    try:
-        stage = Usd.Stage.Open(native_name(os.path.realpath(path)), Usd.Stage.LoadNone)
-    except Tf.ErrorException:
-        stage = None
-    if stage is None:
-        raise InputError(f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more")
+    stage = open_stage(path, os.path.realpath(path), Usd.Stage.LoadNone)
     folder = Path(os.path.realpath(path)).parent
     for layer in stage.GetUsedLayers():
         file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # of a layer in a .usdz, the .usdz
