@@ -246,14 +246,18 @@ def _document(
         accessor |= {"normalized": True} if component == UINT16 else {}
         accessors.append(accessor)
     said: dict[str, Any] = {"kernel": "ellipse", "colorSpace": color_space}
+    places = {name: index for index, name in enumerate(attributes)}
+    node: dict[str, Any] = {"mesh": 0}
+    if gaussians.origin.any():
+        node["translation"] = (gaussians.origin * LEFT_UP).tolist()
     used = [EXTENSION]
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "clsplat"},
         "extensionsUsed": used,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [],
+        "nodes": [node],
+        "meshes": [{"primitives": [{"attributes": places, "mode": 0, "extensions": {EXTENSION: said}}]}],
         "accessors": accessors,
     }
     contents: Iterable[bytes | memoryview]
@@ -272,11 +276,6 @@ def _document(
         document["bufferViews"] = [
             {"buffer": 0, "byteOffset": offset, "byteLength": size, "target": target} for offset, size in views
         ]
-    places = {name: index for index, name in enumerate(attributes)}
-    primitive = {"attributes": places, "mode": 0, "extensions": {EXTENSION: said}}
-    document["meshes"] = [{"primitives": [primitive]}]
-    if gaussians.origin.any():
-        document["nodes"][0]["translation"] = [float(value) for value in gaussians.origin * LEFT_UP]
     return document, contents
 
 

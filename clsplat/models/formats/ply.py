@@ -39,24 +39,10 @@ MAX_BLOCK_BYTES, MAX_BLOCK_WORDS = 1 << 26, 1 << 21
 MAX_NUMBER_BYTES = 128
 """The longest number in text, as a row of them is made an array whose elements have the width of the widest."""
 
-TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+          "double": "f8"}  # fmt: skip
+TYPES = _TYPES | {np.dtype(code).name: code for code in _TYPES.values()}
+"""NumPy's types by PLY's names, of which newer ones, such as float32, are NumPy's."""
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 POSITION = ("x", "y", "z")

@@ -23,7 +23,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -138,20 +138,16 @@ class _Archive(_Files):
                     left -= len(block)
                     if left < 0:
                         raise InputError(f"{self.path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
-                    _write(file, block, target)
+                    try:
+                        file.write(block)
+                        file.flush()  # here and not at the end, where it would seem that reading failed
+                    except OSError as error:
+                        raise write_error(target, error) from None
         except KeyError:
             raise InputError(f"{self.path}: has no {name[:80]} in it") from None
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
             raise InputError(f"{self.path}: {name[:80]} does not unpack ({error}); is it damaged?") from None
         return target
-
-
-def _write(file: BinaryIO, block: bytes, path: Path) -> None:
-    try:
-        file.write(block)
-        file.flush()  # here and not at the end, where it would seem that reading failed
-    except OSError as error:
-        raise write_error(path, error) from None
 
 
 @contextmanager
@@ -294,7 +290,9 @@ def write(
     that are not finite.
     """
     packing.check_writable(path, gaussians, least=1)
-    with scratch_folder(_room(len(gaussians))) as folder:
+    # more bytes than the pictures have: the encoder of WebP crashes where there is no room
+    room = 24 * len(gaussians) + 64 * min(len(gaussians), MAX_PALETTE) + (1 << 16)
+    with scratch_folder(room) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)
         meta = _pictures(folder, gaussians, order, iterations, progress)
         text = json.dumps(meta, separators=(",", ":")).encode()
@@ -311,11 +309,6 @@ def write(
             archive.writestr(zipfile.ZipInfo(META), text)
             for picture in files:
                 archive.writestr(zipfile.ZipInfo(picture.name), picture.read_bytes())
-
-
-def _room(count: int) -> int:
-    """More bytes than the pictures have: the encoder of WebP crashes where there is no room."""
-    return 24 * count + 64 * min(count, MAX_PALETTE) + (1 << 16)
 
 
 def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, progress: Progress) -> dict[str, Any]:

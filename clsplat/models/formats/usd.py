@@ -44,12 +44,11 @@ MOST_LEVELS = 5000
 WORLD, PRIM = "/World", "/World/Gaussians"
 
 
-def _pxr(path: Path) -> Any:
+def _require_pxr(path: Path) -> None:
     try:
-        import pxr.Usd
+        import pxr.Usd  # noqa: F401
     except ImportError:
         raise InputError(f"{path}: USD needs usd-core, expected it installed: pip install 'clsplat[usd]'") from None
-    return pxr
 
 
 def recognises(head: bytes) -> bool:
@@ -61,7 +60,7 @@ def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **ar
     """Raise InputError where there is no usd-core or no such file, and where a process that makes the `call`
     (MODULE:FUNCTION, with the path and these arguments) does not live to its end: USD's library follows what a damaged
     binary file says to anywhere, and so deep into a file that its stack ends."""
-    _pxr(path)
+    _require_pxr(path)
     with open_input(path, "a USD stage") as file:
         alone, status = _stands_alone(file), os.fstat(file.fileno())
     words = json.dumps(arguments)
@@ -227,7 +226,7 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     if up_axis not in ("Y", "Z") or not meters_per_unit > 0:
         raise ValueError(f"up_axis {up_axis!r}, meters_per_unit {meters_per_unit}: expected Y or Z, and more than 0")
     packing.check_writable(path, gaussians, least=1)
-    _pxr(path)
+    _require_pxr(path)
     from pxr import Usd, UsdUtils
 
     suffix = path.suffix.lower()
