@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Gaussians that training starts from: one a point, isotropic, as wide as the way to its neighbours."""
+"""The Gaussians that training starts from: one a point, isotropic, as wide as the way to its neighbours. Of a
+cloud without colours each has the mean of what the training photographs have where it is seen."""
 
 from __future__ import annotations
 
@@ -8,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.arrays import Float64
-from clsplat.camera import NEAR
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import NEAR, Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.images.alpha import composite
 from clsplat.spherical_harmonics import C0
 
 if TYPE_CHECKING:
@@ -26,6 +28,10 @@ LEAST_COLOUR = 1 / 512
 """Half a step of an 8 bit image. A channel that starts at 0 is at the clamp of colours, where it has no gradient, and
 rounding may keep it there for good."""
 NEIGHBOURS = 3
+LONGEST = 400
+"""Pixels of the photographs' longer side here: a point stands for a few of the full size."""
+UNSEEN = 0.5
+"""Grey, for points that no photograph shows."""
 
 
 def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
@@ -110,3 +116,37 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
     points = low + rng.random((count, 3)) * (high - low)
     colors = 0.5 + C0 * rng.random((count, 3)) / 255
     return points, colors
+
+
+def is_colourless(scene: Scene) -> bool:
+    """True if all points are of one colour, as those of clouds without colours are read."""
+    colors = scene.point_colors
+    return len(colors) > 1 and bool((colors == colors[0]).all())
+
+
+def photographed(scene: Scene, background: ArrayLike) -> Float32:
+    """(N, 3) float32 in [0, 1] for the scene's points. What lies before a point is not known, and counts too."""
+    sums, seen = np.zeros((len(scene.points), 3)), np.zeros(len(scene.points))
+    for view in scene.train_views:
+        factor = min(LONGEST / max(view.camera.width, view.camera.height), 1.0)
+        camera = view.camera.resized(
+            max(round(factor * view.camera.width), 1), max(round(factor * view.camera.height), 1)
+        ).before(scene.near)
+        picture = composite(view.load(camera.width, camera.height), background)
+        rows, columns, inside = pixels_of(scene.points, camera)
+        sums[inside] += picture[rows, columns]
+        seen[inside] += 1
+    means = np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], UNSEEN)
+    return np.clip(means, 0, 1).astype(np.float32)
+
+
+def pixels_of(points: Float64, camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Rows and columns of the pixels that show the points (N, 3) of the world, of those before the camera and in its
+    picture, which are `inside` (N,)."""
+    local = points @ camera.rotation.T + camera.translation
+    depth = local[:, 2]
+    ahead = depth > camera.near
+    by = np.where(ahead, depth, 1.0)
+    x, y = camera.fx * local[:, 0] / by + camera.cx, camera.fy * local[:, 1] / by + camera.cy
+    inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return y[inside].astype(np.int64), x[inside].astype(np.int64), inside

@@ -18,8 +18,7 @@ from clsplat.camera import Camera
 from clsplat.errors import InputError, examples
 from clsplat.models.formats.usd import open_stage, readable, survive
 from clsplat.scenes.transforms import opengl_pose, short
-from clsplat.shots.entries import whole_frames
-from clsplat.shots.shot import Shot, numbered
+from clsplat.shots.shot import Shot, numbered, whole_frames
 
 ORTHOGRAPHIC_UNIT = 0.1
 """USD measures apertures in tenths of a world unit; only of an orthographic camera that is more than a ratio."""
