@@ -111,11 +111,8 @@ class KernelBuildError(ClsplatError):
         self.log, self.source = log, source
 
     def __str__(self) -> str:
-        return (
-            f"{self.args[0]}\n{self.log}\n{self.source}"
-            if os.environ.get("CLSPLAT_DEBUG") == "1"
-            else str(self.args[0])
-        )
+        debug = os.environ.get("CLSPLAT_DEBUG") == "1"
+        return f"{self.args[0]}\n{self.log}\n{self.source}" if debug else str(self.args[0])
 
 
 class DriverError(ClsplatError):

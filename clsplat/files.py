@@ -246,11 +246,7 @@ def _take(lock: Path, token: bytes) -> bool:
 
 def replace(source: Path, target: Path) -> None:
     """Rename a file or a folder, in the place of a file that is there. Raises OSError."""
-
-    def rename() -> None:
-        source.replace(target)
-
-    _patiently(rename)
+    _patiently(lambda: source.replace(target))
 
 
 def remove(path: Path) -> None:
@@ -258,16 +254,18 @@ def remove(path: Path) -> None:
     _patiently(lambda: path.unlink(missing_ok=True))
 
 
-def _patiently(act: Callable[[], None], *, windows: bool = WINDOWS) -> None:
+def _patiently(act: Callable[[], object], *, windows: bool = WINDOWS) -> None:
     """Do it; again and again for a while where Windows says that another program has the file open."""
     until = time.monotonic() + PATIENCE
     while True:
         try:
-            return act()
+            act()
         except PermissionError:
             if not windows or time.monotonic() > until:
                 raise
             time.sleep(0.02)
+        else:
+            return
 
 
 def name_trouble(name: str, *, windows: bool = WINDOWS) -> str | None:

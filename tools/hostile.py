@@ -368,7 +368,7 @@ def read_checkpoint(folder: Path) -> None:
 
 def read_photos(folder: Path) -> None:
     """Read photos like structure from motion, up to the start of pycolmap."""
-    photos = sfm_photos.find_photos(folder / "photos").photos
+    photos = sfm_photos.find_photos(folder / "photos")[0]
     sfm_photos.stage_photos(folder / "photos", photos, folder / "staged", lambda _: None, 1)
 
 

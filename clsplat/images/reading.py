@@ -128,7 +128,7 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
 
     Raises InputError for a file that is missing, no picture, or a PNG that is cut short.
     """
-    source = open_image(path, straight=True)
+    source = open_image(path)
     spec = source.spec()
     source.close()
     width, height = spec.full_width, spec.full_height
@@ -150,7 +150,7 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
     Raises InputError, naming the file and the decoder's reason, for a file that is missing, no picture, damaged, cut
     short, of another kind of channels, or with values that are not finite.
     """
-    source = open_image(path, straight=True)
+    source = open_image(path)
     spec = source.spec()
     if source.format_name() == "png":
         _check_png_is_whole(path)
@@ -190,14 +190,13 @@ def downscale(image: Float32, width: int, height: int) -> Float32:
     return unassociate(result) if has_alpha else result
 
 
-def open_image(path: Path, *, straight: bool = False) -> Any:
-    """OpenImageIO's input of a file, whose header makes sense. straight: alpha, where the format has it so. Raises
+def open_image(path: Path) -> Any:
+    """OpenImageIO's input of a file, whose header makes sense. Alpha is straight where the format has it so. Raises
     InputError."""
     if not is_file(path):
         raise InputError(f"{path}: no such image file")
     hints = oiio.ImageSpec()
-    if straight:
-        hints.attribute("oiio:UnassociatedAlpha", 1)
+    hints.attribute("oiio:UnassociatedAlpha", 1)
     size = path.stat().st_size
     with open_input(path, "a picture") as file:
         known = file.read(8).startswith(SIGNATURES)

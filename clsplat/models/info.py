@@ -89,10 +89,6 @@ def _percentiles(values: NDArray[Any]) -> dict[str, float]:
     return {f"p{percent}": float(value) for percent, value in zip(PERCENTILES, results, strict=True)}
 
 
-def _listed(percentiles: dict[str, float]) -> str:
-    return ", ".join(f"{key} {value:.4g}" for key, value in percentiles.items())
-
-
 def text(info: dict[str, Any]) -> str:
     """A line for each thing."""
 
@@ -113,7 +109,10 @@ def text(info: dict[str, Any]) -> str:
         bounds = info["bounds"]
         lines.append(("bounds", f"{numbers(bounds['min'])} to {numbers(bounds['max'])}, extent {bounds['extent']:.6g}"))
         lines.append(("98 % within", f"{numbers(bounds['p1'])} to {numbers(bounds['p99'])}"))
-        lines += [(name, _listed(info[name])) for name in ("scale", "opacity")]
+        percentiles = {
+            name: [f"{key} {value:.4g}" for key, value in info[name].items()] for name in ("scale", "opacity")
+        }
+        lines += [(name, ", ".join(values)) for name, values in percentiles.items()]
     if any(info["origin"]):
         lines.append(("origin", " ".join(map(repr, info["origin"]))))
     if info.get("near", NEAR) != NEAR:

@@ -13,11 +13,12 @@ import os
 import re
 import struct
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO
 
 import numpy as np
 
@@ -28,8 +29,6 @@ from clsplat.files import is_file, open_input
 from clsplat.rotations import rotation_from_quaternion
 from clsplat.scenes.data_set import MAX_NUMBER, DataSet, PosedImage
 from clsplat.scenes.lens import Lens, absurd, check_lens, models
-
-Value = TypeVar("Value")
 
 STEMS = ("cameras", "images", "points3D")
 COUNT = struct.Struct("<Q")
@@ -240,11 +239,10 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
-    def parse(words: list[str]) -> tuple[int, Lens]:
-        return int(words[0]), Lens(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
-
     for number, line in _lines(path):
-        yield _parsed(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse, line.split())
+        with _parsing(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"):
+            key, model, width, height, *params = line.split()
+            yield int(key), Lens(model, int(width), int(height), tuple(map(float, params)))
 
 
 def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
@@ -301,13 +299,11 @@ def _are_observations(line: str) -> bool:
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
-    def parse(words: list[str]) -> tuple[str, int, tuple[float, ...]]:
-        int(words[0])
-        return words[9], int(words[8]), tuple(map(float, words[1:8]))
-
     for number, line, expected in _image_lines(path):
-        # the name is the rest of the line, blanks and all
-        yield _parsed(path, number, expected, parse, line.split(maxsplit=9))
+        with _parsing(path, number, expected):
+            words = line.split(maxsplit=9)  # the name is the rest of the line, blanks and all
+            int(words[0])
+            yield words[9], int(words[8]), tuple(map(float, words[1:8]))
 
 
 def _read_points(folder: Path) -> tuple[Float64, Float32]:
@@ -335,14 +331,12 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
-    def parse(words: list[str]) -> tuple[float, ...]:
-        _, x, y, z, red, green, blue, _ = words[:8]
-        if len(words) > 8 and len(words[8].split()) % 2:
-            raise ValueError("a track is of pairs")
-        return float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue))
-
     for number, line in _lines(path):
-        yield _parsed(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK", parse, line.split(maxsplit=8))
+        with _parsing(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
+            _, x, y, z, red, green, blue, _, *track = line.split(maxsplit=8)
+            if track and len(track[0].split()) % 2:
+                raise ValueError("a track is of pairs")
+            yield float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue))
 
 
 def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
@@ -361,8 +355,9 @@ def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]
             raise corrupt(path, "is not text in UTF-8") from None
 
 
-def _parsed(path: Path, number: int, expected: str, parse: Callable[[list[str]], Value], words: list[str]) -> Value:
+@contextmanager
+def _parsing(path: Path, number: int, expected: str) -> Iterator[None]:
     try:
-        return parse(words)
+        yield
     except (ValueError, IndexError, OverflowError):
         raise InputError(f"{path}: line {number} does not read as {expected}; is the file cut or damaged?") from None

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Gaussians that training starts from: one a point, isotropic, as wide as the way to its neighbours."""
+"""The Gaussians that training starts from: one a point, isotropic, as wide as the way to its neighbours. Of a
+cloud without colours each has the mean of what the training photographs have where it is seen."""
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.arrays import Float64
-from clsplat.camera import NEAR
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import NEAR, Camera
 from clsplat.errors import InputError
-from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.gaussians import Gaussians
+from clsplat.images.alpha import composite
 from clsplat.spherical_harmonics import C0
 
 if TYPE_CHECKING:
@@ -27,6 +28,10 @@ LEAST_COLOUR = 1 / 512
 """Half a step of an 8 bit image. A channel that starts at 0 is at the clamp of colours, where it has no gradient, and
 rounding may keep it there for good."""
 NEIGHBOURS = 3
+LONGEST = 400
+"""Pixels of the photographs' longer side here: a point stands for a few of the full size."""
+UNSEEN = 0.5
+"""Grey, for points that no photograph shows."""
 
 
 def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
@@ -35,35 +40,29 @@ def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gau
     colors: NDArray[Any] = scene.point_colors
     if len(points) == 0:
         points, colors = random_points(random_count, *scene.bounds, rng)
-    return from_points(points, colors, sh_degree=0, origin=scene.origin, extent=scene.extent, near=scene.near)
+    return from_points(points, colors, origin=scene.origin, extent=scene.extent, near=scene.near)
 
 
 def from_points(
     points: ArrayLike,
     colors: ArrayLike,
     *,
-    sh_degree: int,
     origin: Float64 | None = None,
     extent: float = 1.0,
     near: float = NEAR,
 ) -> Gaussians:
     """One Gaussian a point.
 
-    points (N, 3), world units; colors (N, 3), float in [0, 1] or uint8; sh_degree 0 to 3: the higher coefficients
-    are there and 0; origin (3,): where the means count from, the world's own if not given; extent: the scene's,
-    world units; near: the model's near plane. The standard deviation is the root of the mean squared distance to the
-    three nearest other points (fewer where there are fewer; a lone point gets the floor). Opacity 0.1, quaternions
-    1 0 0 0.
+    points (N, 3), world units; colors (N, 3) in [0, 1]; origin (3,): where the means count from, the world's own if not
+    given; extent: the scene's, world units; near: the model's near plane. The standard deviation is the root of the
+    mean squared distance to the three nearest other points (fewer where there are fewer; a lone point gets the floor).
+    Opacity 0.1, quaternions 1 0 0 0.
     Raises InputError for no points or points that are not finite, ValueError for wrong shapes.
     """
     xyz = np.asarray(points, np.float64)
     rgb: NDArray[Any] = np.asarray(colors)
-    if rgb.dtype == np.uint8:
-        rgb = rgb / 255.0
     if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape:
         raise ValueError(f"points {xyz.shape} and colors {rgb.shape}: expected (N, 3) both")
-    if not 0 <= sh_degree <= MAX_SH_DEGREE:
-        raise ValueError(f"sh_degree {sh_degree}: expected 0 to {MAX_SH_DEGREE}")
     count = len(xyz)
     if count == 0:
         raise InputError("no points to start from, expected at least one")
@@ -74,8 +73,7 @@ def from_points(
     log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), squared_floor(extent)))
     quaternions = np.zeros((count, 4), np.float32)
     quaternions[:, 0] = 1
-    sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (np.maximum(rgb, LEAST_COLOUR) - 0.5) / C0
+    sh = ((np.maximum(rgb, LEAST_COLOUR) - 0.5) / C0).astype(np.float32)[:, None]
     return Gaussians(
         means=np.ascontiguousarray(xyz - origin, np.float32),
         quaternions=quaternions,
@@ -98,11 +96,12 @@ def mean_squared_distance(points: Float64) -> Float64:
 
     A point that coincides with others counts them as neighbours at distance 0, as the authors' code does.
     """
+    from scipy.spatial import cKDTree
+
     neighbours = min(NEIGHBOURS, len(points) - 1)
     if neighbours == 0:
         return np.zeros(len(points))
-    tree: Any = import_module("scipy.spatial").cKDTree(points)  # scipy has no types
-    distances, _ = tree.query(points, k=neighbours + 1)
+    distances, _ = cKDTree(points).query(points, k=neighbours + 1)
     # Sorted, so the first is 0: the point itself or one at the same place, which is the same distance.
     return np.asarray(np.mean(np.square(distances[:, 1:]), axis=1))
 
@@ -117,3 +116,37 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
     points = low + rng.random((count, 3)) * (high - low)
     colors = 0.5 + C0 * rng.random((count, 3)) / 255
     return points, colors
+
+
+def is_colourless(scene: Scene) -> bool:
+    """True if all points are of one colour, as those of clouds without colours are read."""
+    colors = scene.point_colors
+    return len(colors) > 1 and bool((colors == colors[0]).all())
+
+
+def photographed(scene: Scene, background: ArrayLike) -> Float32:
+    """(N, 3) float32 in [0, 1] for the scene's points. What lies before a point is not known, and counts too."""
+    sums, seen = np.zeros((len(scene.points), 3)), np.zeros(len(scene.points))
+    for view in scene.train_views:
+        factor = min(LONGEST / max(view.camera.width, view.camera.height), 1.0)
+        camera = view.camera.resized(
+            max(round(factor * view.camera.width), 1), max(round(factor * view.camera.height), 1)
+        ).before(scene.near)
+        picture = composite(view.load(camera.width, camera.height), background)
+        rows, columns, inside = pixels_of(scene.points, camera)
+        sums[inside] += picture[rows, columns]
+        seen[inside] += 1
+    means = np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], UNSEEN)
+    return np.clip(means, 0, 1).astype(np.float32)
+
+
+def pixels_of(points: Float64, camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Rows and columns of the pixels that show the points (N, 3) of the world, of those before the camera and in its
+    picture, which are `inside` (N,)."""
+    local = points @ camera.rotation.T + camera.translation
+    depth = local[:, 2]
+    ahead = depth > camera.near
+    by = np.where(ahead, depth, 1.0)
+    x, y = camera.fx * local[:, 0] / by + camera.cx, camera.fy * local[:, 1] / by + camera.cy
+    inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return y[inside].astype(np.int64), x[inside].astype(np.int64), inside

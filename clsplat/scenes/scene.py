@@ -60,16 +60,10 @@ class View:
     def load(self, width: int | None = None, height: int | None = None) -> Float32:
         """Read the pixels, float32 (H, W, 3), or (H, W, 4) with straight alpha, undistorted, of the camera's size.
 
-        width, height: another size; with only one of them the other follows from the camera's proportions. Reads the
-        file each time. Raises InputError for one that does not decode or has changed its size since.
+        width, height: another size. Reads the file each time. Raises InputError for one that does not decode or has
+        changed its size since.
         """
-        if width is None and height is None:
-            width, height = self.camera.width, self.camera.height
-        elif width is None:
-            width = max(1, round(self.camera.width * (height or 1) / self.camera.height))
-        elif height is None:
-            height = max(1, round(self.camera.height * width / self.camera.width))
-        assert height is not None
+        width, height = width or self.camera.width, height or self.camera.height
         image = self._read()
         if self.lens.is_pinhole:
             return downscale(image, width, height)

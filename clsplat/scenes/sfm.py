@@ -79,8 +79,7 @@ def reconstruct(
         raise InputError(f"matching {matching!r}: expected auto, exhaustive or sequential")
     if camera_model not in CAMERA_MODELS:
         raise InputError(f"camera model {camera_model!r}: expected one of {', '.join(CAMERA_MODELS)}")
-    photo_files = sfm_photos.find_photos(images, excluded=output)
-    paths = photo_files.photos
+    paths, left_out = sfm_photos.find_photos(images, excluded=output)
     settings = f"{matching} {camera_model} {shared_camera} {max_image_size} {max_features} {seed}"
     fingerprint = sfm_photos.fingerprint(images, paths, settings)
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
@@ -88,14 +87,9 @@ def reconstruct(
         return output
     if len(paths) < MINIMUM_PHOTOS:
         raise InputError(f"{images}: only {len(paths)} photo(s) found, expected at least {MINIMUM_PHOTOS}")
-    for left_out, why in (
-        (photo_files.others, "convert to JPEG, PNG or TIFF first"),
-        (photo_files.broken, "links that lead nowhere"),
-        (photo_files.companions, "by their names masks, depths or the like of other photos"),
-    ):
-        if left_out:
-            names = [sfm_photos.photo_name(images, path) for path in left_out]
-            warn(f"{images}: {_listed(names)} left out: {why}")
+    for why, others in left_out.items():
+        names = [sfm_photos.photo_name(images, path) for path in others]
+        warn(f"{images}: {_listed(names)} left out: {why}")
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -256,14 +250,11 @@ def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
 def _rows(database: Path, table: str) -> int:
     """Rows of a table that the worker is filling; 0 while it cannot be read."""
     try:
-        connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.1)
-        try:
-            count: int = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]  # noqa: S608 - our names
-        finally:
-            connection.close()
+        name = f"{database.resolve().as_uri()}?mode=ro"
+        with contextlib.closing(sqlite3.connect(name, uri=True, timeout=0.1)) as connection:
+            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])  # noqa: S608 - our names
     except sqlite3.Error:
         return 0
-    return count
 
 
 def _move_into_place(work: Path, output: Path) -> None:

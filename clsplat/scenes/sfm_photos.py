@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import WINDOWS, is_file, native_name, require_room, room_error, write_error
-from clsplat.images.reading import cannot_be_searched, companions, error_of, open_image
+from clsplat.images.reading import cannot_be_searched, companions, error_of, open_image, opened
 from clsplat.images.writing import jpeg_room
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -44,19 +44,8 @@ class Photo:
     transparent: bool = False
 
 
-@dataclass(frozen=True)
-class PhotoFiles:
-    """photos in the order of their names, and what is left out: images of kinds that cannot be used, links that lead
-    nowhere, and masks, depths and the like that go with photos."""
-
-    photos: list[Path]
-    others: list[Path]
-    broken: list[Path]
-    companions: list[Path]
-
-
-def find_photos(folder: Path, excluded: Path | None = None) -> PhotoFiles:
-    """The photos below a folder.
+def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], dict[str, list[Path]]]:
+    """The photos below a folder in the order of their names, and what is left out, by why.
 
     Hidden files and folders are skipped, as is `excluded` (the output, where it lies inside). Raises InputError
     for a folder that does not exist, that cannot be read, or that holds no photos.
@@ -90,7 +79,12 @@ def find_photos(folder: Path, excluded: Path | None = None) -> PhotoFiles:
     key = partial(photo_name, folder)
     aside = companions(photos, photos, folder)
     kept = [path for path in photos if path not in aside]
-    return PhotoFiles(*(sorted(paths, key=key) for paths in (kept, others, broken, aside)))
+    left_out = {
+        "convert to JPEG, PNG or TIFF first": others,
+        "links that lead nowhere": broken,
+        "by their names masks, depths or the like of other photos": aside,
+    }
+    return sorted(kept, key=key), {why: sorted(paths, key=key) for why, paths in left_out.items() if paths}
 
 
 def photo_name(folder: Path, path: Path) -> str:
@@ -175,12 +169,8 @@ def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
 
 def has_alpha(path: Path) -> bool:
     """True if an image file has an alpha channel; reads its header alone."""
-    source = oiio.ImageInput.open(native_name(path))
-    if source is None:
-        return False
-    found: bool = source.spec().alpha_channel >= 0
-    source.close()
-    return found
+    with opened(path) as source:
+        return source is not None and source.spec().alpha_channel >= 0
 
 
 def _write_upright(path: Path, copy: Path, spec: Any) -> None:

@@ -50,15 +50,13 @@ class Worker:
         renumber_by_name(self.database)
         self.match()
         models = self.map(relaxed=False)
-        if best_size(models) < 0.6 * self.count:
+        if max((model.num_reg_images() for model in models.values()), default=0) < 0.6 * self.count:
             # a weak baseline or few features: start from a narrower pair, as a second try
-            again = self.map(relaxed=True)
-            if best_size(again) > best_size(models):
-                models = again
+            models |= self.map(relaxed=True)
         if not models:
             self.say(failure=self.evidence())
             return
-        best = max(models, key=lambda path: models[path].num_reg_images())
+        best = max(models, key=lambda path: models[path].num_reg_images())  # the mapping does not put it first
         self.undistort(best)
         model = models[best]
         registered = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
@@ -196,11 +194,6 @@ def as_pinhole(folder: Path) -> None:
         camera.params = [focal, focal, cx, cy]
     if simple:
         model.write(folder)
-
-
-def best_size(models: dict[Path, pycolmap.Reconstruction]) -> int:
-    """Photos in the largest model; incremental mapping does not put it first."""
-    return max((model.num_reg_images() for model in models.values()), default=0)
 
 
 def renumber_by_name(database: Path) -> None:

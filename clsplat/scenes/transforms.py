@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float32, Float64, numbers
+from clsplat.camera import Projection, focal_length
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.images.reading import EXTENSIONS, image_size, require_images
 from clsplat.models.formats import ply
 from clsplat.scenes.data_set import MAX_NUMBER, DataSet, PosedImage
-from clsplat.scenes.lens import Lens, absurd, check_lens
+from clsplat.scenes.lens import MAX_SIZE, Lens, absurd, check_lens
 
 DRIVE = re.compile(r"\A[A-Za-z]:/")
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -86,8 +87,7 @@ def read_poses(path: Path, size: tuple[int, int] | None = None) -> list[PosedIma
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
-    frames = document.get("frames")
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+    if not (frames := objects(document, "frames")):
         raise InputError(f"{path}: has no 'frames' (a list of pictures with their poses); {EXPORT_AGAIN}")
     readers = [Keys(path, f"frame {index}", frame, document) for index, frame in enumerate(frames)]
     for keys in readers:
@@ -173,7 +173,8 @@ def read_blender(folder: Path) -> DataSet:
 
 
 class Keys:
-    """Values of one frame, or of the file where the frame does not have them; `where` begins every error."""
+    """Values of one frame or camera, or of the file where that does not have them; `where` begins every error. Every
+    method raises InputError for a value that cannot be."""
 
     def __init__(self, path: Path, part: str | None, frame: dict[str, Any], document: dict[str, Any]) -> None:
         self.path, self.frame, self.document = path, frame, document
@@ -195,15 +196,42 @@ class Keys:
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
-            raise InputError(f"{self.where}: '{key}' is {short(value)}, expected a number")
+            raise self.wrong(key, "a number")
         return float(value)
 
     def require(self, key: str) -> float:
         """The number of `key`; InputError for what `number` refuses, and where there is none."""
-        value = self.number(key)
-        if value is None:
-            raise InputError(f"{self.where}: has no '{key}', expected a number")
+        if (value := self.number(key)) is None:
+            raise self.wrong(key, "a number")
         return value
+
+    def side(self, key: str) -> int:
+        """Width or height in pixels."""
+        side = self.number(key)
+        if side is None or not 1 <= side <= MAX_SIZE or side != round(side):
+            raise self.wrong(key, f"a whole number of pixels from 1 to {MAX_SIZE}")
+        return round(side)
+
+    def vector(self, key: str, size: int) -> Float64:
+        """Finite numbers (size,)."""
+        vector = numbers(self.get(key))
+        if vector.shape != (size,) or not np.isfinite(vector).all():
+            raise self.wrong(key, f"a list of {size} numbers")
+        return vector
+
+    def focal(self, key: str, size: int, projection: Projection = "perspective") -> float:
+        """The focal length in pixels of an angle of view in degrees across `size` pixels."""
+        try:
+            return focal_length(math.radians(self.require(key)), size, projection)
+        except ValueError as error:
+            raise InputError(f"{self.where}: '{key}': {error}") from None
+
+    def wrong(self, key: str, expected: str) -> InputError:
+        """The error for a value that is missing or cannot be."""
+        value = self.get(key)
+        shown = f"{value:g}" if isinstance(value, float) else short(value)
+        problem = f"has no '{key}'" if value is None else f"'{key}' is {shown}"
+        return InputError(f"{self.where}: {problem}, expected {expected}")
 
 
 def short(value: object) -> str:
@@ -223,6 +251,12 @@ def load_document(path: Path, expected: str = "a transforms.json", key: str = "'
     if not isinstance(document, dict):
         raise InputError(f"{path}: holds no JSON object, expected one with {key}")
     return document
+
+
+def objects(document: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    """The list of objects under a key, empty where that is none."""
+    given = document.get(key)
+    return given if isinstance(given, list) and all(isinstance(entry, dict) for entry in given) else []
 
 
 def _plain(listed: str) -> str:
@@ -298,7 +332,7 @@ def _focal(keys: Keys, focal: str, angle: str, size: float) -> float | None:
     if (value := keys.number(angle)) is None:
         return None
     if not 0 < value < math.pi:
-        raise InputError(f"{keys.where}: '{angle}' is {value}, expected an angle between 0 and pi, in radians")
+        raise keys.wrong(angle, "an angle between 0 and pi, in radians")
     return 0.5 * size / math.tan(0.5 * value)
 
 

@@ -14,10 +14,9 @@ from clsplat.arrays import Float64
 from clsplat.camera import LARGEST_FOCAL, Camera, Projection
 from clsplat.errors import InputError
 from clsplat.rotations import rotation_from_quaternion
-from clsplat.scenes.transforms import short
-from clsplat.shots.entries import Entry, objects, whole_frames
+from clsplat.scenes.transforms import Keys, objects, short
 from clsplat.shots.keys import Key, interpolate
-from clsplat.shots.shot import Shot, numbered
+from clsplat.shots.shot import Shot, numbered, whole_frames
 
 VERSION_KEY, VERSION = "clsplat_cameras", 1
 FOCAL = ("fx", "fy", "fov_x", "fov_y", "pixel_size")
@@ -40,14 +39,14 @@ def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
     _known(str(path), document, FILE)
     if not (entries := objects(document, "keys")):
         raise InputError(f"{path}: has no keys, expected 'keys' to be a list of at least one")
-    whole = Entry(path, None, {}, document)
+    whole = Keys(path, None, {}, document)
     fps, first, loop = whole.number("fps"), whole.number("first_frame"), whole.number("loop_frames")
     if fps is not None and fps <= 0:
         raise InputError(f"{path}: 'fps' is {fps:g}, expected more than 0")
     first = 1.0 if first is None else first
     keys = []
     for index, entry in enumerate(entries):
-        reader = Entry(path, f"key {index}", entry, document)
+        reader = Keys(path, f"key {index}", entry, document)
         _known(reader.where, entry, KEY)
         camera = _camera(reader, whole)
         keys.append(Key(_frame(reader, fps, first), camera, math.radians(reader.number("roll") or 0.0)))
@@ -62,7 +61,7 @@ def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
             raise InputError(f"{where}: '{name}' is not known here, expected one of {', '.join(names)}")
 
 
-def _frame(keys: Entry, fps: float | None, first: float) -> float:
+def _frame(keys: Keys, fps: float | None, first: float) -> float:
     frame, seconds = keys.frame.get("frame"), keys.frame.get("seconds")
     if (frame is None) == (seconds is None):
         raise InputError(f"{keys.where}: expected 'frame' or 'seconds', and one of them only")
@@ -89,7 +88,7 @@ def _frames(path: Path, frames: list[float], loop: float | None) -> list[int]:
     return whole_frames(str(path), "frame", begin, end)
 
 
-def _camera(keys: Entry, whole: Entry) -> Camera:
+def _camera(keys: Keys, whole: Keys) -> Camera:
     projection = whole.document.get("projection", "perspective")
     if projection not in get_args(Projection):
         raise InputError(
@@ -109,7 +108,7 @@ def _camera(keys: Entry, whole: Entry) -> Camera:
     return Camera(width, height, fx, fy, cx, cy, rotation, -rotation @ position, near, far, projection)
 
 
-def _rotation(keys: Entry) -> Float64:
+def _rotation(keys: Keys) -> Float64:
     quaternion = keys.vector("world_from_cam", 4)
     norm = float(np.linalg.norm(quaternion))
     if not 0.5 < norm < 2:
@@ -119,11 +118,11 @@ def _rotation(keys: Entry) -> Float64:
     return rotation_from_quaternion(quaternion / norm)
 
 
-def _focal(keys: Entry, projection: Projection, width: int, height: int) -> tuple[float, float]:
+def _focal(keys: Keys, projection: Projection, width: int, height: int) -> tuple[float, float]:
     """Pixels a unit, from what the key has of FOCAL, or the file where it has none of them."""
     source = keys.frame if any(name in keys.frame for name in FOCAL) else keys.document
     given = [name for name in FOCAL if name in source]
-    values = Entry(keys.path, None, source, {})
+    values = Keys(keys.path, None, source, {})
     values.where = keys.where
     if projection == "equirectangular":
         across, down = values.number("fov_x"), values.number("fov_y")
@@ -155,7 +154,7 @@ def _listed(source: dict[str, Any], given: list[str]) -> str:
     return ", ".join(f"'{name}' {short(source[name])}" for name in given) or "no focal length"
 
 
-def _principal(keys: Entry, width: int, height: int) -> tuple[float, float]:
+def _principal(keys: Keys, width: int, height: int) -> tuple[float, float]:
     cx, cy = keys.number("cx"), keys.number("cy")
     if keys.get("shift") is None:
         return width / 2 if cx is None else cx, height / 2 if cy is None else cy

@@ -14,8 +14,7 @@ from typing import Any, cast
 
 from clsplat.camera import Camera, Projection
 from clsplat.errors import InputError
-from clsplat.scenes.transforms import opengl_pose, short
-from clsplat.shots.entries import Entry, objects
+from clsplat.scenes.transforms import Keys, objects, opengl_pose, short
 from clsplat.shots.shot import Shot, numbered
 
 TYPES = ("perspective", "fisheye", "equirectangular")
@@ -37,15 +36,15 @@ def read_camera_path(path: Path, document: dict[str, Any]) -> Shot:
     kind = document.get("camera_type") or "perspective"
     if not isinstance(kind, str) or kind.lower() not in TYPES:
         raise InputError(f"{path}: 'camera_type' is {short(kind)}, expected one of {', '.join(TYPES)}")
-    whole = Entry(path, None, {}, document)
+    whole = Keys(path, None, {}, document)
     width, height, fps = whole.side("render_width"), whole.side("render_height"), whole.number("fps")
-    readers = [Entry(path, f"key {index}", entry, {}) for index, entry in enumerate(entries)]
+    readers = [Keys(path, f"key {index}", entry, {}) for index, entry in enumerate(entries)]
     cameras = [_camera(reader, cast("Projection", kind.lower()), width, height) for reader in readers]
     fps = fps if fps and fps > 0 else None
     return Shot(numbered(cameras, fps=fps), fps=fps)
 
 
-def _camera(keys: Entry, projection: Projection, width: int, height: int) -> Camera:
+def _camera(keys: Keys, projection: Projection, width: int, height: int) -> Camera:
     given = keys.frame.get("camera_to_world")
     if isinstance(given, list) and len(given) == 16:
         given = [given[row : row + 4] for row in range(0, 16, 4)]

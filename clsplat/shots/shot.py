@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import ceil, floor, isfinite
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
@@ -74,6 +75,16 @@ class Shot:
     def at(self, frame: float) -> Camera:
         """The camera at a frame that need not be whole, such as within a shutter's time: interpolated as keys are."""
         return interpolate([Key(key.number, key.camera) for key in self.frames], [frame])[0]
+
+
+def whole_frames(where: str, what: str, begin: float, end: float) -> list[int]:
+    """The whole numbers from `begin` to `end`. Raises InputError for none of them, and for too many."""
+    if not (isfinite(end - begin) and end - begin < MOST_FRAMES):
+        raise InputError(f"{where}: has the {what}s {begin:g} to {end:g}, expected at most {MOST_FRAMES:,}")
+    frames = list(range(ceil(begin), floor(end) + 1))
+    if not frames:
+        raise InputError(f"{where}: has no whole {what} from {begin:g} to {end:g}, expected at least one")
+    return frames
 
 
 def numbered(cameras: Iterable[Camera], first: int = 1, fps: float | None = None) -> tuple[Frame, ...]:

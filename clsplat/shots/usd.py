@@ -16,11 +16,9 @@ import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError, examples
-from clsplat.files import native_name
-from clsplat.models.formats.usd import readable, survive
+from clsplat.models.formats.usd import open_stage, readable, survive
 from clsplat.scenes.transforms import opengl_pose, short
-from clsplat.shots.entries import whole_frames
-from clsplat.shots.shot import Shot, numbered
+from clsplat.shots.shot import Shot, numbered, whole_frames
 
 ORTHOGRAPHIC_UNIT = 0.1
 """USD measures apertures in tenths of a world unit; only of an orthographic camera that is more than a ratio."""
@@ -47,16 +45,11 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
 
 def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
     """`read_usd` of a file that is known not to end the process."""
-    from pxr import Tf, Usd, UsdGeom, UsdUtils
+    from pxr import UsdGeom, UsdUtils
 
     # takes what USD would print: a layer that does not resolve may have nothing to do with the camera
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
-    try:
-        stage = Usd.Stage.Open(native_name(path))
-    except Tf.ErrorException:
-        raise InputError(
-            f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more"
-        ) from None
+    stage = open_stage(path, path)
     with readable(path):
         camera = _find(path, [UsdGeom.Camera(item) for item in stage.Traverse() if item.IsA(UsdGeom.Camera)], prim)
         where = f"{path}: {camera.GetPath()}"

@@ -34,7 +34,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
-from clsplat.scenes.point_colours import is_colourless, photographed
+from clsplat.scenes.initialise import is_colourless, photographed
 from clsplat.scenes.scene import Scene
 from clsplat.stages.loss import Loss
 from clsplat.training import telemetry

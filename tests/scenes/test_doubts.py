@@ -21,8 +21,7 @@ from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
 from clsplat.reference.cameras import pixel_from_world
 from clsplat.scenes import doubts
-from clsplat.scenes.initialise import LEAST_COLOUR, from_points
-from clsplat.scenes.point_colours import is_colourless, photographed, pixels_of
+from clsplat.scenes.initialise import LEAST_COLOUR, from_points, is_colourless, photographed, pixels_of
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.spherical_harmonics import C0
 
@@ -149,7 +148,7 @@ def test_pictures_with_alpha_take_any_background(tmp_path: Path) -> None:
 
 def test_a_black_point_can_learn(default_device: Device) -> None:
     # at a colour of 0 it is at the clamp, where rounding decides for good whether there is a gradient
-    model = from_points([[0, 0, 2.0]], [[0.0, 0.5, 1.0]], sh_degree=0)
+    model = from_points([[0, 0, 2.0]], [[0.0, 0.5, 1.0]])
     np.testing.assert_allclose(0.5 + C0 * model.sh[0, 0], [LEAST_COLOUR, 0.5, 1.0], atol=1e-7)
 
 

@@ -25,46 +25,36 @@ def test_neighbours(count: int) -> None:
 def test_points_that_coincide() -> None:
     points = np.repeat(np.random.default_rng(0).standard_normal((10, 3)), [1, 2, 3, 4, 5, 6, 1, 1, 1, 1], axis=0)
     np.testing.assert_allclose(mean_squared_distance(points), brute_force(points), rtol=1e-12, atol=1e-15)
-    scales = np.exp(from_points(points, np.zeros_like(points), sh_degree=0).log_scales)
+    scales = np.exp(from_points(points, np.zeros_like(points)).log_scales)
     assert np.isfinite(scales).all()
     np.testing.assert_allclose(scales.min(), np.sqrt(MIN_SQUARED_DISTANCE), rtol=1e-5)
 
 
 def test_a_lone_point() -> None:
-    gaussians = from_points([[1, 2, 3]], [[0.5, 0.5, 0.5]], sh_degree=3)
+    gaussians = from_points([[1, 2, 3]], [[0.5, 0.5, 0.5]])
     np.testing.assert_allclose(np.exp(gaussians.log_scales), np.sqrt(MIN_SQUARED_DISTANCE), rtol=1e-5)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_a_gaussian_starts_as(degree: int) -> None:
+def test_what_a_gaussian_starts_as() -> None:
     rng = np.random.default_rng(0)
     points, colors = rng.standard_normal((30, 3)), rng.random((30, 3))
-    gaussians = from_points(points, colors, sh_degree=degree)
+    gaussians = from_points(points, colors)
     gaussians.check()
-    assert gaussians.sh_degree == degree
+    assert gaussians.sh_degree == 0
     np.testing.assert_array_equal(gaussians.means, points.astype(np.float32))
     np.testing.assert_array_equal(gaussians.quaternions, np.tile(np.float32([1, 0, 0, 0]), (30, 1)))
     np.testing.assert_allclose(1 / (1 + np.exp(-gaussians.opacity_logits)), 0.1, rtol=1e-6)
     np.testing.assert_allclose(0.5 + C0 * gaussians.sh[:, 0], colors, atol=1e-6)
-    assert not gaussians.sh[:, 1:].any()
     np.testing.assert_allclose(np.exp(2 * gaussians.log_scales), np.tile(brute_force(points)[:, None], 3), rtol=1e-5)
-
-
-def test_byte_colours() -> None:
-    points = np.eye(3)
-    byte = np.uint8([[0, 128, 255]] * 3)
-    np.testing.assert_array_equal(
-        from_points(points, byte, sh_degree=0).sh, from_points(points, byte / 255, sh_degree=0).sh
-    )
 
 
 def test_bad_points() -> None:
     with pytest.raises(InputError, match="no points"):
-        from_points(np.zeros((0, 3)), np.zeros((0, 3)), sh_degree=0)
+        from_points(np.zeros((0, 3)), np.zeros((0, 3)))
     with pytest.raises(InputError, match="point 1 is not finite"):
-        from_points([[0, 0, 0], [0, np.nan, 0]], np.zeros((2, 3)), sh_degree=0)
+        from_points([[0, 0, 0], [0, np.nan, 0]], np.zeros((2, 3)))
     with pytest.raises(ValueError, match="expected"):
-        from_points(np.zeros((4, 3)), np.zeros((3, 3)), sh_degree=0)
+        from_points(np.zeros((4, 3)), np.zeros((3, 3)))
 
 
 def test_random_points_fill_the_box_and_repeat() -> None:

@@ -62,7 +62,6 @@ def test_colmap(tmp_path: Path) -> None:
     assert (image.shape, image.dtype) == ((HEIGHT, WIDTH, 3), np.float32)
     np.testing.assert_allclose(image, 0.3, atol=2e-3)
     assert view.load(24, 16).shape == (16, 24, 3)
-    assert view.load(width=24).shape == view.load(height=16).shape == (16, 24, 3)
 
 
 def test_split(tmp_path: Path) -> None:

@@ -11,8 +11,9 @@ import pytest
 
 from clsplat.camera import focal_length
 from clsplat.errors import InputError
+from clsplat.scenes.transforms import Keys, objects
 from clsplat.shots import read_shot
-from clsplat.shots.entries import Entry, objects, whole_frames
+from clsplat.shots.shot import whole_frames
 
 POSE = [float(row == column) for row in range(4) for column in range(4)]
 
@@ -56,7 +57,7 @@ def test_angles_that_cannot_be(write: Any, tmp_path: Path) -> None:
 
 
 def test_an_entry_begins_every_error_with_its_place() -> None:
-    entry = Entry(Path("a.json"), "key 3", {"p": [1, 2, "x"], "n": 10**5000}, {"q": [1, 2, 3]})
+    entry = Keys(Path("a.json"), "key 3", {"p": [1, 2, "x"], "n": 10**5000}, {"q": [1, 2, 3]})
     assert entry.vector("q", 3).tolist() == [1, 2, 3]
     with pytest.raises(InputError, match=r"^a\.json: key 3: 'p' is \[1, 2, 'x'\], expected a list of 3 numbers$"):
         entry.vector("p", 3)

@@ -33,7 +33,8 @@ def with_one_behind(scene: Scene) -> Gaussians:
     """Its last Gaussian lies far behind each camera."""
     points = np.concatenate([scene.points, [[0.0, 0.0, -500.0]]]).astype(np.float32)
     colors = np.concatenate([scene.point_colors, scene.point_colors[:1]])
-    model = from_points(points, colors, sh_degree=1)
+    model = from_points(points, colors)
+    model.sh = np.pad(model.sh, ((0, 0), (0, 3), (0, 0)))  # degree 1
     model.log_scales[-1] = model.log_scales[0]
     return model
 

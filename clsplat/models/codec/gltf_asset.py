@@ -190,8 +190,7 @@ class Asset:
             if "uri" not in said:
                 if self.binary is None or index != 0:
                     raise InputError(f"{self.path}: buffer {index} has no place, expected a uri or the .glb's own")
-                start, have = self.binary
-                data = _map(self.path, start, have)
+                data = _map(self.path, *self.binary)
             else:
                 data = self.outside(str(said["uri"]))
             if len(data) < length:

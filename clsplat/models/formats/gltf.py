@@ -23,9 +23,10 @@ from __future__ import annotations
 import io
 import json
 import struct
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -161,15 +162,15 @@ def write(
     if color_space not in COLOR_SPACES:
         raise ValueError(f"color_space {color_space!r}: expected {' or '.join(COLOR_SPACES)}")
     values.check_writable(path, gaussians, least=1)
-    document, buffer = _document(path, gaussians, spz_compression, color_space)
+    document, contents = _document(path, gaussians, spz_compression, color_space)
+    length = sum(view["byteLength"] for view in document["bufferViews"])
     if path.suffix.lower() == ".gltf":
         binary = path.with_suffix(".bin")
-        with atomic_writer(binary, buffer.length) as file:
-            length = buffer.write(file)
+        with atomic_writer(binary, length) as file:
+            file.writelines(contents)
         document["buffers"] = [{"byteLength": length, "uri": binary.name}]
         atomic_write(path, json.dumps(document, indent=1).encode())
         return
-    length = buffer.length
     document["buffers"] = [{"byteLength": length}]
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
@@ -180,34 +181,8 @@ def write(
     with atomic_writer(path, total) as file:
         file.write(struct.pack("<IIIII", GLB_MAGIC, 2, total, len(text), JSON_CHUNK) + text)
         file.write(struct.pack("<II", padded, BIN_CHUNK))
-        buffer.write(file)
+        file.writelines(contents)
         file.write(bytes(padded - length))
-
-
-@dataclass
-class _Buffer:
-    """Contents of the buffer to be written: arrays by the block of rows, or an SPZ file."""
-
-    gaussians: Gaussians
-    attributes: list[str]
-    color_space: str
-    blob: bytes | None = None
-
-    @property
-    def length(self) -> int:
-        if self.blob is not None:
-            return len(self.blob)
-        return sum(_layout(name)[2] for name in self.attributes) * len(self.gaussians)
-
-    def write(self, file: BinaryIO) -> int:
-        if self.blob is not None:
-            file.write(self.blob)
-            return self.length
-        for name in self.attributes:
-            for first in range(0, len(self.gaussians), BLOCK_ROWS):
-                block = _block(name, self.gaussians, slice(first, first + BLOCK_ROWS), self.color_space)
-                file.write(np.ascontiguousarray(block).data)
-        return self.length
 
 
 def _layout(name: str) -> tuple[str, int, int]:
@@ -244,9 +219,18 @@ def _block(name: str, gaussians: Gaussians, rows: slice, color_space: str) -> Ar
     return block
 
 
+def _blocks(names: list[str], gaussians: Gaussians, color_space: str) -> Iterator[memoryview]:
+    """The attributes one after another."""
+    for name in names:
+        for first in range(0, len(gaussians), BLOCK_ROWS):
+            block = _block(name, gaussians, slice(first, first + BLOCK_ROWS), color_space)
+            yield np.ascontiguousarray(block).data
+
+
 def _document(
     path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
-) -> tuple[dict[str, Any], _Buffer]:
+) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
+    """The JSON but for its buffers, and the contents of the one buffer."""
     count = len(gaussians)
     attributes = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))]
     attributes += [name for degree in range(gaussians.sh_degree + 1) for name in sh_attributes(degree)]
@@ -262,24 +246,29 @@ def _document(
         accessor |= {"normalized": True} if component == UINT16 else {}
         accessors.append(accessor)
     said: dict[str, Any] = {"kernel": "ellipse", "colorSpace": color_space}
+    places = {name: index for index, name in enumerate(attributes)}
+    node: dict[str, Any] = {"mesh": 0}
+    if gaussians.origin.any():
+        node["translation"] = (gaussians.origin * LEFT_UP).tolist()
     used = [EXTENSION]
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "clsplat"},
         "extensionsUsed": used,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [],
+        "nodes": [node],
+        "meshes": [{"primitives": [{"attributes": places, "mode": 0, "extensions": {EXTENSION: said}}]}],
         "accessors": accessors,
     }
-    buffer = _Buffer(gaussians, attributes, color_space)
+    contents: Iterable[bytes | memoryview]
     if spz_compression:
-        buffer.blob = _spz_blob(path, gaussians)
+        contents = [_spz_blob(path, gaussians)]
         used.append(SPZ_EXTENSION)
         document["extensionsRequired"] = used
         said["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
-        document["bufferViews"] = [{"buffer": 0, "byteLength": buffer.length}]
+        document["bufferViews"] = [{"buffer": 0, "byteLength": len(contents[0])}]
     else:
+        contents = _blocks(attributes, gaussians, color_space)
         sizes = [_layout(name)[2] * count for name in attributes]
         offsets = np.cumsum([0, *sizes]).tolist()
         views = zip(offsets, sizes, strict=False)
@@ -287,12 +276,7 @@ def _document(
         document["bufferViews"] = [
             {"buffer": 0, "byteOffset": offset, "byteLength": size, "target": target} for offset, size in views
         ]
-    places = {name: index for index, name in enumerate(attributes)}
-    primitive = {"attributes": places, "mode": 0, "extensions": {EXTENSION: said}}
-    document["meshes"] = [{"primitives": [primitive]}]
-    if gaussians.origin.any():
-        document["nodes"][0]["translation"] = [float(value) for value in gaussians.origin * LEFT_UP]
-    return document, buffer
+    return document, contents
 
 
 def _spz_blob(path: Path, gaussians: Gaussians) -> bytes:

@@ -17,6 +17,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, islice
+from math import isqrt
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -30,6 +31,7 @@ from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import values
 from clsplat.models.codec.values import BLOCK_ROWS
+from clsplat.models.edit import take
 
 MAX_HEADER_LINES = 10_000
 MAX_LINE_BYTES = 1 << 20
@@ -37,24 +39,10 @@ MAX_BLOCK_BYTES, MAX_BLOCK_WORDS = 1 << 26, 1 << 21
 MAX_NUMBER_BYTES = 128
 """The longest number in text, as a row of them is made an array whose elements have the width of the widest."""
 
-TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+          "double": "f8"}  # fmt: skip
+TYPES = _TYPES | {np.dtype(code).name: code for code in _TYPES.values()}
+"""NumPy's types by PLY's names, of which newer ones, such as float32, are NumPy's."""
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 POSITION = ("x", "y", "z")
@@ -157,25 +145,19 @@ def blocks(path: Path) -> tuple[Float64, Iterator[Gaussians]]:
     are passed on. Raises InputError as `read`."""
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
-    return np.zeros(3) if header.origin is None else header.origin, _read_blocks(path)
+    return np.zeros(3) if header.origin is None else header.origin, _read_blocks(header)
 
 
-def _read_blocks(path: Path) -> Iterator[Gaussians]:
-    with open_input(path, "a 3DGS PLY") as file:
-        header = read_header(file, path)
+def _read_blocks(header: Header) -> Iterator[Gaussians]:
+    with open_input(header.path, "a 3DGS PLY") as file:
+        file.seek(header.size)
         rest = _check_properties(header)
-        higher, kept = rest // 3, min(rest // 3, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
-        names = [*DC, *(f"f_rest_{c * higher + k}" for k in range(kept) for c in range(3))]
         if header.vertex.count == 0:
-            yield values.empty(0, round((1 + kept) ** 0.5) - 1)
+            yield values.empty(0, _degree(rest))
         for block in read_vertices(file, header, "Gaussian") if header.vertex.count else ():
-
-            def columns(*wanted: str, block: Block = block) -> Float32:
-                with np.errstate(over="ignore", invalid="ignore"):
-                    return np.stack([block[name].astype(np.float32) for name in wanted], axis=1)
-
-            sh = columns(*names).reshape(-1, 1 + kept, 3)
-            yield Gaussians(columns(*POSITION), columns(*ROTATION), columns(*SCALE), columns("opacity")[:, 0], sh)
+            gaussians = values.empty(len(block["x"]), _degree(rest))
+            _fill(gaussians, block, rest)
+            yield gaussians
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -273,8 +255,8 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             match words:
                 case ["format", name, _]:
                     form = name
-                case ["element", name, count]:
-                    elements.append(Element(name, _count(count)))
+                case ["element", name, count] if int(count) >= 0:
+                    elements.append(Element(name, int(count)))
                 case ["property", "list", _, _, name]:
                     elements[-1].properties.append((name, ""))
                 case ["property", kind, name]:
@@ -323,13 +305,6 @@ def _count_from(origin: Float64, gaussians: Gaussians, local: Float32 | None, pa
     if not np.isfinite(means).all():
         raise InputError(f"{path}: the origin in the comment, {origin}, leaves means that are not finite")
     gaussians.origin, gaussians.means = origin, np.ascontiguousarray(means)
-
-
-def _count(text: str) -> int:
-    count = int(text)
-    if count < 0:
-        raise ValueError
-    return count
 
 
 def _check_properties(header: Header) -> int:
@@ -435,43 +410,48 @@ def _ascii_blocks(file: BinaryIO, header: Header, what: str) -> Iterator[Block]:
         warn(f"{path}: text after the last {what} ignored")
 
 
-def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gaussians:
-    """Gather the columns into arrays and refuse values that are not finite."""
-    higher = rest // 3
-    kept = min(higher, MAX_SH_DEGREE * (MAX_SH_DEGREE + 2))
-    # The first block is read before anything is allocated: an ascii file's count is only a claim.
-    first_block = next(blocks)
-    result = values.empty(count, round((1 + kept) ** 0.5) - 1)
-    columns: dict[str, Float32] = {"opacity": result.opacity_logits}
-    arrays = (result.means, result.log_scales, result.quaternions, result.sh[:, 0])
+def _degree(rest: int) -> int:
+    """The degree of SH that is kept of a file with so many f_rest properties."""
+    return min(isqrt(1 + rest // 3) - 1, MAX_SH_DEGREE)
+
+
+def _columns(gaussians: Gaussians, rest: int) -> dict[str, NDArray[Any]]:
+    """The place in the arrays of each property that is kept."""
+    columns: dict[str, NDArray[Any]] = {"opacity": gaussians.opacity_logits}
+    arrays = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh[:, 0])
     for names, array in zip((POSITION, SCALE, ROTATION, DC), arrays, strict=True):
-        columns.update({name: array[:, index] for index, name in enumerate(names)})
-    for index in range(rest):
-        if index % higher < kept:
-            columns[f"f_rest_{index}"] = result.sh[:, 1 + index % higher, index // higher]
+        columns |= {name: array[:, index] for index, name in enumerate(names)}
+    for channel in range(3):
+        for index in range(1, gaussians.sh.shape[1]):
+            columns[f"f_rest_{channel * (rest // 3) + index - 1}"] = gaussians.sh[:, index, channel]
+    return columns
 
-    start, bad_positions, first_bad = 0, 0, -1
-    other: tuple[int, str] | None = None
-    for block in chain([first_block], blocks):
+
+def _fill(gaussians: Gaussians, block: Block, rest: int) -> None:
+    """Write a block into as many Gaussians. A double beyond float32 becomes infinite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        for name, column in _columns(gaussians, rest).items():
+            column[:] = block[name]
+
+
+def _assemble(blocks: Iterator[Block], count: int, rest: int, path: Path) -> Gaussians:
+    """Gather the blocks and refuse values that are not finite."""
+    first = next(blocks)  # before anything is allocated: an ascii file's count is only a claim
+    result = values.empty(count, _degree(rest))
+    start = 0
+    for block in chain([first], blocks):
         stop = start + len(block["x"])
-        bad = np.zeros(stop - start, bool)
-        for name, column in columns.items():
-            with np.errstate(over="ignore", invalid="ignore"):  # a double beyond float32 becomes inf, refused below
-                column[start:stop] = block[name]
-            not_finite = ~np.isfinite(column[start:stop])
-            if name in POSITION:
-                bad |= not_finite
-            elif other is None and not_finite.any():
-                other = (start + int(not_finite.argmax()), name)
-        if bad.any():
-            first_bad = first_bad if bad_positions else start + int(bad.argmax())
-            bad_positions += int(bad.sum())
+        _fill(take(result, slice(start, stop)), block, rest)
         start = stop
-
-    if bad_positions:
+    if all(np.isfinite(array).all() for array in result.arrays().values()):
+        return result
+    bad = ~np.isfinite(result.means).all(axis=1)
+    if bad.any():
         raise InputError(
-            f"{path}: {bad_positions} of {count} Gaussians have a position that is not finite, the first is {first_bad}"
+            f"{path}: {bad.sum()} of {count} Gaussians have a position that is not finite, the first is {bad.argmax()}"
         )
-    if other is not None:
-        raise InputError(f"{path}: {other[1]} of Gaussian {other[0]} is not finite")
-    return result
+    columns = _columns(result, rest).items()
+    name, row = next(
+        (name, (~np.isfinite(column)).argmax()) for name, column in columns if not np.isfinite(column).all()
+    )
+    raise InputError(f"{path}: {name} of Gaussian {row} is not finite")

@@ -23,7 +23,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -58,7 +58,6 @@ SH_PICTURES = ("shN_centroids.webp", "shN_labels.webp")
 MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
 LARGEST_TAG = 252
-COEFFICIENTS = {degree: (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
 FREE_BYTES = 16 << 20
 """Bytes that a picture in an archive may have; beyond that 8 for each Gaussian, twice what its pixels have."""
 
@@ -84,8 +83,7 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read a .sog, or a meta.json with its pictures, or the folder that has them. Raises InputError."""
     with _opened(path) as files:
-        meta = _Meta(files, files.meta())
-        model = meta.gaussians()
+        model = _Meta(files).gaussians()
     packing.require_finite(path, model)
     return model
 
@@ -140,20 +138,16 @@ class _Archive(_Files):
                     left -= len(block)
                     if left < 0:
                         raise InputError(f"{self.path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
-                    _write(file, block, target)
+                    try:
+                        file.write(block)
+                        file.flush()  # here and not at the end, where it would seem that reading failed
+                    except OSError as error:
+                        raise write_error(target, error) from None
         except KeyError:
             raise InputError(f"{self.path}: has no {name[:80]} in it") from None
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
             raise InputError(f"{self.path}: {name[:80]} does not unpack ({error}); is it damaged?") from None
         return target
-
-
-def _write(file: BinaryIO, block: bytes, path: Path) -> None:
-    try:
-        file.write(block)
-        file.flush()  # here and not at the end, where it would seem that reading failed
-    except OSError as error:
-        raise write_error(path, error) from None
 
 
 @contextmanager
@@ -173,8 +167,9 @@ def _opened(path: Path) -> Iterator[_Files]:
 class _Meta:
     """meta.json, and what it leads to."""
 
-    def __init__(self, files: _Files, meta: dict[str, Any]) -> None:
-        self.files, self.meta, self.path = files, meta, files.path
+    def __init__(self, files: _Files) -> None:
+        self.files, self.path, meta = files, files.path, files.meta()
+        self.meta = meta
         self.version = meta.get("version", 1)
         if self.version not in (1, 2):
             raise InputError(f"{self.path}: SOG version {str(self.version)[:20]}, expected 1 or 2")
@@ -207,7 +202,7 @@ class _Meta:
         least = self.count if least is None else least
         file = self.files.file(names[index], FREE_BYTES + 8 * least)
         try:
-            source = open_image(file, straight=True)
+            source = open_image(file)
             spec = source.spec()
             pixels = spec.width * spec.height
             if pixels < least or spec.nchannels < channels:
@@ -267,7 +262,7 @@ class _Meta:
         table = self.picture("shN", 0, 3, least=needed)
         width = table.shape[1] // PALETTE_COLUMNS
         said = self.section("shN").get("bands") if self.version == 2 else None
-        bands = next((degree for degree, coefficients in COEFFICIENTS.items() if coefficients == width and degree), 0)
+        bands = next((degree for degree in range(1, MAX_SH_DEGREE + 1) if degree * (degree + 2) == width), 0)
         if table.shape[1] % PALETTE_COLUMNS or not bands or said not in (None, bands):
             raise InputError(f"{self.path}: shN's palette is {table.shape[1]} pixels wide for {str(said)[:20]} bands")
         colours = table.reshape(-1, width, 3)
@@ -295,7 +290,9 @@ def write(
     that are not finite.
     """
     packing.check_writable(path, gaussians, least=1)
-    with scratch_folder(_room(len(gaussians))) as folder:
+    # more bytes than the pictures have: the encoder of WebP crashes where there is no room
+    room = 24 * len(gaussians) + 64 * min(len(gaussians), MAX_PALETTE) + (1 << 16)
+    with scratch_folder(room) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)
         meta = _pictures(folder, gaussians, order, iterations, progress)
         text = json.dumps(meta, separators=(",", ":")).encode()
@@ -312,11 +309,6 @@ def write(
             archive.writestr(zipfile.ZipInfo(META), text)
             for picture in files:
                 archive.writestr(zipfile.ZipInfo(picture.name), picture.read_bytes())
-
-
-def _room(count: int) -> int:
-    """More bytes than the pictures have: the encoder of WebP crashes where there is no room."""
-    return 24 * count + 64 * min(count, MAX_PALETTE) + (1 << 16)
 
 
 def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, progress: Progress) -> dict[str, Any]:

@@ -310,8 +310,28 @@ def write(
 def header_for(
     path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None, flags: int = 0
 ) -> Header:
-    """The header for `write_to`, of at least one Gaussian. Raises InputError for positions that do not fit."""
-    bits = _fractional_bits(path, gaussians, fractional_bits)
+    """The header for `write_to`, of at least one Gaussian. The bits after the point are as many as asked for, if the
+    positions fit; or by the model's size, without its farthest hundredth. Raises InputError for positions that do not
+    fit."""
+    low, high = (
+        values.world_means(gaussians, rows) for rows in (gaussians.means.argmin(axis=0), gaussians.means.argmax(axis=0))
+    )
+    largest = max(float(np.abs(low).max()), float(np.abs(high).max()))
+    fits = 23 - max(0, int(np.ceil(np.log2(largest + 1e-30)))) if largest > 1 else 23
+    while fits >= 0 and round(largest * 2**fits) >= 1 << 23:
+        fits -= 1
+    bits = fractional_bits
+    if fits < 0 or (bits is not None and bits > fits):
+        raise InputError(
+            f"{path}: cannot be written: positions of up to {largest:g} do not fit into 24 bits"
+            + (f" with {bits} after the point" if bits is not None else "")
+        )
+    if bits is None:
+        spread = np.quantile(np.abs(gaussians.means - np.median(gaussians.means, axis=0)).max(axis=1), 0.99)
+        # 2^-12 for a model of 16 units; the same share of a smaller one
+        bits = min(fits, max(12, 16 - int(np.ceil(np.log2(max(float(spread), 1e-6))))))
+    elif bits < 0:
+        raise ValueError(f"fractional_bits {bits}: expected 0 to 23")
     return Header(version, len(gaussians), gaussians.sh_degree, bits, flags)
 
 
@@ -342,30 +362,6 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
     file.seek(table)
     file.write(sizes)
     file.seek(end)
-
-
-def _fractional_bits(path: Path, gaussians: Gaussians, wanted: int | None) -> int:
-    """Bits after the point: as many as asked for, if the positions fit; or by the model's size, without its farthest
-    hundredth."""
-    low, high = (
-        values.world_means(gaussians, rows) for rows in (gaussians.means.argmin(axis=0), gaussians.means.argmax(axis=0))
-    )
-    largest = max(float(np.abs(low).max()), float(np.abs(high).max()))
-    fits = 23 - max(0, int(np.ceil(np.log2(largest + 1e-30)))) if largest > 1 else 23
-    while fits >= 0 and round(largest * 2**fits) >= 1 << 23:
-        fits -= 1
-    if fits < 0 or (wanted is not None and wanted > fits):
-        raise InputError(
-            f"{path}: cannot be written: positions of up to {largest:g} do not fit into 24 bits"
-            + (f" with {wanted} after the point" if wanted is not None else "")
-        )
-    if wanted is not None:
-        if wanted < 0:
-            raise ValueError(f"fractional_bits {wanted}: expected 0 to 23")
-        return wanted
-    spread = np.quantile(np.abs(gaussians.means - np.median(gaussians.means, axis=0)).max(axis=1), 0.99)
-    # 2^-12 for a model of 16 units; the same share of a smaller one
-    return min(fits, max(12, 16 - int(np.ceil(np.log2(max(float(spread), 1e-6))))))
 
 
 def _pack(

@@ -20,7 +20,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -44,12 +44,11 @@ MOST_LEVELS = 5000
 WORLD, PRIM = "/World", "/World/Gaussians"
 
 
-def _pxr(path: Path) -> Any:
+def _require_pxr(path: Path) -> None:
     try:
-        import pxr.Usd
+        import pxr.Usd  # noqa: F401
     except ImportError:
         raise InputError(f"{path}: USD needs usd-core, expected it installed: pip install 'clsplat[usd]'") from None
-    return pxr
 
 
 def recognises(head: bytes) -> bool:
@@ -61,7 +60,7 @@ def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **ar
     """Raise InputError where there is no usd-core or no such file, and where a process that makes the `call`
     (MODULE:FUNCTION, with the path and these arguments) does not live to its end: USD's library follows what a damaged
     binary file says to anywhere, and so deep into a file that its stack ends."""
-    _pxr(path)
+    _require_pxr(path)
     with open_input(path, "a USD stage") as file:
         alone, status = _stands_alone(file), os.fstat(file.fileno())
     words = json.dumps(arguments)
@@ -114,17 +113,22 @@ def readable(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: has values that USD cannot read; is it damaged?") from None
 
 
+def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
+    """The stage of this name. Raises InputError about the path."""
+    from pxr import Tf, Usd
+
+    with suppress(Tf.ErrorException):
+        if stage := Usd.Stage.Open(native_name(name), *load):
+            return stage
+    raise InputError(f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more")
+
+
 def _open(path: Path) -> Any:
     """The stage, without payloads, all of whose layers are in the file's folder or below it."""
-    from pxr import Ar, Tf, Usd, UsdUtils
+    from pxr import Ar, Usd, UsdUtils
 
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
-    try:
-        stage = Usd.Stage.Open(native_name(os.path.realpath(path)), Usd.Stage.LoadNone)
-    except Tf.ErrorException:
-        stage = None
-    if stage is None:
-        raise InputError(f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more")
+    stage = open_stage(path, os.path.realpath(path), Usd.Stage.LoadNone)
     folder = Path(os.path.realpath(path)).parent
     for layer in stage.GetUsedLayers():
         file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # of a layer in a .usdz, the .usdz
@@ -222,7 +226,7 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     if up_axis not in ("Y", "Z") or not meters_per_unit > 0:
         raise ValueError(f"up_axis {up_axis!r}, meters_per_unit {meters_per_unit}: expected Y or Z, and more than 0")
     packing.check_writable(path, gaussians, least=1)
-    _pxr(path)
+    _require_pxr(path)
     from pxr import Usd, UsdUtils
 
     suffix = path.suffix.lower()
