@@ -45,22 +45,28 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
         start = time.monotonic()
         # before minutes of work: is there a device of that name?
         opened = open_device(device)
-        scene_folder = make_scene(output, StageProgress())
-        run_folder, turntable_folder = output / "run", output / "turntable"
-        config = TrainConfig(iterations=iterations)
-        run = Run.create(run_folder, config, scene=scene_folder, resume=False, overwrite=True)
+        report = StageProgress()
+        scene_folder = make_scene(output, report)
+        scene, config = load_scene(scene_folder), TrainConfig(iterations=iterations)
+        run = Run.create(output / "run", config, scene=scene_folder, resume=False, overwrite=True)
         with TrainProgress(iterations) as progress:
-            train(load_scene(scene_folder), config, device=opened, run=run, on_step=progress)
+            train(scene, config, device=opened, run=run, on_step=progress)
         result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
-        _render_turntable(scene_folder, run_folder, turntable_folder, opened)
+        gaussians, renderer = Gaussians.load(run.model_path), Renderer(opened)
+        turntable_folder = output / "turntable"
+        turntable_folder.mkdir(exist_ok=True)
+        for index, camera in enumerate(turntable([view.camera for view in scene.views], TURNTABLE_FRAMES)):
+            picture = renderer.render(gaussians, camera, (0.0, 0.0, 0.0)).image
+            write_image(turntable_folder / f"frame_{index:03d}.png", picture)
+            report("rendering the turntable", (index + 1) / TURNTABLE_FRAMES)
     minutes, seconds = divmod(round(time.monotonic() - start), 60)
     print(
         f"done in {minutes} min {seconds} s: PSNR {result['mean']['psnr']:.2f} dB, SSIM {result['mean']['ssim']:.3f} "
         f"on {len(result['views'])} held-out photos\n"
         f"  the photos:           {output / 'photos'}\n"
-        f"  held-out renders:     {run_folder / 'test'}\n"
+        f"  held-out renders:     {run.test_path}\n"
         f"  the turntable:        {turntable_folder}\n"
-        f"  the model (any viewer of splats opens it): {run_folder / 'model.ply'}",
+        f"  the model (any viewer of splats opens it): {run.model_path}",
         file=sys.stderr,
     )
     return result
@@ -93,15 +99,3 @@ def make_scene(output: Path, progress: Progress | None = None) -> Path:
         write_photos(photos, count=PHOTOS, progress=progress)
     # the ray caster's lens has no distortion, as ours is known to have none: photos need no resampling
     return sfm.reconstruct(photos, scene, camera_model="SIMPLE_PINHOLE", overwrite=True, progress=progress)
-
-
-def _render_turntable(scene_folder: Path, run_folder: Path, target: Path, device: Any) -> None:
-    """A closed camera path around the scene as PNG files."""
-    progress = StageProgress()
-    cameras = [view.camera for view in load_scene(scene_folder).views]
-    gaussians = Gaussians.load(run_folder / "model.ply")
-    renderer = Renderer(device)
-    target.mkdir(parents=True, exist_ok=True)
-    for index, camera in enumerate(turntable(cameras, TURNTABLE_FRAMES)):
-        write_image(target / f"frame_{index:03d}.png", renderer.render(gaussians, camera, (0.0, 0.0, 0.0)).image)
-        progress("rendering the turntable", (index + 1) / TURNTABLE_FRAMES)
