@@ -14,8 +14,6 @@ from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Any
 
-Handler = Callable[[int, FrameType | None], object]
-
 
 def apart() -> dict[str, Any]:
     """Arguments of `subprocess.Popen` for a process that a Ctrl-C on this terminal does not reach."""
@@ -53,7 +51,7 @@ def interrupt(number: int, _frame: FrameType | None) -> None:
 
 
 @contextmanager
-def handled(numbers: Iterable[int], handler: Handler) -> Iterator[None]:
+def handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
     """Inside, these signals call the handler. In the main thread alone: Python handles signals there."""
     if threading.current_thread() is not threading.main_thread():
         yield

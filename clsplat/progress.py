@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Literal, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from typing_extensions import Self
 
@@ -21,9 +21,6 @@ PLAIN_INTERVAL = 10.0
 """Seconds between plain lines."""
 SMOOTHING = 0.1
 """Weight of the newest report in the shown PSNR and loss, which jump from view to view."""
-
-
-BarT = TypeVar("BarT", bound="_Bar")
 
 
 def no_progress(text: str, fraction: float | None = None) -> None:
@@ -187,7 +184,5 @@ def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list
     """A line for each row. The columns `left` are aligned to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     sides = ["<" if index in left else ">" for index in range(len(widths))]
-    return [
-        "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    line = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))
+    return [line.format(*row).rstrip() for row in rows]

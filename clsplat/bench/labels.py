@@ -26,7 +26,6 @@ CROSSING = 60.0
 """A crossed line costs as much as a label so many pixels farther away."""
 MISTAKEN = 40.0
 """So does a point that is not its own, as near to the label or nearly."""
-NO_LINES: Float64 = np.zeros((0, 2, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +36,7 @@ class Place:
     leader: Float64 | None
 
 
-def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64 = NO_LINES) -> list[Place]:
+def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64) -> list[Place]:
     """A place for each label beside its point and inside the box `frame`. points (n, 2), sizes (n, 2): of the labels.
 
     Greedy: the points with the most neighbours first, each at the cheapest of the candidates around it that covers

@@ -26,16 +26,8 @@ WIDTH, DPI = 8.0, 100
 """Inches, and pixels an inch of the layout."""
 SIZE = 10
 """Of text, in points."""
-BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK, GREY = COLOURS = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#CC79A7",
-    "#56B4E9",
-    "#000000",
-    "#666666",
-)
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#666666")
+BLUE, ORANGE, _, VERMILION, _, _, BLACK, GREY = COLOURS
 LETTERS = 92
 """Of a line over the whole width."""
 ABOVE = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": 3, "frameon": False, "fontsize": SIZE}
@@ -43,7 +35,6 @@ ABOVE = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": 3, "frameon": 
 PAD = 2.0
 """Pixels around a label."""
 
-Points = Sequence[Mapping[str, Any]]
 Point = tuple[float, float]
 
 
@@ -160,8 +151,7 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
 
 
 def _exact_point(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    points: Points = result["points"]
-    return next((point for point in points if point["name"] == result["exact"]), None)
+    return next((point for point in result["points"] if point["name"] == result["exact"]), None)
 
 
 def _around(values: Sequence[float], below: float) -> tuple[float, float]:
@@ -179,18 +169,19 @@ def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def _label_points(
-    figure: Any, axes: Any, points: Sequence[Point], texts: Sequence[str], lines: Sequence[tuple[Point, Point]] = ()
+    figure: Any, axes: Any, points: Sequence[Point], texts: Sequence[str], lines: Sequence[tuple[Point, Point]]
 ) -> None:
     """Write a text beside each point, with a leader line where it lies apart; `lines` are better not crossed. The axes
     must have their place and limits."""
     to_pixels, to_figure = axes.transData.transform, figure.transFigure.inverted().transform
     bounds = axes.get_window_extent()
     frame = np.array([bounds.x0 + PAD, bounds.y0 + PAD, bounds.x1 - PAD, bounds.y1 - PAD])
-    sizes = np.array([_extent(figure, text) for text in texts]) + 2 * PAD
+    artists = [figure.text(0, 0, text, fontsize=SIZE) for text in texts]
+    sizes = np.array([artist.get_window_extent().size for artist in artists]) + 2 * PAD
     segments = to_pixels(np.reshape(lines, (-1, 2))).reshape(-1, 2, 2)
     line = import_module("matplotlib.lines").Line2D
-    for text, place in zip(texts, place_labels(to_pixels(points), sizes, frame, segments), strict=True):
-        figure.text(*to_figure(place.box[:2] + PAD), text, ha="left", va="bottom", fontsize=SIZE)
+    for artist, place in zip(artists, place_labels(to_pixels(points), sizes, frame, segments), strict=True):
+        artist.set(position=to_figure(place.box[:2] + PAD), ha="left", va="bottom")
         if place.leader is not None:
             figure.add_artist(line(*to_figure(place.leader).T, color=GREY, linewidth=0.8, zorder=1))
 
@@ -205,15 +196,6 @@ def _sheet(titles: Sequence[str], notes: Sequence[str], inches: float) -> tuple[
     axes = figure.subplots()
     axes.set_title("\n".join(head) + "\n\n", loc="left", fontsize=SIZE)
     return figure, axes
-
-
-def _extent(figure: Any, text: str) -> tuple[float, float]:
-    """Width and height of a text in pixels."""
-    canvas = import_module("matplotlib.backends.backend_agg").FigureCanvasAgg(figure)
-    artist = figure.text(0, 0, text, fontsize=SIZE)
-    box = artist.get_window_extent(canvas.get_renderer())
-    artist.remove()
-    return float(box.width), float(box.height)
 
 
 def save_figure(figure: Any, path: Path) -> None:

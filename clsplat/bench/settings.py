@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.bench.stages import held_kind, picture_of, trainer_of, wall_ms
-from clsplat.bench.subject import Progress, Subject
+from clsplat.bench.subject import Subject
 from clsplat.camera import Camera
 from clsplat.config.presets import PRESETS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
@@ -22,7 +22,7 @@ from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.gaussians import Gaussians
-from clsplat.progress import aligned
+from clsplat.progress import Progress, aligned, no_progress
 from clsplat.reference.blend import blend
 from clsplat.reference.project import project
 from clsplat.reference.render import parameters
@@ -31,9 +31,6 @@ from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.rendering.renderer import held_sh
 from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
-
-if TYPE_CHECKING:
-    from clsplat.reference.project import Projected
 
 CROP = 192
 """Side in pixels of what is compared with the float64 reference, in the middle of the image; smaller ones are whole."""
@@ -45,20 +42,13 @@ MAY_CHANGE_BITS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min",
 """Settings whose values approximate, all but that of `exact`. Of `extent` one value does: 3sigma."""
 
 
-@dataclass(frozen=True)
-class Error:
-    """Of a picture: PSNR over all pixels and channels in dB, at most PSNR_MAX, and the largest absolute difference."""
-
-    psnr: float
-    max_abs: float
-
-    @classmethod
-    def of(cls, picture: NDArray[Any], wanted: NDArray[Any]) -> Error:
-        """Compared in float64, not clamped."""
-        difference = np.asarray(picture, np.float64) - np.asarray(wanted, np.float64)
-        mse = float(np.mean(np.square(difference)))
-        psnr = min(-10 * float(np.log10(mse)), PSNR_MAX) if mse > 0 else PSNR_MAX
-        return cls(psnr, float(np.abs(difference).max()))
+def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
+    """PSNR over all pixels and channels in dB, at most PSNR_MAX, and the largest absolute difference. Compared in
+    float64, not clamped."""
+    difference = np.asarray(picture, np.float64) - np.asarray(wanted, np.float64)
+    mse = float(np.mean(np.square(difference)))
+    psnr = min(-10 * float(np.log10(mse)), PSNR_MAX) if mse > 0 else PSNR_MAX
+    return {"psnr": psnr, "max_abs": float(np.abs(difference).max())}
 
 
 def settings() -> dict[str, BenchSwitches]:
@@ -105,18 +95,20 @@ def compare(
     turn; the frame's difference from the float64 reference on a crop, and from the exact preset's frame on the whole
     image. Where both are among the settings, also how many times faster all exact switches together make them.
     """
-    say = progress or (lambda *_: None)
+    say = progress or no_progress
     tried = {name: config.switches() for name, config in (candidates or settings()).items()}
     trainer, camera = trainer_of(subject, device, PRESETS["exact"]), subject.camera
     model, work = trainer.parameters, trainer.rasterizer.work
     background = upload(device, np.zeros(3, np.float32))
-    x0, y0, width, height = crop = _crop(camera)
+    width, height = min(CROP, camera.width), min(CROP, camera.height)
+    x0, y0 = (camera.width - width) // 2, (camera.height - height) // 2
+    crop = (x0, y0, width, height)
     say("float64 reference", None)
     reference = reference_crop(subject.gaussians, camera, crop)
 
-    def errors(picture: Float32) -> tuple[Error, Error]:
+    def errors(picture: Float32) -> dict[str, dict[str, float]]:
         part = picture[y0 : y0 + height, x0 : x0 + width]
-        return Error.of(part, reference), Error.of(picture, exact)
+        return {"against_float64": error_of(part, reference), "against_exact": error_of(picture, exact)}
 
     def draw(rasterizer: Rasterizer) -> Frame:
         held = models[held_kind(rasterizer.config)]
@@ -146,56 +138,34 @@ def compare(
         for name, rasterizer in rasterizers.items():
             both = wall_ms(device, partial(draw, rasterizer)), wall_ms(device, partial(step, rasterizer))
             times[name].append(both)
-    medians = {name: tuple(map(statistics.median, zip(*pairs, strict=True))) for name, pairs in times.items()}
     whole = (width, height) == (camera.width, camera.height)
+    points: dict[str, dict[str, Any]] = {}
+    for name, config in tried.items():
+        frame_ms, iteration_ms = map(statistics.median, zip(*times[name], strict=True))
+        points[name] = {
+            "name": name,
+            "approximate": approximate(config),
+            "frame_ms": frame_ms,
+            "iteration_ms": iteration_ms,
+            **differences[name],
+            **differences[name]["against_float64" if whole else "against_exact"],
+        }
+    on_front = front([(point["frame_ms"], point["psnr"]) for point in points.values()])
+    for point, best in zip(points.values(), on_front, strict=True):
+        point["on_front"] = best
+    exact_name = next((name for name, config in tried.items() if config == PRESETS["exact"].switches()), None)
+    faster = None
+    if exact_name is not None and ALL_OFF in points:
+        on, off = points[exact_name], points[ALL_OFF]
+        faster = {key: off[f"{key}_ms"] / on[f"{key}_ms"] for key in ("frame", "iteration")}
     return {
-        "exact": _exact_of(tried),
-        "exact_switches_faster": _faster(tried, medians),
+        "exact": exact_name,
+        "exact_switches_faster": faster,
         "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
         "crop": list(crop),
-        "exact_against_float64": asdict(errors(exact)[0]),
-        "points": _points(tried, differences, medians, whole=whole),
+        "exact_against_float64": errors(exact)["against_float64"],
+        "points": list(points.values()),
     }
-
-
-def _points(
-    candidates: Mapping[str, BenchSwitches],
-    differences: Mapping[str, tuple[Error, Error]],
-    medians: Mapping[str, tuple[float, ...]],
-    *,
-    whole: bool,
-) -> list[dict[str, Any]]:
-    points = []
-    for name, (from_reference, from_exact) in differences.items():
-        points.append(
-            {
-                "name": name,
-                "approximate": approximate(candidates[name]),
-                "frame_ms": medians[name][0],
-                "iteration_ms": medians[name][1],
-                "against_float64": asdict(from_reference),
-                "against_exact": asdict(from_exact),
-                **asdict(from_reference if whole else from_exact),
-            }
-        )
-    on_front = front([(point["frame_ms"], point["psnr"]) for point in points])
-    for point, best in zip(points, on_front, strict=True):
-        point["on_front"] = best
-    return points
-
-
-def _exact_of(candidates: Mapping[str, BenchSwitches]) -> str | None:
-    """The name of the setting that is the `exact` preset."""
-    return next((name for name, config in candidates.items() if config == PRESETS["exact"].switches()), None)
-
-
-def _faster(
-    candidates: Mapping[str, BenchSwitches], medians: Mapping[str, tuple[float, ...]]
-) -> dict[str, float] | None:
-    on = _exact_of(candidates)
-    if on is None or ALL_OFF not in medians:
-        return None
-    return {key: medians[ALL_OFF][k] / medians[on][k] for k, key in enumerate(("frame", "iteration"))}
 
 
 def front(points: list[tuple[float, float]]) -> list[bool]:
@@ -205,16 +175,10 @@ def front(points: list[tuple[float, float]]) -> list[bool]:
     ]
 
 
-def _crop(camera: Camera) -> tuple[int, int, int, int]:
-    """x, y, width, height."""
-    width, height = min(CROP, camera.width), min(CROP, camera.height)
-    return (camera.width - width) // 2, (camera.height - height) // 2, width, height
-
-
 def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, int, int]) -> Float64:
     """A part of the frame in float64, over black, (height, width, 3): the twin, but for Gaussians that cannot reach."""
     x, y, width, height = crop
-    projected: Projected = project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
+    projected = project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
     means = projected.means2d - (x, y)
     reach = 1.1 * projected.half_extents + 1.0
     near = (means > -reach).all(axis=1) & (means < np.array([width, height]) + reach).all(axis=1)

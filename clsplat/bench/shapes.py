@@ -12,7 +12,6 @@ import statistics
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -41,13 +40,12 @@ class Trial:
     ms: float | None
 
 
-def tune(device: cl.Device, index: int, progress: Callable[[Shape], Any] | None = None) -> tuple[list[Trial], Shape]:
+def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tuple[list[Trial], Shape]:
     """Try the candidates on the device, the `index`-th of all, and keep the quickest. Raises DriverError where none
     works, and OSError."""
     trials = []
     for shape in candidates(device):
-        if progress is not None:
-            progress(shape)
+        progress(shape)
         trials.append(Trial(shape, _in_a_process(index, shape)))
     if all(trial.ms is None for trial in trials):
         shapes = ", ".join(trial.shape.label for trial in trials)

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float32
-from clsplat.bench.subject import Progress, Subject
+from clsplat.bench.subject import Subject
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.profile import StageRecord
 from clsplat.gaussians import GROUPS, floats_of
-from clsplat.progress import aligned
+from clsplat.progress import Progress, aligned, no_progress
 from clsplat.rendering.rasterizer import Frame
 from clsplat.rendering.renderer import Renderer, held_sh
 from clsplat.scenes.lens import Lens
@@ -51,7 +51,7 @@ def bench(
 ) -> dict[str, Any]:
     """Measure every stage; returns what `clsplat bench --json` prints. The device's queue should have been made with
     profiling."""
-    say = progress or (lambda *_: None)
+    say = progress or no_progress
     config = (config or RasterizerConfig()).switches()
     say("limits", None)
     limits = limits or measure_limits(device)
@@ -73,13 +73,17 @@ def bench(
         drawn = (part.lists, frame.projected.splats, frame.background, subject.camera)
         added, looked_at = count_pairs(rasterizer.device, rasterizer.work, *drawn)
         contributing, evaluated = contributing + added, evaluated + looked_at
-    in_frame = _measure(device, draw, repeat)
+    frame_ms, in_frame, by_wall = _measure(device, draw, repeat)
     say("training step", None)
-    in_step = _measure(device, trainer.train_step, repeat)
+    iteration_ms, in_step, _ = _measure(device, trainer.train_step, repeat)
 
-    stages = {name: record for name, record in in_frame.stages.items() if name in FORWARD}
-    stages.update({name: record for name, record in in_step.stages.items() if name not in stages})
-    table = {name: _row(record, limits) for name, record in stages.items()}
+    stages = {name: record for name, record in in_frame.items() if name in FORWARD}
+    stages.update({name: record for name, record in in_step.items() if name not in stages})
+    table: dict[str, dict[str, Any]] = {}
+    for name, record in stages.items():
+        rate = 1e3 * record.bytes / record.ms if record.ms > 0 else 0.0
+        shares = {"bytes_per_second": rate, "share_of_copy": rate / limits.copy_bytes_per_second}
+        table[name] = asdict(record) | shares
     for name, limit in (("blend", limits.pairs_per_second), ("blend_grad", limits.gradient_pairs_per_second)):
         if name in table and table[name]["ms"] > 0:
             rate = 1e3 * contributing / table[name]["ms"]
@@ -97,26 +101,18 @@ def bench(
         "height": subject.camera.height,
         "repeat": repeat,
         "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "timer": "wall" if in_frame.by_wall else "events",
-        "frame_ms": in_frame.ms,
-        "iteration_ms": in_step.ms,
+        "timer": "wall" if by_wall else "events",
+        "frame_ms": frame_ms,
+        "iteration_ms": iteration_ms,
         "stages": table,
         "pairs": {"listed": listed, "contributing": contributing, "evaluated": evaluated},
         "limit": asdict(limits),
     }
 
 
-@dataclass(frozen=True)
-class _Measured:
-    """ms: wall time, nothing recorded; stages: medians; by_wall: the driver's events give no times."""
-
-    ms: float
-    stages: dict[str, StageRecord]
-    by_wall: bool
-
-
-def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Measured:
-    """Medians over `repeat` rounds: plain, with events, and waiting at the seams of the stages."""
+def _measure(device: Device, work: Callable[[], object], repeat: int) -> tuple[float, dict[str, StageRecord], bool]:
+    """Wall time in ms with nothing recorded; the stages; True if their times are of the wall, as the driver's events
+    give none. Medians over `repeat` rounds: plain, with events, and waiting at the seams of the stages."""
     for _ in range(2):
         work()
     walls: list[float] = []
@@ -136,7 +132,7 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Measur
         kernels = {kernel: statistics.median(run.get(kernel, 0.0) for run in times) for kernel in record.kernels}
         total = statistics.median(waits if by_wall else [sum(run.values()) for run in times])
         medians[name] = replace(record, kernels=kernels, ms=total, wall_ms=statistics.median(waits))
-    return _Measured(statistics.median(walls), medians, by_wall)
+    return statistics.median(walls), medians, by_wall
 
 
 def wall_ms(device: Device, work: Callable[[], object]) -> float:
@@ -146,11 +142,6 @@ def wall_ms(device: Device, work: Callable[[], object]) -> float:
     work()
     device.finish()
     return 1e3 * (time.perf_counter() - start)
-
-
-def _row(record: StageRecord, limits: Limits) -> dict[str, Any]:
-    rate = 1e3 * record.bytes / record.ms if record.ms > 0 else 0.0
-    return {**asdict(record), "bytes_per_second": rate, "share_of_copy": rate / limits.copy_bytes_per_second}
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +14,10 @@ from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.models.formats import is_model_name
-from clsplat.runs.run import Run, is_run
+from clsplat.progress import Progress
+from clsplat.runs.run import run_of
 from clsplat.scenes.initialise import from_scene
 from clsplat.scenes.scene import load_scene
-
-Progress = Callable[[str, float | None], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,33 +44,24 @@ def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Sub
     opacities = 0.005 + 0.99 * rng.beta(0.6, 0.8, count)
     sh = rng.normal(0.0, 0.1, (count, 16, 3))
     sh[:, 0] = rng.uniform(-1.5, 1.5, (count, 3))
-    arrays = (
-        means,
-        rng.normal(size=(count, 4)),
-        np.log(sizes * depths / focal),
-        np.log(opacities) - np.log1p(-opacities),
-        sh,
-    )
-    means32, quaternions, log_scales, logits, coefficients = (
-        np.ascontiguousarray(array, np.float32) for array in arrays
-    )
-    gaussians = Gaussians(means32, quaternions, log_scales, logits, coefficients)
-    return Subject("synthetic", gaussians, camera)
+    scales, logits = np.log(sizes * depths / focal), np.log(opacities) - np.log1p(-opacities)
+    single = partial(np.ascontiguousarray, dtype=np.float32)
+    arrays = (single(means), single(rng.normal(size=(count, 4))), single(scales), single(logits), single(sh))
+    return Subject("synthetic", Gaussians(*arrays), camera)
 
 
 def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Progress | None = None) -> Subject:
     """A run: its model from the first view of its scene. A model file: as a run's, if it lies in one, else from a
     camera in front of it. A scene: the Gaussians that training starts from. Raises InputError."""
-    run = next((Run.open(folder) for folder in (path, path.parent) if is_run(folder)), None)
-    if run is not None and (path.is_dir() or path == run.model_path):
-        gaussians = Gaussians.load(run.model_path)
-        if run.scene is None or not run.scene.exists():
+    run = run_of(path)
+    if run is not None and not path.is_dir() and path != run.model_path:
+        run = None
+    if run is not None or is_model_name(path):
+        gaussians = Gaussians.load(run.model_path if run else path)
+        if run is None or run.scene is None or not run.scene.exists():
             return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
         config = run.config
         scene = load_scene(run.scene, resolution=config.resolution, test_every=config.test_every, progress=progress)
-    elif is_model_name(path):
-        gaussians = Gaussians.load(path)
-        return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
     else:
         scene = load_scene(path, progress=progress)
         gaussians = from_scene(scene, TrainConfig().random_points, np.random.default_rng(0))

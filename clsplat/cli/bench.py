@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg
 
 from clsplat.cli.options import DeviceOptions, Flag, Verb, with_given
 from clsplat.cli.session import Services
+from clsplat.config.checks import check_rules
 from clsplat.config.memory import parse_bytes
 from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import BenchSwitches
@@ -65,10 +66,7 @@ def run(verb: Bench, services: Services) -> int:
     from clsplat.progress import StageProgress
 
     size, limit = parse_size(verb.size), parse_bytes(verb.device.max_device_mem)
-    if verb.gaussians < 1:
-        raise InputError(f"--gaussians {verb.gaussians}: expected at least 1")
-    if verb.repeat < 1:
-        raise InputError(f"--repeat {verb.repeat}: expected at least 1")
+    check_rules(verb, "--", ((("gaussians", "repeat"), lambda value: value >= 1, "at least 1"),))
     verb.rasterizer.check()
     if verb.plot is not None:
         check_plot(verb.plot)

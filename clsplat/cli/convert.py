@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
-from math import inf, isclose, isfinite
+from dataclasses import dataclass, field, fields
+from math import inf, isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from clsplat.cli.options import Flag, Memory, RunOrModel, ScenePath, Verb
+from clsplat.cli.options import DeviceOptions, Flag, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services, warn
+from clsplat.config.checks import Rule, check_rules
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
 from clsplat.progress import StageProgress
@@ -31,7 +32,8 @@ NEAR_SLACK = 0.05
 class Convert(Verb):
     """Write a model in another format, by the files' endings, and say what was lost; or edit it on the way.
 
-    Edits are made in this order: merge, crop, prune, transform, scale, drop-sh. docs/formats.md has the formats.
+    Edits are made in this order: merge, crop, prune, transform, scale, drop-sh. A device is needed for --scene and
+    --prune-contribution alone. docs/formats.md has the formats.
     """
 
     source: RunOrModel
@@ -68,11 +70,7 @@ class Convert(Verb):
     """Longest image side for --scene; 0: the images' size up to 1600."""
     background: Literal["black", "white"] = "black"
     """Background behind the Gaussians and behind images with alpha, for --scene."""
-    device: Annotated[str | None, arg(metavar="DEVICE")] = None
-    """OpenCL device for --scene and --prune-contribution: an index, cpu, gpu, or a part of a name.
-    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
-    max_device_mem: Memory = None
-    """Most device memory to use, such as 256MiB or 2G. If not given: all that the device has."""
+    device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
     json: Flag = False
     """Print the result as JSON."""
 
@@ -131,17 +129,14 @@ def _check(verb: Convert) -> None:
     """Raise InputError for a number out of its range, and for flags that lack their companion."""
     from clsplat.gaussians import MAX_SH_DEGREE
 
-    ranges = {
-        "scale": (0.0, inf, "a number over 0"),
-        "prune_opacity": (-inf, 1.0, "0 to 1"),
-        "prune_contribution": (0.0, inf, "pixels, a number over 0"),
-    }
-    for name, (low, high, expected) in ranges.items():
-        value = getattr(verb, name)
-        if value is not None and not (low < value <= high and isfinite(value) and value >= 0):
-            raise InputError(f"--{name.replace('_', '-')} {value}: expected {expected}")
-    if verb.drop_sh is not None and not 0 <= verb.drop_sh <= MAX_SH_DEGREE:
-        raise InputError(f"--drop-sh {verb.drop_sh}: expected 0 to {MAX_SH_DEGREE}")
+    rules: tuple[Rule, ...] = (
+        (("scale",), lambda value: value is None or 0 < value < inf, "a number over 0"),
+        (("prune_opacity",), lambda value: value is None or 0 <= value <= 1, "0 to 1"),
+        (("prune_contribution",), lambda value: value is None or 0 < value < inf, "pixels, a number over 0"),
+        (("drop_sh",), lambda value: value is None or 0 <= value <= MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
+        (("test_every", "resolution"), lambda value: value >= 0, "at least 0"),
+    )
+    check_rules(verb, "--", rules)
     if (verb.prune_contribution is None) != (verb.cameras is None):
         raise InputError("--prune-contribution and --cameras go together: contributions are to these cameras")
     defaults = {field.name: field.default for field in fields(verb)}
@@ -149,8 +144,6 @@ def _check(verb: Convert) -> None:
     if verb.scene is None and names:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
         raise InputError(f"{flags}: of measuring on a scene, expected --scene with it")
-    if verb.test_every < 0 or verb.resolution < 0:
-        raise InputError(f"--test-every {verb.test_every} --resolution {verb.resolution}: expected at least 0")
 
 
 def _described(path: Path, form: Format, gaussians: Gaussians) -> dict[str, Any]:

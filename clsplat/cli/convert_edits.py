@@ -13,7 +13,6 @@ import numpy as np
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.cli.convert import Convert
-from clsplat.cli.options import DeviceOptions
 from clsplat.cli.session import Services, load_scene, warn
 from clsplat.errors import InputError
 from clsplat.evaluation.metrics import psnr
@@ -67,19 +66,15 @@ def similarity(verb: Convert) -> Float64 | None:
     """--transform, then --scale, as one (4, 4); None without them. Raises InputError."""
     if verb.transform is None and verb.scale is None:
         return None
-    matrix = np.eye(4) if verb.transform is None else _matrix(verb.transform)
+    matrix: Float64 = np.eye(4)
+    if (text := verb.transform) is not None:
+        words = read_document(Path(text), "a text file of 16 numbers", MAX_MATRIX) if is_file(text) else text
+        matrix = np.array(_numbers("transform", words, 16)).reshape(4, 4)
     try:
         edit.decompose(matrix)
     except InputError as error:
         raise InputError(f"--transform {verb.transform}: {error}") from None
     return matrix if verb.scale is None else edit.scaling(verb.scale) @ matrix
-
-
-def _matrix(text: str) -> Float64:
-    words = text
-    if is_file(text):
-        words = read_document(Path(text), "a text file of 16 numbers", MAX_MATRIX)
-    return np.array(_numbers("transform", words, 16)).reshape(4, 4)
 
 
 def _numbers(flag: str, text: str, count: int) -> list[float]:
@@ -113,18 +108,13 @@ def _thinned(verb: Convert, services: Services, gaussians: Gaussians) -> Gaussia
         keep("crop-sphere", edit.in_sphere(gaussians, centre, radius))
     if verb.prune_opacity is not None:
         keep("prune-opacity", edit.opaque(gaussians, verb.prune_opacity))
-    if verb.prune_contribution is not None:
-        keep("prune-contribution", _contributions(verb, services, gaussians) >= verb.prune_contribution)
+    if verb.prune_contribution is not None and verb.cameras is not None:
+        shot = choose_shot(verb.cameras)
+        for text in shot.warnings:
+            warn(text)
+        contributions = largest_contributions(gaussians, shot.cameras, verb.device.trusted(services))
+        keep("prune-contribution", contributions >= verb.prune_contribution)
     return gaussians
-
-
-def _contributions(verb: Convert, services: Services, gaussians: Gaussians) -> Float32:
-    assert verb.cameras is not None
-    shot = choose_shot(verb.cameras)
-    for text in shot.warnings:
-        warn(text)
-    device = DeviceOptions(verb.device, verb.max_device_mem).trusted(services)
-    return largest_contributions(gaussians, shot.cameras, device)
 
 
 def measured(
@@ -132,7 +122,7 @@ def measured(
 ) -> dict[str, Any]:
     """PSNR in dB of the model as it was read and of the one that was written, against the photographs and against each
     other: of each view, and the means. The cameras of the written model move along with it."""
-    device = DeviceOptions(verb.device, verb.max_device_mem).open(services)
+    device = verb.device.open(services)
     assert verb.scene is not None
     scene = load_scene(services, verb.scene, verb.resolution, verb.test_every)
     renderer = services.renderer(services.require(device, FORWARD))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 from clsplat.cli.options import DeviceOptions, Flag, OptionalInt, RunOrModel, ScenePath, Verb
-from clsplat.cli.session import Services, load_scene, run_of, warn
+from clsplat.cli.session import Services, load_scene, warn
 from clsplat.config.training import TrainConfig
 from clsplat.errors import CapacityError, InputError, plain
 
@@ -61,7 +61,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
     from clsplat.report import NAME
     from clsplat.report.page import write_last
     from clsplat.runs import scene_record
-    from clsplat.runs.run import model_file
+    from clsplat.runs.run import model_file, run_of
     from clsplat.scenes import doubts
     from clsplat.selftest.result import FORWARD
 

@@ -18,6 +18,7 @@ from clsplat.errors import InputError, examples
 from clsplat.files import check_new, digest
 from clsplat.frame.samples import finer
 from clsplat.gaussians import Gaussians
+from clsplat.images.alpha import background_colour
 from clsplat.images.channels import VIDEO, check_format, parse_channels
 from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
 from clsplat.runs.run import model_file
@@ -32,7 +33,6 @@ _USED_BY = {
     "quality": (".jpg", ".jpeg"),
 }
 """The files that each of the encoding's flags is for."""
-Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -255,11 +255,10 @@ def _devices(verb: Render) -> tuple[str | None, ...]:
     return tuple(words)
 
 
-def parse_colour(text: str) -> Colour:
+def parse_colour(text: str) -> tuple[float, float, float]:
     """black, white or three numbers from 0 to 1. Raises InputError."""
-    named: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-    if text in named:
-        return named[text]
+    if text in ("black", "white"):
+        return background_colour(text)
     try:
         red, green, blue = (float(word) for word in text.split(","))
     except ValueError:

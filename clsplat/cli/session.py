@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from clsplat.device.context import Device, DeviceInfo
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
-    from clsplat.runs.run import Run
     from clsplat.scenes.scene import Scene
 
 
@@ -51,14 +50,6 @@ def load_scene(services: Services, path: Path, resolution: int, test_every: int)
     for text in scene.warnings:
         warn(text)
     return scene
-
-
-def run_of(model: Path) -> Run | None:
-    """The run that a model is of: the folder itself, or the folder that the file is in."""
-    from clsplat.runs.run import Run, is_run
-
-    folder = next((path for path in (model, model.parent) if is_run(path)), None)
-    return None if folder is None else Run.open(folder)
 
 
 def chosen_devices(selector: str | None) -> list[DeviceInfo]:

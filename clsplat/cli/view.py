@@ -15,16 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from clsplat.cli.options import DeviceOptions, PageOptions, RunOrModel, ScenePath, Verb
-from clsplat.cli.session import Services, run_of, warn
+from clsplat.cli.session import Services, warn
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.process import endings, handled
 
 if TYPE_CHECKING:
-    from clsplat.gaussians import Gaussians
     from clsplat.scenes.scene import Scene
-    from clsplat.viewer.models import HeldModel
-    from clsplat.viewer.server import Server, World
+    from clsplat.viewer.server import Server
     from clsplat.viewer.training_view import TrainingView
 
 FIRST = (640, 360)
@@ -53,11 +51,13 @@ def run(verb: View, services: Services) -> int:
     from clsplat.device.child import TrialInterrupted
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
-    from clsplat.runs.run import model_file
+    from clsplat.runs.run import model_file, run_of
     from clsplat.selftest.result import FORWARD
+    from clsplat.viewer.appearance import Look
     from clsplat.viewer.models import HeldModel
+    from clsplat.viewer.pose import extent_of, looking, start_of
     from clsplat.viewer.scheduler import Viewing
-    from clsplat.viewer.server import Address, Server
+    from clsplat.viewer.server import Address, Server, World
     from clsplat.viewer.training_view import LONGEST_WAIT
 
     address = Address(verb.page.host, verb.page.port, verb.page.paths)
@@ -72,8 +72,13 @@ def run(verb: View, services: Services) -> int:
     scene = _scene(services, verb.scene or (run.scene if run else None), config, given=verb.scene is not None)
     device = verb.device.trusted(services, FORWARD)
     model = HeldModel(gaussians, device, config.rasterizer, background_colour(verb.background or config.background))
-    world = _world(gaussians, scene, file.name)
-    _warm(model, world)
+    views = scene.views if scene else []
+    low, high = extent_of(gaussians.means)
+    box = (low + gaussians.origin, high + gaussians.origin)
+    start = start_of([view.camera for view in views], gaussians.means + gaussians.origin)
+    world = World(file.name, start, gaussians.origin, box, gaussians.sh_degree, views)
+    for exact in (False, True):  # the first pictures wait for kernels to be built
+        model.picture(looking(start, FIRST).camera(), Look(), exact=exact)
     viewing = Viewing(model)
     stopped = threading.Event()
     signals = handled((signal.SIGINT, *endings()), lambda *_: stopped.set())
@@ -122,27 +127,6 @@ def _scene(services: Services, path: Path | None, config: TrainConfig, *, given:
             raise
         warn(f"no cameras and photos: {error}")
         return None
-
-
-def _world(gaussians: Gaussians, scene: Scene | None, title: str) -> World:
-    from clsplat.viewer.pose import extent_of, start_of
-    from clsplat.viewer.server import World
-
-    views = scene.views if scene else []
-    low, high = extent_of(gaussians.means)
-    box = (low + gaussians.origin, high + gaussians.origin)
-    start = start_of([view.camera for view in views], gaussians.means + gaussians.origin)
-    return World(title, start, gaussians.origin, box, gaussians.sh_degree, views)
-
-
-def _warm(model: HeldModel, world: World) -> None:
-    """Make a picture in motion and one at rest: the first pictures wait for kernels to be built."""
-    from clsplat.viewer.appearance import Look
-    from clsplat.viewer.pose import looking
-
-    camera = looking(world.start, FIRST).camera()
-    for exact in (False, True):
-        model.picture(camera, Look(), exact=exact)
 
 
 def _print_address(server: Server) -> None:

@@ -33,6 +33,8 @@ SUN = np.array([0.45, -0.35, 0.82], np.float32) / np.float32(np.sqrt(0.45**2 + 0
 SUN_LIGHT = np.array([0.80, 0.74, 0.64], np.float32)
 SKY_LIGHT = np.array([0.36, 0.40, 0.47], np.float32)
 SHADOW_RAYS = 24
+GLOSS = 0.25
+"""Strength of the highlight on the balls."""
 WALL_RADIUS, WALL_HEIGHT = 3.4, 2.8
 CENTRE = np.array([0.0, 0.0, 0.35], np.float32)
 FIELD_OF_VIEW = np.deg2rad(62.0)
@@ -89,12 +91,11 @@ def dot(a: Float32, b: Float32) -> Float32:
 class Surface(ABC):
     """One object: how a ray meets it, how its texture wraps around it, and its baked colours.
 
-    rows, columns: texels of the texture; a texel is about a pixel wide in the photos. gloss: strength of the highlight.
+    rows, columns: texels of the texture; a texel is about a pixel wide in the photos.
     """
 
     rows: int
     columns: int
-    gloss: float = 0.0
     texture: Float32 = field(default_factory=lambda: np.zeros((1, 1, 3), np.float32))
 
     @abstractmethod
@@ -294,8 +295,8 @@ def still_life() -> list[Surface]:
     return [
         Floor(768, 768),
         Wall(320, 2048),
-        Ball(192, 384, 0.25, centre=(0.05, -0.1, 0.48), radius=0.48, palette=marble),
-        Ball(96, 192, 0.25, centre=(0.72, 0.62, 0.24), radius=0.24, palette=amber),
+        Ball(192, 384, centre=(0.05, -0.1, 0.48), radius=0.48, palette=marble),
+        Ball(96, 192, centre=(0.72, 0.62, 0.24), radius=0.24, palette=amber),
         Box(128, 768, centre=(-0.85, 0.35, 0.42), half=(0.30, 0.26, 0.42), turn=0.5, palette=red),
         Box(96, 576, centre=(0.55, -0.95, 0.20), half=(0.34, 0.22, 0.20), turn=-0.35, palette=green),
     ]
@@ -376,12 +377,12 @@ def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32
             continue
         points = origin + nearest[rays, None] * direction[rays]
         colour[rays] = surface.colour(points)
-        if isinstance(surface, Ball) and surface.gloss:
+        if isinstance(surface, Ball):
             normals = ((points - np.asarray(surface.centre)) / surface.radius).astype(np.float32)
             halfway = (SUN - direction[rays]).astype(np.float32)
             halfway /= np.sqrt(dot(halfway, halfway))[:, None]
             highlight = np.maximum(dot(normals, halfway), 0) ** 24
-            colour[rays] += surface.gloss * highlight[:, None]
+            colour[rays] += GLOSS * highlight[:, None]
     fine = colour.reshape(camera.height, samples, camera.width, samples, 3)
     linear = np.clip(fine.mean(axis=(1, 3)), 0, 1)
     # a gentle tone curve: the photos should not look gloomy

@@ -27,26 +27,49 @@ from clsplat.scenes.scene import load_scene
 from clsplat.shots.generated import turntable
 
 PHOTOS = 40
-WIDTH, HEIGHT = 320, 240
 TURNTABLE_FRAMES = 60
 MARK = ".clsplat-demo"
 """The file that says of a folder that a demo has made what is in it."""
 MADE = ("photos", "scene", "run", "turntable")
 
 
-def run_demo(
-    output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS, frames: int = TURNTABLE_FRAMES
-) -> dict[str, Any]:
+def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS) -> dict[str, Any]:
     """Make everything below output: photos/, scene/, run/ and turntable/; returns the evaluation, as in eval.json.
 
     What an earlier, interrupted demo has finished is used again. device: as `clsplat devices` names it; iterations: of
-    training; frames: of the turntable. Raises InputError for a folder that holds something else, and what the steps
-    raise.
+    training. Raises InputError for a folder that holds something else, and what the steps raise.
     """
     output.mkdir(parents=True, exist_ok=True)
     with locked(output, "demo"):
         claim(output)
-        return _run_demo(output, device=device, iterations=iterations, frames=frames)
+        start = time.monotonic()
+        # before minutes of work: is there a device of that name?
+        opened = open_device(device)
+        report = StageProgress()
+        scene_folder = make_scene(output, report)
+        scene, config = load_scene(scene_folder), TrainConfig(iterations=iterations)
+        run = Run.create(output / "run", config, scene=scene_folder, resume=False, overwrite=True)
+        with TrainProgress(iterations) as progress:
+            train(scene, config, device=opened, run=run, on_step=progress)
+        result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
+        gaussians, renderer = Gaussians.load(run.model_path), Renderer(opened)
+        turntable_folder = output / "turntable"
+        turntable_folder.mkdir(exist_ok=True)
+        for index, camera in enumerate(turntable([view.camera for view in scene.views], TURNTABLE_FRAMES)):
+            picture = renderer.render(gaussians, camera, (0.0, 0.0, 0.0)).image
+            write_image(turntable_folder / f"frame_{index:03d}.png", picture)
+            report("rendering the turntable", (index + 1) / TURNTABLE_FRAMES)
+    minutes, seconds = divmod(round(time.monotonic() - start), 60)
+    print(
+        f"done in {minutes} min {seconds} s: PSNR {result['mean']['psnr']:.2f} dB, SSIM {result['mean']['ssim']:.3f} "
+        f"on {len(result['views'])} held-out photos\n"
+        f"  the photos:           {output / 'photos'}\n"
+        f"  held-out renders:     {run.test_path}\n"
+        f"  the turntable:        {turntable_folder}\n"
+        f"  the model (any viewer of splats opens it): {run.model_path}",
+        file=sys.stderr,
+    )
+    return result
 
 
 def claim(output: Path) -> None:
@@ -62,33 +85,6 @@ def claim(output: Path) -> None:
     atomic_write(output / MARK, b"What is beside this file was made by clsplat demo, which may replace it.\n")
 
 
-def _run_demo(output: Path, *, device: str | None, iterations: int, frames: int) -> dict[str, Any]:
-    """Do the work of `run_demo`, alone in the folder."""
-    start = time.monotonic()
-    # before minutes of work: is there a device of that name?
-    opened = open_device(device)
-    scene_folder = make_scene(output, StageProgress())
-    run_folder, turntable_folder = output / "run", output / "turntable"
-    config = TrainConfig(iterations=iterations)
-    run = Run.create(run_folder, config, scene=scene_folder, resume=False, overwrite=True)
-    with TrainProgress(iterations) as progress:
-        train(load_scene(scene_folder), config, device=opened, run=run, on_step=progress)
-    result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
-    _render_turntable(scene_folder, run_folder, turntable_folder, frames, opened)
-
-    minutes, seconds = divmod(round(time.monotonic() - start), 60)
-    print(
-        f"done in {minutes} min {seconds} s: PSNR {result['mean']['psnr']:.2f} dB, SSIM {result['mean']['ssim']:.3f} "
-        f"on {len(result['views'])} held-out photos\n"
-        f"  the photos:           {output / 'photos'}\n"
-        f"  held-out renders:     {run_folder / 'test'}\n"
-        f"  the turntable:        {turntable_folder}\n"
-        f"  the model (any viewer of splats opens it): {run_folder / 'model.ply'}",
-        file=sys.stderr,
-    )
-    return result
-
-
 def make_scene(output: Path, progress: Progress | None = None) -> Path:
     """Photos in output/photos and the scene recovered from them in output/scene, whose path is returned.
 
@@ -100,18 +96,6 @@ def make_scene(output: Path, progress: Progress | None = None) -> Path:
     if not set(existing).issubset(expected):
         raise InputError(f"{photos}: holds files that are not the demo's, expected a new folder")
     if existing != expected:
-        write_photos(photos, count=PHOTOS, width=WIDTH, height=HEIGHT, progress=progress)
+        write_photos(photos, count=PHOTOS, progress=progress)
     # the ray caster's lens has no distortion, as ours is known to have none: photos need no resampling
     return sfm.reconstruct(photos, scene, camera_model="SIMPLE_PINHOLE", overwrite=True, progress=progress)
-
-
-def _render_turntable(scene_folder: Path, run_folder: Path, target: Path, frames: int, device: Any) -> None:
-    """A closed camera path around the scene as PNG files."""
-    progress = StageProgress()
-    cameras = [view.camera for view in load_scene(scene_folder).views]
-    gaussians = Gaussians.load(run_folder / "model.ply")
-    renderer = Renderer(device)
-    target.mkdir(parents=True, exist_ok=True)
-    for index, camera in enumerate(turntable(cameras, frames)):
-        write_image(target / f"frame_{index:03d}.png", renderer.render(gaussians, camera, (0.0, 0.0, 0.0)).image)
-        progress("rendering the turntable", (index + 1) / frames)

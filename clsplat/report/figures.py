@@ -64,10 +64,9 @@ class Figures:
     @property
     def gaussians(self) -> int | None:
         """Number of Gaussians in the model, as it or eval.json says, or at the last step."""
-        if self.model is not None:
-            return int(self.model["gaussians"])
-        if self.evaluation is not None and self.evaluation["gaussians"] is not None:
-            return int(self.evaluation["gaussians"])
+        for record in (self.model, self.evaluation):
+            if record is not None and record["gaussians"] is not None:
+                return int(record["gaussians"])
         last = next(reversed(self.curves["gaussians"]), None)
         return None if last is None else int(last)
 
@@ -89,7 +88,7 @@ def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = T
 
     Raises InputError for metrics that are no metrics at all; whatever else is missing or damaged is a note.
     """
-    records = [record for record in run.read_metrics() if _is_complete(record)]
+    records = [record for record in run.read_metrics() if all(number(record.get(name)) is not None for name in CURVES)]
     curves = {name: [float(record[name]) for record in records] for name in CURVES}
     figures = Figures(run, run.path.resolve().name, curves)
     for record in records:
@@ -147,10 +146,6 @@ def smooth(values: list[float], count: int) -> list[float]:
     low, high = np.maximum(at - count // 2, 0), np.minimum(at + count // 2 + 1, len(values))
     means: list[float] = ((sums[high] - sums[low]) / (high - low)).tolist()
     return means
-
-
-def _is_complete(record: Mapping[str, Any]) -> bool:
-    return all(number(record.get(name)) is not None for name in CURVES)
 
 
 def _texts(values: Mapping[str, Any]) -> Record:

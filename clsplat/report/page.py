@@ -188,7 +188,9 @@ def stage_rows(figures: Figures) -> list[tuple[str, float, float, float]]:
 
 def histograms(figures: Figures) -> list[Markup]:
     """Scales, opacities, contributions."""
-    bars = {name: _bars(histogram) for name, histogram in figures.histograms.items()}
+    bars = {
+        name: list(zip(data["edges"], [*data["counts"], 0], strict=True)) for name, data in figures.histograms.items()
+    }
     scales = (("largest scale", 0), ("smallest scale", 1))
     series = [Series(name, bars[name], "bars", color) for name, color in scales if name in bars]
     made = [chart("Scales", series, "world units", "Gaussians", powers=True, note="standard deviations")]
@@ -223,11 +225,6 @@ def duration(seconds: float | None) -> str:
 def score(value: float, name: str) -> str:
     """A score with the digits that mean something."""
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
-
-
-def _bars(histogram: dict[str, Any]) -> list[tuple[float, float]]:
-    edges, counts = histogram["edges"], histogram["counts"]
-    return list(zip(edges, [*counts, 0], strict=True))
 
 
 def _data(figures: Figures) -> dict[str, Any]:

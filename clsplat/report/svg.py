@@ -36,8 +36,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """The axis from values low to high, to pixels from start to end; ticks: value and label. power: values are powers
-    of ten of what the labels say."""
+    """The axis from values low to high, to pixels from start to end; ticks: value and label."""
 
     low: float
     high: float
@@ -75,25 +74,19 @@ def chart(
         templates()
         .get_template("chart.html")
         .render(
-            {
-                "title": title,
-                "drawn": drawn,
-                "across": across,
-                "up": up,
-                "x": x,
-                "y": y,
-                "powers": powers,
-                "note": note,
-            },
+            title=title,
+            drawn=drawn,
+            across=across,
+            up=up,
+            x=x,
+            y=y,
+            powers=powers,
+            note=note,
             label=f"{title}: {y} by {x}. " + " ".join(_described(curve) for curve in drawn if curve.kind != "faint"),
             shapes=[_shape(curve, drawn, across, up, log_y=log_y) for curve in _back_to_front(drawn)],
             colors=COLORS,
             width=WIDTH,
             height=HEIGHT,
-            left=LEFT,
-            right=RIGHT,
-            top=TOP,
-            bottom=BOTTOM,
         )
     )
     return Markup(html)  # noqa: S704  # escaped by the template

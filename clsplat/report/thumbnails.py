@@ -17,12 +17,12 @@ import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.arrays import Float32
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import InputError
 from clsplat.evaluation.held_out import picture_names
-from clsplat.files import native_name
 from clsplat.images.alpha import composite
 from clsplat.images.colour import displayed, photos_space
-from clsplat.images.reading import downscale, error_of, read_image
+from clsplat.images.reading import downscale, read_image
+from clsplat.images.writing import write_spec
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, View, detect, load_scene
 
@@ -126,10 +126,7 @@ def data_uri(image: NDArray[Any]) -> str:
         spec.attribute("Compression", f"jpeg:{QUALITY}")
     with tempfile.TemporaryDirectory() as folder:  # OpenImageIO's Python writes to files alone
         path = Path(folder) / f"picture.{kind}"
-        name = native_name(path)
-        output = oiio.ImageOutput.create(name)
-        if not (output and output.open(name, spec) and output.write_image(pixels) and output.close()):
-            raise ClsplatError(f"a picture could not be encoded: {error_of(output or oiio)}")
+        write_spec(path, [pixels], [spec], kind)
         data = path.read_bytes()
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 

@@ -240,6 +240,11 @@ def is_run(path: Path) -> bool:
     return any(line.startswith("clsplat = ") for line in text.split("\n"))
 
 
+def run_of(model: Path) -> Run | None:
+    """The run that a model is of: the folder itself, or the folder that the file is in."""
+    return next((Run.open(path) for path in (model, model.parent) if is_run(path)), None)
+
+
 def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
     """Raise InputError where a run may not be put at `path`. Writes nothing."""
     if resume and overwrite:

@@ -68,11 +68,9 @@ class HeldModel:
             return self._picture(key, camera, look, exact=exact)
 
     def _picture(self, key: Look | None, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        gaussians, renderers = (
-            self._held.pop(key)
-            if key in self._held
-            else (self.gaussians if key is None else edited(self.gaussians, key), {})
-        )
+        if key not in self._held:
+            self._held[key] = (self.gaussians if key is None else edited(self.gaussians, key), {})
+        gaussians, renderers = self._held.pop(key)
         while len(self._held) >= HELD:
             del self._held[next(iter(self._held))]
         self._held[key] = (gaussians, renderers)  # the latest is the last

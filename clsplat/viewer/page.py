@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import re
 import threading
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,12 +73,9 @@ class ViserPage:
             scene.add_frame(name, show_axes=False)
         self._status = gui.add_markdown("")
         tabs = gui.add_tab_group()
-        with tabs.add_tab("View"):
-            self._add_view(gui)
-        with tabs.add_tab("Path"):
-            self._add_path(gui)
-        with tabs.add_tab("Screenshot"):
-            self._add_screenshot(gui)
+        for name, add in (("View", self._add_view), ("Path", self._add_path), ("Screenshot", self._add_screenshot)):
+            with tabs.add_tab(name):
+                add(gui)
 
     def _say(self, text: str) -> None:
         if self._status is not None and self._status.content != text:
@@ -162,63 +160,47 @@ class ViserPage:
         handle.on_click(clicked)
 
     def _add_path(self, gui: Any) -> None:
-        add, remove, clear = (gui.add_button(name) for name in ("Add key", "Remove last key", "Clear keys"))
-        count = gui.add_markdown("no keys")
-        apart = gui.add_number("Seconds between keys", 2.0, min=0.05, max=3600.0, step=0.05)
-        fps = gui.add_number("Frames a second", FPS, min=1.0, max=240.0, step=1.0)
-        loop = gui.add_checkbox("Closed loop", initial_value=False)
-        width, height = self._add_size(gui)
-        download = gui.add_button("Download path")
-        save = gui.add_button("Save path") if self.paths is not None else None
+        def button(name: str, action: Callable[[], None]) -> None:
+            async def clicked(_: Any) -> None:
+                self._attempt(action)
+                keys = len(self.recorder.keys)
+                count.content = f"{keys or 'no'} key{'' if keys == 1 else 's'}"
 
-        def counted() -> None:
-            keys = len(self.recorder.keys)
-            count.content = f"{keys or 'no'} key{'' if keys == 1 else 's'}"
+            gui.add_button(name).on_click(clicked)
 
-        async def added(_: Any) -> None:
-            pose = self.viewer.pose
-            if pose is not None:
-                self._attempt(lambda: self.recorder.add(pose))
-                self._draw_key(len(self.recorder.keys) - 1)
-            counted()
+        def add() -> None:
+            if (pose := self.viewer.pose) is not None:
+                self.recorder.add(pose)
+                # thin lines: where the camera still stands, it would frame the page
+                lines = {"thickness": 2.0, "thickness_units": "screen"}
+                self._add_frustum(f"/keys/{len(self.recorder.keys) - 1}", pose, "key", **lines)
 
-        async def removed(_: Any) -> None:
+        def remove() -> None:
             del self.recorder.keys[-1:]
             self.client.scene.remove_by_name(f"/keys/{len(self.recorder.keys)}")
-            counted()
 
-        async def cleared(_: Any) -> None:
+        def clear() -> None:
             self.recorder.keys.clear()
             self._clear("/keys")
-            counted()
 
         def document() -> str:
             size = (int(width.value), int(height.value))
             return self.recorder.document(size, apart=float(apart.value), fps=float(fps.value), loop=loop.value)
 
-        async def downloaded(_: Any) -> None:
-            self._attempt(
-                lambda: self.client.send_file_download("path.json", document().encode(), save_immediately=True)
-            )
+        def download() -> None:
+            self.client.send_file_download("path.json", document().encode(), save_immediately=True)
 
-        def write() -> None:
-            if self.paths is not None:
-                self.tell(f"saved as {save_path(self.paths, document()).name}")
-
-        async def saved(_: Any) -> None:
-            self._attempt(write)
-
-        add.on_click(added)
-        remove.on_click(removed)
-        clear.on_click(cleared)
-        download.on_click(downloaded)
-        if save is not None:
-            save.on_click(saved)
-
-    def _draw_key(self, index: int) -> None:
-        # thin lines: where the camera still stands, it would frame the page
-        pose, lines = self.recorder.keys[index], {"thickness": 2.0, "thickness_units": "screen"}
-        self._add_frustum(f"/keys/{index}", pose, "key", **lines)
+        button("Add key", add)
+        button("Remove last key", remove)
+        button("Clear keys", clear)
+        count = gui.add_markdown("no keys")
+        apart = gui.add_number("Seconds between keys", 2.0, min=0.05, max=3600.0, step=0.05)
+        fps = gui.add_number("Frames a second", FPS, min=1.0, max=240.0, step=1.0)
+        loop = gui.add_checkbox("Closed loop", initial_value=False)
+        width, height = self._add_size(gui)
+        button("Download path", download)
+        if (folder := self.paths) is not None:
+            button("Save path", lambda: self.tell(f"saved as {save_path(folder, document()).name}"))
 
     def _add_frustum(self, name: str, pose: Pose, kind: str, **options: Any) -> Any:
         """Draw a camera of a kind of CAMERA_COLOURS."""
@@ -259,7 +241,7 @@ class ViserPage:
         image, _ = model.picture(pose.camera(width, height), self.viewer.look, exact=True)
         self.client.send_file_download("screenshot.png", png(image), save_immediately=True)
 
-    def _attempt(self, action: Any) -> None:
+    def _attempt(self, action: Callable[[], None]) -> None:
         """Do it, and tell of what is wrong with it."""
         try:
             action()

@@ -43,15 +43,14 @@ class Level:
 class Pace:
     """Finds the size at which pictures in motion take the time that they may take."""
 
-    def __init__(self, target: float = TARGET) -> None:
-        self.target = target
+    def __init__(self) -> None:
         self.scale = 0.25
         self._exact = 0.0
 
     def moved(self, scale: float, seconds: float) -> None:
         """A picture in motion of this scale took so long. Part of that does not shrink with the pixels, so that the
         next size is found step by step."""
-        factor = math.sqrt(self.target / max(seconds, 1e-4))
+        factor = math.sqrt(TARGET / max(seconds, 1e-4))
         self.scale = min(max(scale * min(max(factor, 0.6), 1.2), SMALLEST), 1.0)
         self._exact = max(self._exact, seconds)
 
@@ -68,8 +67,8 @@ class Pace:
 class Refinement:
     """The picture that a viewer sees, and the next one: coarse in motion, finer at rest, exact in the end."""
 
-    def __init__(self, now: float, pace: Pace | None = None) -> None:
-        self.pace = pace or Pace()
+    def __init__(self, now: float) -> None:
+        self.pace = Pace()
         self.served = -math.inf
         self._changed, self._at = 1, now
         self._settle = START

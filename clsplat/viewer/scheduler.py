@@ -66,7 +66,7 @@ class Viewing:
                 if viewer.pose is not None:
                     viewer.refinement.changed(self.clock())
                 viewer.pose = pose
-                self._wake()
+                self.wake()
 
     def looks(self, viewer: Viewer, look: Look) -> None:
         """Take the viewer's look at the model."""
@@ -74,18 +74,19 @@ class Viewing:
             if look != viewer.look:
                 viewer.look = look
                 viewer.refinement.changed(self.clock())
-                self._wake()
+                self.wake()
 
     def ask(self, viewer: Viewer, job: Callable[[Model], None]) -> None:
         """Have something done in the device's thread. The page tells of its ClsplatError or OSError."""
         with self._news:
             self._jobs.append((viewer, job))
-            self._wake()
+            self.wake()
 
     def wake(self) -> None:
         """End a `wait`."""
         with self._news:
-            self._wake()
+            self._is_news = True
+            self._news.notify_all()
 
     def wait(self, most: float) -> None:
         """Wait until there may be something to do, for at most `most` seconds."""
@@ -102,10 +103,7 @@ class Viewing:
     def work(self, share: Share | None = None) -> bool:
         """Do one thing, if there is one: a job, or the picture of the one whose turn it is. share: of a training, which
         must not be exceeded. Whether something was done."""
-        if not self._viewers and not self._jobs:
-            return False
-        model = self.model
-        if model is None:
+        if (model := self.model) is None or not (self._viewers or self._jobs):
             return False
         with self._news:
             self._is_news = False
@@ -153,7 +151,3 @@ class Viewing:
         except (ClsplatError, OSError) as error:
             if viewer in self._viewers:
                 viewer.page.tell(str(error))
-
-    def _wake(self) -> None:
-        self._is_news = True
-        self._news.notify_all()

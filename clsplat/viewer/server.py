@@ -64,7 +64,10 @@ class Address:
     def check(self) -> None:
         """Raise InputError where viser is missing, the folder is, or nothing can listen there. viser itself would take
         the next port that is free."""
-        require_viser()
+        try:
+            import viser  # noqa: F401
+        except ImportError:
+            raise InputError("the viewer needs viser: pip install 'clsplat[view]'") from None
         if not 0 <= self.port <= 65535:
             raise InputError(f"--port {self.port}: expected 0 to 65535; 0 is any that is free")
         if self.paths is not None and not self.paths.is_dir():
@@ -93,14 +96,6 @@ class Address:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
             return False
-
-
-def require_viser() -> None:
-    """Raise InputError, with what installs it, where viser is missing."""
-    try:
-        import viser  # noqa: F401
-    except ImportError:
-        raise InputError("the viewer needs viser: pip install 'clsplat[view]'") from None
 
 
 class Server:

@@ -487,7 +487,7 @@ def test_labels_cover_nothing() -> None:
 
 def test_too_many_labels_have_a_place_each() -> None:
     points, sizes = np.full((6, 2), (50.0, 20.0)), np.full((6, 2), (60.0, 16.0))
-    places = place_labels(points, sizes, np.array([0.0, 0.0, 100.0, 40.0]))
+    places = place_labels(points, sizes, np.array([0.0, 0.0, 100.0, 40.0]), np.zeros((0, 2, 2)))
     assert len(places) == 6
 
 
