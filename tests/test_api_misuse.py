@@ -96,9 +96,7 @@ def test_arguments_of_another_kind_are_named(arguments: dict[str, Any], message:
     ],
     ids=str,
 )
-def test_numbers_of_a_scene_that_are_not_whole_are_named(
-    arguments: dict[str, Any], message: str, scene: Path
-) -> None:
+def test_numbers_of_a_scene_that_are_not_whole_are_named(arguments: dict[str, Any], message: str, scene: Path) -> None:
     with pytest.raises(InputError) as caught:
         load_scene(scene, **arguments)
     assert str(caught.value).startswith(message)

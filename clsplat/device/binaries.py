@@ -21,7 +21,6 @@ import pyopencl as cl
 from clsplat.device.known import cache_folder
 from clsplat.device.processor import features
 from clsplat.device.quirks import TARGET, wants_cache
-from clsplat.errors import InputError
 from clsplat.files import atomic_write
 
 MOST_BYTES = 256 << 20
@@ -32,11 +31,8 @@ FOLDER = "CLSPLAT_BINARIES"
 
 
 def folder() -> Path:
-    """The place of the files. Raises InputError for a FOLDER of blanks."""
-    text = os.environ.get(FOLDER, "")
-    if text.isspace():
-        raise InputError(f"{FOLDER}={text}: expected the path of a folder")
-    return Path(text or cache_folder() / "binaries")
+    """The place of the files."""
+    return Path(os.environ.get(FOLDER, "").strip() or cache_folder() / "binaries")
 
 
 def _processor() -> str:

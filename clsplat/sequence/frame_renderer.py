@@ -84,8 +84,8 @@ class FrameRenderer:
         if options.deep is not None:
             model = (self._renderer, self._gaussians)
             above = header(task, options)
-            blank = write_deep(task.path, *model, camera, options.deep, encoding, above, pipeline.colours)
-            return RenderedFrame(None, time.monotonic() - start, measured={"blank": blank})
+            empty = write_deep(task.path, *model, camera, options.deep, encoding, above, pipeline.colours)
+            return RenderedFrame(None, time.monotonic() - start, measured={"blank": empty})
         draw, finish = pipeline.draw(task.at, camera_after(task, options))
         rows = self._rows(camera)
         if rows < camera.height and not task.is_video:

@@ -194,11 +194,10 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
 
 def _content(source: str) -> str:
     """SHA-256 of a file of OpenColorIO's, and of the tables that it names; the name of another configuration."""
-    path = Path(source)
-    if not source or not is_file(path):
+    if not source or not is_file(Path(source)):
         return source
-    patterns = _table_patterns(source, path.stat().st_mtime_ns)
-    tables = sorted({found for pattern in patterns for found in glob(pattern) if is_file(Path(found))})
+    patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
+    tables = sorted({path for each in patterns for path in glob(each) if is_file(Path(path))})  # noqa: PTH207
     return " ".join(_digest_at(str(each), Path(each).stat().st_mtime_ns) for each in (source, *tables))
 
 

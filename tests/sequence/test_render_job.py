@@ -352,10 +352,16 @@ def test_the_digest_goes_by_what_a_colour_configuration_says(tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     "paths",
-    ["search_path: luts:other", "search_path: [other, luts]", "search_path:\n  - other\n  - luts", 'search_path: "$LUTS"'],
+    [
+        "search_path: luts:other",
+        "search_path: [other, luts]",
+        "search_path:\n  - other\n  - luts",
+        'search_path: "$LUTS"',
+    ],
 )
 @pytest.mark.parametrize(
-    "named", ["{src: film.cube}", '{src: "film.cube", interpolation: linear}', "\n    src: film.cube", "{src: $LOOK.cube}"]
+    "named",
+    ["{src: film.cube}", '{src: "film.cube", interpolation: linear}', "\n    src: film.cube", "{src: $LOOK.cube}"],
 )
 def test_the_digest_goes_by_the_tables_that_a_colour_configuration_names(
     paths: str, named: str, tmp_path: Path

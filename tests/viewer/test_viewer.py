@@ -54,9 +54,7 @@ def test_a_model_without_gaussians(tmp_path: Path, capsys: Capture) -> None:
     assert "empty.ply" in error_line(capsys)
 
 
-def test_the_page_has_the_models_colour_space(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
+def test_the_page_has_the_models_colour_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     def shown(*given: object) -> None:
         raise InputError(f"shown in {given[4:]}")
 
