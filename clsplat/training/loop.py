@@ -105,6 +105,8 @@ class _Session:
         on_plan: Callable[[Plan], None] | None,
     ) -> None:
         self.trainer, self.run, self.on_step, self.on_plan = trainer, run, on_step, on_plan
+        record = scene_record.read(run) if run is not None else None
+        self.scene = scene_record.digest_of(record) if record is not None else None
         self.announced: Plan | None = None
         self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
@@ -139,7 +141,8 @@ class _Session:
         if self.run is not None and self.trainer.step > self.saved:
             arrays, state = self.trainer.checkpoint()
             if not self.trainer.watch.patience.lost:
-                self.run.save_checkpoint(self.trainer.step, arrays, {**state, "seconds": self.seconds})
+                state |= {"seconds": self.seconds, **({"scene": self.scene} if self.scene else {})}
+                self.run.save_checkpoint(self.trainer.step, arrays, state)
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
