@@ -83,6 +83,42 @@ def test_arguments_of_another_kind_are_named(arguments: dict[str, Any], message:
     assert message in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"test_every": 2.5}, "test_every 2.5: expected a whole number below"),
+        ({"test_every": "8"}, "test_every 8: expected a whole number below"),
+        ({"test_every": None}, "test_every None: expected a whole number below"),
+        ({"test_every": True}, "test_every True: expected a whole number below"),
+        ({"resolution": 40.5}, "resolution 40.5: expected a whole number below"),
+        ({"resolution": -1}, "resolution -1: expected 0 or more"),
+        ({"test_every": -1}, "test_every -1: expected 0 or more"),
+    ],
+    ids=str,
+)
+def test_numbers_of_a_scene_that_are_not_whole_are_named(arguments: dict[str, Any], message: str, scene: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        load_scene(scene, **arguments)
+    assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize("degree", [3.0, "3", True, 4, -1], ids=repr)
+def test_a_degree_that_is_none_is_not_written(degree: Any, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=rf"^sh_degree {degree}: expected 0 \(the model's\) to 3$"):
+        hidden_model().save(tmp_path / "a.ply", sh_degree=degree)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("device", [0, True, 1.5], ids=repr)
+def test_a_device_that_is_no_name_is_named(device: Any, loaded: Scene) -> None:
+    for call in (
+        lambda: clsplat.render(hidden_model(), loaded.views[0].camera, device=device),
+        lambda: train(loaded, FEW, device=device),
+    ):
+        with pytest.raises(InputError, match=rf"device is {device}, expected"):
+            call()
+
+
 def test_a_limit_holds_for_a_device_that_is_open(loaded: Scene, default_device: Device) -> None:
     with pytest.raises(CapacityError):
         train(loaded, FEW, device=default_device, max_device_mem="1KiB")

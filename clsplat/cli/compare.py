@@ -32,7 +32,8 @@ class Compare(Verb):
 
 def run(verb: Compare, _: Services) -> int:
     """Print runs side by side, and write their page."""
-    from clsplat.files import atomic_write, check_new
+    from clsplat.files import atomic_write
+    from clsplat.report import check_page
     from clsplat.report.compare import compare_runs, comparison_page, comparison_table
     from clsplat.runs.run import Run
 
@@ -40,7 +41,7 @@ def run(verb: Compare, _: Services) -> int:
         raise InputError(f"{verb.runs[0]}: expected at least two runs to compare")
     runs = [Run.open(path) for path in verb.runs]
     if verb.output is not None:
-        check_new(verb.output, overwrite=verb.overwrite)
+        check_page(verb.output, overwrite=verb.overwrite)
     comparison = compare_runs(runs)
     if verb.output is not None:
         atomic_write(verb.output, comparison_page(comparison).encode("utf-8", "replace"))

@@ -39,7 +39,7 @@ class Report(Verb):
 
 def run(verb: Report, _: Services) -> int:
     """Write the page."""
-    from clsplat.files import check_new
+    from clsplat.report import check_page
     from clsplat.report.page import write_report
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run
@@ -48,7 +48,7 @@ def run(verb: Report, _: Services) -> int:
     if verb.views < 0:
         raise InputError(f"--views {verb.views}: expected at least 0")
     path = verb.output or run.path / "report.html"
-    check_new(path, overwrite=verb.overwrite or verb.output is None)
+    check_page(path, overwrite=verb.overwrite or verb.output is None)
     with nullcontext() if verb.output else locked(run.path, "report"):
         figures = write_report(run, path, views=verb.views)
     if verb.json:

@@ -51,6 +51,7 @@ def run(verb: View, services: Services) -> int:
     from clsplat.device.child import TrialInterrupted
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
+    from clsplat.images.colour import recorded_space
     from clsplat.runs.run import model_file, run_of
     from clsplat.selftest.result import FORWARD
     from clsplat.viewer.appearance import Look
@@ -71,7 +72,8 @@ def run(verb: View, services: Services) -> int:
     config = run.config if run else TrainConfig()
     scene = _scene(services, verb.scene or (run.scene if run else None), config, given=verb.scene is not None)
     device = verb.device.trusted(services, FORWARD)
-    model = HeldModel(gaussians, device, config.rasterizer, background_colour(verb.background or config.background))
+    background = background_colour(verb.background or config.background)
+    model = HeldModel(gaussians, device, config.rasterizer, background, recorded_space(file))
     views = scene.views if scene else []
     low, high = extent_of(gaussians.means)
     box = (low + gaussians.origin, high + gaussians.origin)

@@ -32,7 +32,7 @@ FOLDER = "CLSPLAT_BINARIES"
 
 def folder() -> Path:
     """The place of the files."""
-    return Path(os.environ.get(FOLDER) or cache_folder() / "binaries")
+    return Path(os.environ.get(FOLDER, "").strip() or cache_folder() / "binaries")
 
 
 def _processor() -> str:

@@ -196,6 +196,8 @@ def select(selector: str | None) -> cl.Device:
 
     Without one: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
     """
+    if not isinstance(selector, str | None):
+        raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
     patience()  # what the environment says of drivers is looked at before it is needed
     devices, infos = all_devices(), list_devices()
     if not devices:
@@ -206,10 +208,10 @@ def select(selector: str | None) -> cl.Device:
         return next((d for d, i in zip(devices, infos, strict=True) if i.kind == "gpu"), devices[0])
     if selector.isdigit() and int(selector) < len(devices):
         return devices[int(selector)]
-    wanted = selector.lower()
+    wanted = selector.lower() if selector.strip() else None  # blanks are in every name
     for device, info in zip(devices, infos, strict=True):
         words = f"{info.name} {info.platform} {info.version}".lower()
-        if not selector.isdigit() and (wanted == info.kind or wanted in words):
+        if not selector.isdigit() and wanted and (wanted == info.kind or wanted in words):
             return device
     names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for info in infos)
     raise DeviceError(f"{named}: no such device, expected cpu, gpu, a part of a name, or an index of these: {names}")

@@ -17,8 +17,8 @@ import pyopencl as cl
 from clsplat.device import binaries
 from clsplat.device.known import BREAK
 from clsplat.device.quirks import build_advice
-from clsplat.device.source import kernel_source
-from clsplat.errors import DriverError, InputError, KernelBuildError
+from clsplat.device.source import kernel_root, kernel_source
+from clsplat.errors import DriverError, InputError, KernelBuildError, examples
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,9 @@ def text_of(stem: str) -> str:
     old, arrow, new = (part.strip() for part in change.partition("=>"))
     if not (where and old and arrow):
         raise InputError(f"{BREAK}={wanted}: expected STEM: WORDS => WORDS")
+    stems = sorted(path.stem for path in kernel_root().glob("*.cl"))
+    if where.strip() not in stems:
+        raise InputError(f"{BREAK}={wanted}: {where.strip()} is no kernel, expected one of {examples(stems)}")
     if where.strip() != stem:
         return source
     if old not in source:

@@ -88,8 +88,8 @@ def write_deep(
     encoding: Encoding | None = None,
     header: Header | None = None,
     colours: Colours | None = None,
-) -> None:
-    """Render and write a deep scanline EXR, atomically, in strips that bound the memory.
+) -> bool:
+    """Render and write a deep scanline EXR, atomically, in strips that bound the memory; True if nothing is in it.
 
     Channels R G B A Z ZBack; a pixel has a sample for each slice that it has something in, with the depths of the first
     and the last Gaussian that it takes there. Colours are half or float as the encoding says, depths are float. Raises
@@ -102,16 +102,19 @@ def write_deep(
     bounds = bin_bounds(gaussians, camera, config)
     spec = deep_spec(camera.width, camera.height, encoding, header)
     rows = deep_rows(renderer.device, camera, len(bounds) + 1)
+    seen: list[bool] = []
 
     def pieces() -> Iterator[tuple[Any, int]]:
         for strip in strips(camera, rows):
             slices = render_deep(renderer, gaussians, strip, bounds)
+            seen.append(bool(slices[:, :, :, 3].any()))
             for image in slices:
                 rgb, alpha = np.ascontiguousarray(image[:, :, :3]), np.ascontiguousarray(image[:, :, 3])
                 image[:, :, :3] = colours.convert(rgb, alpha, colours.model, colours.output)
             yield from _deep_rows(slices, list(spec.channelformats), half=encoding.depth == "half")
 
     write_rows(path, spec, "exr", pieces())
+    return not any(seen)
 
 
 def _deep_rows(slices: Float32, kinds: list[Any], *, half: bool) -> Iterator[tuple[Any, int]]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from difflib import get_close_matches
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -98,8 +98,14 @@ def linear_to_srgb(values: Float32) -> Float32:
 def displayed(rgb: NDArray[Any], space: str) -> Float32:
     """(H, W, 3) of a model's space as PNG and JPEG files show it: in sRGB, within [0, 1]. Raises InputError for a space
     that is not known."""
-    colours = Colours(ColourConfig(colorspace=SRGB), space)
+    colours = _to_srgb(space, os.environ.get("OCIO", ""))
     return np.clip(colours.convert(np.asarray(rgb, np.float32), None, colours.model, SRGB), 0, 1)
+
+
+@lru_cache(maxsize=8)
+def _to_srgb(space: str, source: str) -> Colours:
+    """The spaces of pictures on a display, loaded once: a viewer shows many."""
+    return Colours(ColourConfig(colorspace=SRGB, ocio_config=source), space)
 
 
 class Colours:

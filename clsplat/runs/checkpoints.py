@@ -82,6 +82,19 @@ def read_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(step, arrays, state)
 
 
+def scene_of(path: Path) -> str | None:
+    """The digest of the scene that a checkpoint's state names; None where it names none, or is damaged."""
+    try:
+        with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
+            member = archive.getinfo(f"{STATE_KEY}.npy")
+            if member.compress_type != ZIP_STORED:
+                return None
+            scene = parse_json(_array(archive.read(member), STATE_KEY).tobytes())["state"].get("scene")
+            return scene if isinstance(scene, str) else None
+    except Exception:  # noqa: BLE001  # as of load_latest_checkpoint, which tells of it
+        return None
+
+
 class _Bounded:
     """A file that is never asked for more than it has: `read` makes room for all that it is asked for, and zipfile asks
     for what a header says."""

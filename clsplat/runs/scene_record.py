@@ -15,6 +15,7 @@ import numpy as np
 import clsplat
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import atomic_write, parse_json, read_document, short_digest
+from clsplat.runs.checkpoints import scene_of
 
 if TYPE_CHECKING:
     from clsplat.runs.run import Run
@@ -55,9 +56,23 @@ def _view(view: View, digest: str | None) -> dict[str, Any]:
     }
 
 
+def digest_of(record: dict[str, Any]) -> str:
+    """128 bits of SHA-256 of a scene, in hexadecimal, whatever version has written it down."""
+    scene = {key: value for key, value in record.items() if key not in ("clsplat", "earlier")}
+    return hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def known_digests(run: Run) -> set[str]:
+    """Digests of the scene of scene.json, and of those that it has taken the place of."""
+    record = read(run)
+    return {digest_of(record), *record.get("earlier", [])} if record is not None else set()
+
+
 def write(run: Run, scene: Scene) -> None:
-    """Write scene.json."""
-    record = record_of(scene, run.config.resolution)
+    """Write scene.json. Checkpoints that are there stay those of the run: their scenes are kept as earlier ones."""
+    record, there = record_of(scene, run.config.resolution), {scene_of(path) for _, path in run.checkpoints()}
+    earlier = known_digests(run) | {digest for digest in there if digest}
+    record["earlier"] = sorted(earlier - {digest_of(record)})
     atomic_write(run.path / NAME, (json.dumps(record, allow_nan=False) + "\n").encode())
 
 
@@ -74,6 +89,8 @@ def read(run: Run) -> dict[str, Any] | None:
         assert isinstance(points["count"], int)
         assert len(record["origin"]) == 3
         assert isinstance(record["resolution"], int)
+        assert isinstance(record.get("earlier", []), list)
+        assert all(isinstance(digest, str) for digest in record.get("earlier", []))
         for view in views.values():
             assert {"split", "file", "folder", "blake2b", "size", "lens", "pose"} <= view.keys()
             assert all(len(np.array(view[key], float)) == n for key, n in (("size", 2), ("lens", 4), ("pose", 12)))
@@ -120,9 +137,15 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
 
     Raises InputError where it differs otherwise, or where the model would not lie where its numbers say.
     """
-    earlier = read(run)
+    earlier, known = read(run), known_digests(run)
     if earlier is None:
         return False
+    others = [path for _, path in run.checkpoints() if (scene_of(path) or next(iter(known))) not in known]
+    if others and not accept:
+        raise InputError(
+            f"{others[-1]}: is of a training on another scene than {run.path} is of, expected one of this run; remove "
+            "it, or --accept-changes goes on from it"
+        )
     now = record_of(scene, resolution)
     changes = differences(earlier, now)
     if changes and not accept:
@@ -135,7 +158,7 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
             f"{path}: lies elsewhere in the world than the scene that {run.path} began with (numbers count from "
             f"{now['origin']}, not {earlier['origin']}), expected the same place; start a new run"
         )
-    return bool(changes)
+    return bool(changes or others)
 
 
 def keep(run: Run, scene: Scene, *, resuming: bool) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, NEARS, Camera
+from clsplat.config.checks import misfit
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError, examples, plain, warn
 from clsplat.files import digest, short_digest
@@ -238,8 +239,9 @@ def load_scene(
     masks, depths and the like (`reading.companions`), and so are those on both sides of the split.
     """
     path = Path(path)
-    if resolution < 0 or test_every < 0:
-        raise InputError(f"resolution {resolution}, test_every {test_every}: expected 0 or more")
+    for name, number in (("resolution", resolution), ("test_every", test_every)):
+        if (expected := misfit(int, number)) or number < 0:
+            raise InputError(f"{name} {number}: expected {expected or '0 or more'}")
     kind = detect(path)
     if images is not None and kind != "colmap":
         raise InputError(f"{path}: is a {kind} scene, a folder of images can be chosen only for a COLMAP one")

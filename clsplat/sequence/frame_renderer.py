@@ -83,17 +83,22 @@ class FrameRenderer:
         camera, names, encoding = picture_camera(task, options), options.channels, options.encoding
         if options.deep is not None:
             model = (self._renderer, self._gaussians)
-            write_deep(task.path, *model, camera, options.deep, encoding, header(task, options), pipeline.colours)
-            return RenderedFrame(None, time.monotonic() - start)
+            above = header(task, options)
+            empty = write_deep(task.path, *model, camera, options.deep, encoding, above, pipeline.colours)
+            return RenderedFrame(None, time.monotonic() - start, measured={"blank": empty})
         draw, finish = pipeline.draw(task.at, camera_after(task, options))
         rows = self._rows(camera)
         if rows < camera.height and not task.is_video:
+            blanks: list[bool | None] = []
 
             def finished(strip: Camera, names: Collection[str]) -> Planes:
-                return finish(draw(strip, names))
+                planes = draw(strip, names)
+                blanks.append(pipeline.is_blank(planes))
+                return finish(planes)
 
             write_in_strips(task.path, finished, camera, names, rows, encoding, header(task, options))
-            return RenderedFrame(None, time.monotonic() - start)
+            nothing = None if None in blanks else all(blanks)
+            return RenderedFrame(None, time.monotonic() - start, measured={"blank": nothing})
         planes = in_strips(draw, rows)(camera, names)
         blank = pipeline.is_blank(planes)
         return RenderedFrame(planes, time.monotonic() - start, finish, {"blank": blank})

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
+from glob import escape, glob
 from pathlib import Path
 from typing import Any
 
@@ -191,14 +193,33 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
 
 
 def _content(source: str) -> str:
-    """SHA-256 of a file of OpenColorIO's; the name of another configuration."""
-    path = Path(source)
-    return _digest_at(source, path.stat().st_mtime_ns) if source and is_file(path) else source
+    """SHA-256 of a file of OpenColorIO's, and of the tables that it names; the name of another configuration."""
+    if not source or not is_file(Path(source)):
+        return source
+    patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
+    tables = sorted({path for each in patterns for path in glob(each) if is_file(Path(path))})  # noqa: PTH207
+    return " ".join(_digest_at(str(each), Path(each).stat().st_mtime_ns) for each in (source, *tables))
+
+
+@lru_cache(maxsize=4096)
+def _digest_at(path: str, changed: int) -> str:  # noqa: ARG001  # asked anew where the file has changed
+    return digest(path)
 
 
 @lru_cache(maxsize=8)
-def _digest_at(path: str, changed: int) -> str:  # noqa: ARG001  # asked anew where the file has changed
-    return digest(path)
+def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # likewise
+    """Patterns of the paths of the files that a configuration's FileTransforms name, in the folders of its search_path;
+    its variables, which are set elsewhere, stand for anything."""
+    text = Path(source).read_text("utf-8", "replace")
+    listed = re.search(r"^search_path:([^\n]*(?:\n[ \t]*- [^\n]*)*)", text, re.MULTILINE)
+    places = re.split(r"[\n\[\],:;]|\s-\s", listed[1]) if listed else []
+    names = re.findall(r"\bsrc:[ \t]*(\"[^\"]*\"|'[^']*'|[^,}\n]+)", text)
+    folders, files = (
+        {re.sub(r"\$\{\w+\}|\$\w+|%\w+%", "*", escape(each.strip(" \t\"'"))) for each in found}
+        for found in (places, names)
+    )
+    beside = Path(escape(str(Path(source).parent)))
+    return tuple(sorted({str(beside / folder / file) for folder in folders | {""} for file in files}))
 
 
 def header(task: Task, options: RenderOptions) -> Header:

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -102,6 +102,8 @@ class _Session:
         on_plan: Callable[[Plan], None] | None,
     ) -> None:
         self.trainer, self.run, self.on_step, self.on_plan = trainer, run, on_step, on_plan
+        record = scene_record.read(run) if run is not None else None
+        self.scene = scene_record.digest_of(record) if record is not None else None
         self.announced: Plan | None = None
         self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
@@ -126,7 +128,8 @@ class _Session:
         if self.run is not None and self.trainer.step > self.saved:
             arrays, state = self.trainer.checkpoint()
             if not self.trainer.watch.patience.lost:
-                self.run.save_checkpoint(self.trainer.step, arrays, {**state, "seconds": self.seconds})
+                state |= {"seconds": self.seconds, **({"scene": self.scene} if self.scene else {})}
+                self.run.save_checkpoint(self.trainer.step, arrays, state)
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
@@ -346,9 +349,38 @@ def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume
     return config
 
 
+def late_settings(config: TrainConfig) -> Iterator[str]:
+    """A line for each setting that is not the default and comes after the last step, or begins before the first."""
+    last, expected = config.iterations, f"expected at most --iterations {config.iterations}"
+    ends = f"training ends at step {last}"
+    if steps := [step for step in config.density.prune_at if step > last]:
+        yield f"--density.prune-at {','.join(map(str, steps))}: nothing is pruned then, {ends}; {expected}"
+    optimiser = config.optimiser
+    if optimiser.cooldown > last:
+        part = optimiser.cooldown_to ** (1 - last / optimiser.cooldown)
+        yield (
+            f"--optimiser.cooldown {optimiser.cooldown}: the learning rates begin at {part:.2g} of what they are, "
+            f"training has {last} steps; {expected}"
+        )
+    if config.frequency_steps > last:
+        rise = "the training resolution does not rise to the full size"
+        yield f"--frequency-steps {config.frequency_steps}: {rise}, {ends}; {expected}"
+    elif (
+        not config.frequency_steps
+        and tuple(config.warmup) != TrainConfig.warmup
+        and (steps := [step for step in config.warmup if step >= max(last, 2)])
+    ):
+        yield (
+            f"--warmup {','.join(map(str, steps))}: the training resolution does not double then, {ends} at "
+            f"1/{2 ** len(steps)} of the size; expected less than --iterations {last}"
+        )
+
+
 def _tell_idle_settings(trainer: Trainer) -> None:
     """A warning for each setting that comes to nothing with this scene."""
     config, count = trainer.config, trainer.parameters.count
+    for text in late_settings(config):
+        warnings.warn(text)
     if config.eval_at and not trainer.scene.test_views:
         steps = ",".join(map(str, config.eval_at))
         warnings.warn(f"--eval-at {steps}: no view is held out, so that nothing is evaluated; see --test-every")

@@ -16,6 +16,7 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
 from clsplat.gaussians import Gaussians
+from clsplat.images.colour import SRGB, displayed, photos_space
 from clsplat.rendering.memory_needs import frame_pixels
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
@@ -47,9 +48,15 @@ class HeldModel:
     """Counts the model's changes."""
 
     def __init__(
-        self, gaussians: Gaussians, device: Device, config: RasterizerConfig, background: Sequence[float]
+        self,
+        gaussians: Gaussians,
+        device: Device,
+        config: RasterizerConfig,
+        background: Sequence[float],
+        space: str = SRGB,
     ) -> None:
-        self.gaussians, self.device, self.background = gaussians, device, background
+        """space: the model's colour space (`colour.recorded_space`)."""
+        self.gaussians, self.device, self.background, self.space = gaussians, device, background, space
         self._rasterizers = {True: Rasterizer(device, config), False: Rasterizer(device, draft(config))}
         self._held: dict[Look | None, tuple[Gaussians, dict[bool, Renderer]]] = {}
 
@@ -77,7 +84,7 @@ class HeldModel:
         renderer = renderers.get(exact)
         if renderer is None:
             renderer = renderers[exact] = Renderer(self.device, self._rasterizers[exact])
-        return render_picture(renderer, gaussians, camera, look, self.background)
+        return render_picture(renderer, gaussians, camera, look, self.background, self.space)
 
 
 class LiveModel:
@@ -86,6 +93,7 @@ class LiveModel:
 
     def __init__(self, trainer: Trainer, background: Sequence[float]) -> None:
         self.trainer, self.background = trainer, background
+        self.space = photos_space(view.path for view in trainer.scene.views)
         self._renderer = Renderer(trainer.device, trainer.rasterizer)
         self._edited: tuple[tuple[int, Look], Gaussians] | None = None
         self._other: Renderer | None = None
@@ -111,18 +119,23 @@ class LiveModel:
             raise InputError("this training has just the memory that it needs: only colour and alpha can be shown")
         if key is None:
             local = trainer.local(camera)
-            return render_picture(self._renderer, trainer.parameters, local, look, self.background)
+            return render_picture(self._renderer, trainer.parameters, local, look, self.background, self.space)
         if self._edited is None or self._edited[0] != (trainer.step, key):
             self._edited = ((trainer.step, key), edited(trainer.gaussians(), key))
         self._other = self._other or Renderer(trainer.device, config=trainer.config.rasterizer)
-        return render_picture(self._other, self._edited[1], camera, look, self.background)
+        return render_picture(self._other, self._edited[1], camera, look, self.background, self.space)
 
 
 Model = HeldModel | LiveModel
 
 
 def render_picture(
-    renderer: Renderer, model: Gaussians | AnyGaussians, camera: Camera, look: Look, background: Sequence[float]
+    renderer: Renderer,
+    model: Gaussians | AnyGaussians,
+    camera: Camera,
+    look: Look,
+    background: Sequence[float],
+    space: str,
 ) -> tuple[Image, str]:
     """The result of `picture`, for a model or the part of it that is on the device."""
     if isinstance(model, Gaussians) and not len(model):
@@ -133,4 +146,6 @@ def render_picture(
             return depth_picture(channels["depth"], frame.alpha)
         return count_picture(channels["count"])
     frame = renderer.render(model, camera, background, contiguous=False)
-    return (alpha_picture(frame.alpha) if look.mode == "alpha" else colour_picture(frame.image)), ""
+    if look.mode == "alpha":
+        return alpha_picture(frame.alpha), ""
+    return colour_picture(frame.image if space == SRGB else displayed(frame.image, space)), ""

@@ -65,6 +65,7 @@ def test_an_unknown_one(capsys: Capture) -> None:
     ("variable", "value", "expected"),
     [
         ("CLSPLAT_DEVICE", "abacus", "no such device, expected cpu, gpu, "),
+        ("CLSPLAT_DEVICE", " ", "no such device, expected cpu, gpu, "),
         ("CLSPLAT_DRIVER_TIMEOUT", "soon", "expected seconds, such as 300"),
         ("CLSPLAT_SHAPE", "8", "expected LANESxITEMS"),
         ("CLSPLAT_TRUST_DRIVER", "no", "expected 1, or 0"),

@@ -319,6 +319,20 @@ def test_frames_that_show_nothing(shot: list[str], tmp_path: Path, capsys: Captu
     assert captured.err == ""
 
 
+@pytest.mark.parametrize("flags", ["--width 960 --max-device-mem 4MiB", "--deep", "--deep --width 960"])
+def test_frames_in_strips_and_deep_ones_that_show_nothing(
+    flags: str, shot: list[str], tmp_path: Path, capsys: Capture
+) -> None:
+    away = hidden_model(5)
+    away.means += np.float32(1000)
+    away.save(tmp_path / "away.ply")
+    for model, blank in ((str(tmp_path / "away.ply"), True), (shot[0], False)):
+        assert render([model, *shot[1:]], tmp_path, "--json", "--frames", "2", "--overwrite", *flags.split()) == 0
+        captured = capsys.readouterr()
+        assert json.loads(captured.out)[0]["blank"] is blank
+        assert ("1 of 1 frames show nothing of the model: 2; are the cameras" in captured.err) is blank
+
+
 @pytest.mark.parametrize("extension", ["png", "jpg", "tif", "exr"])
 def test_pictures_of_others_are_left(extension: str, shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     pattern, photo = f"a.####.{extension}", tmp_path / f"a.0002.{extension}"

@@ -91,6 +91,12 @@ def test_a_folder_that_takes_nothing_is_no_error(fresh: Device, tmp_path: Path) 
     assert load(fresh) is None
 
 
+def test_a_folder_of_blanks_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    for blanks in ("", " "):
+        monkeypatch.setenv(binaries.FOLDER, blanks)
+        assert binaries.folder().name == "binaries"
+
+
 def test_the_oldest_files_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(binaries, "MOST_BYTES", 30)
     for age in range(5):

@@ -326,12 +326,22 @@ def test_wrong_calls_are_one_line(reported: Path, tmp_path: Path, capsys: Captur
         (["report", str(reported / "model.ply")], "no such folder, expected a run"),
         (["report", str(reported), "-o", str(tmp_path / "a" / "b.html")], "no such folder, expected one for b.html"),
         (["report", str(reported), "-o", str(tmp_path)], "is a folder, expected the name of a file"),
+        (
+            ["report", str(reported), "-o", str(tmp_path / "x.txt")],
+            "x.txt: its ending is .txt, expected .html or .htm: a page is written",
+        ),
+        (["report", str(reported), "-o", str(tmp_path / "page")], "page: its ending is none, expected .html or .htm"),
+        (
+            ["compare", str(reported), str(reported), "-o", str(tmp_path / "x.json")],
+            "x.json: its ending is .json, expected .html or .htm",
+        ),
         (["report", str(reported), "--views", "-1"], "--views -1: expected at least 0"),
         (["compare", str(reported)], "expected at least two runs"),
         (["compare", str(reported), str(tmp_path)], "not a run"),
     ):
         assert main(call) == 2, call
         assert words in error_line(capsys)
+    assert not list(tmp_path.iterdir())
 
 
 # What training does for it

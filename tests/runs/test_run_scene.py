@@ -15,6 +15,7 @@ from calls import train as command_train
 from quick import quick
 from tiny import short, write_scene
 
+from clsplat.api import train
 from clsplat.cli.main import main, parse
 from clsplat.cli.train import Train
 from clsplat.config.training import TrainConfig
@@ -201,3 +202,47 @@ def test_all_display_options_beside_resume(tmp_path: Path) -> None:
     verb = parse(["train", "-o", str(tmp_path), "--resume", *" ".join(DISPLAY).split()])
     assert isinstance(verb, Train)
     assert (verb.json, verb.view, verb.page.port, verb.accept_changes, verb.resume) == (True, True, 9, True, True)
+
+
+@pytest.fixture
+def foreign(run: Path, own: Path, tmp_path: Path) -> Path:
+    """The run with the checkpoint of a run of another scene in it, of the same settings."""
+    brighten(own / "images" / "03.png")
+    assert command_train(own, tmp_path / "foreign", FEW) == 0
+    shutil.copy(tmp_path / "foreign" / "checkpoints" / "step-0000003.npz", run / "checkpoints")
+    return run
+
+
+def test_a_checkpoint_of_another_scene_is_refused(foreign: Path, scene: Path, capsys: Capture) -> None:
+    line = refusal(foreign, scene, capsys)
+    named = f"{foreign / 'checkpoints' / 'step-0000003.npz'}: is of a training on another scene than {foreign} is of"
+    assert f"{named}, expected one of this run; remove it, or --accept-changes goes on from it" in line
+    with pytest.raises(InputError, match="is of a training on another scene"):
+        train(load_scene(scene), replace(FEW, iterations=4), run=Run.open(foreign), resume=True)
+    assert resume(foreign, scene, "--accept-changes") == 0
+    assert resume(foreign, scene, "--iterations", "5") == 0, "from now on it is of this run"
+
+
+def test_a_checkpoint_without_a_scene_is_taken(run: Path, scene: Path) -> None:
+    """As earlier versions have written it."""
+    path = run / "checkpoints" / "step-0000003.npz"
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    record = json.loads(arrays["state.json"].tobytes())
+    assert len(record["state"].pop("scene")) == 32
+    arrays["state.json"] = np.frombuffer(json.dumps(record).encode(), np.uint8)
+    np.savez(path, **arrays)
+    assert resume(run, scene) == 0
+
+
+def test_a_checkpoint_outlives_changes_that_are_accepted(run: Path, own: Path) -> None:
+    """A run that is ended before its next checkpoint."""
+    own_scene = load_scene(own)
+    brighten(own / "images" / "03.png")
+    for resolution in (0, 40):
+        changed = load_scene(own, resolution=resolution)
+        opened = Run.open(run)
+        opened.config = replace(opened.config, resolution=resolution)
+        scene_record.write(opened, changed)
+        assert not scene_record.check(opened, changed, own, resolution)
+    assert scene_record.known_digests(Run.open(run)) >= {scene_record.digest_of(scene_record.record_of(own_scene, 0))}

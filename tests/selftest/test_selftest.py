@@ -158,6 +158,13 @@ def test_a_change_of_words_that_are_not_there(default_device: Device, monkeypatc
         default_device.with_shape().kernels("blend")
 
 
+def test_a_change_of_a_kernel_that_is_not_there(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(BREAK, "blender: alpha => beta")
+    known = r"blender is no kernel, expected one of adam, arithmetic, blend and \d+ more$"
+    with pytest.raises(InputError, match=known):
+        default_device.with_shape().kernels("scan")
+
+
 def test_errors_in_ulp() -> None:
     one = np.array([1.0, 1.0])
     assert error_of(np.array([1.0, 1.0 + 2.0**-23]), one) == (2.0**-23, 1.0)

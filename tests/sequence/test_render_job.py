@@ -348,3 +348,38 @@ def test_the_digest_goes_by_what_a_colour_configuration_says(tmp_path: Path) -> 
     assert found(there) == before
     there.write_text("two")
     assert found(there) != before
+
+
+@pytest.mark.parametrize(
+    "paths",
+    [
+        "search_path: luts:other",
+        "search_path: [other, luts]",
+        "search_path:\n  - other\n  - luts",
+        'search_path: "$LUTS"',
+    ],
+)
+@pytest.mark.parametrize(
+    "named",
+    ["{src: film.cube}", '{src: "film.cube", interpolation: linear}', "\n    src: film.cube", "{src: $LOOK.cube}"],
+)
+def test_the_digest_goes_by_the_tables_that_a_colour_configuration_names(
+    paths: str, named: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "show [1]" / "luts"
+    folder.mkdir(parents=True)
+    config, table, other = folder.parent / "a.ocio", folder / "film.cube", folder / "film.txt"
+    config.write_text(f"ocio_profile_version: 2\n{paths}\nlooks:\n  - transform: !<FileTransform> {named}\n")
+
+    def found() -> str:
+        pictures = PictureConfig(ColourConfig(ocio_config=str(config)))
+        return settings_digest(tasks_in(tmp_path)[0], replace(OPTIONS, pictures=pictures))
+
+    digests = [found()]
+    for content in ("one", "two"):
+        table.write_text(content)
+        os.utime(table, ns=(len(digests), len(digests)))  # clocks of file systems may be slow
+        digests.append(found())
+    assert len(set(digests)) == 3
+    other.write_text("nobody names it")
+    assert found() == digests[-1]

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -22,6 +22,8 @@ from tiny import short, write_scene
 import clsplat
 from clsplat.api import train
 from clsplat.cli.main import main
+from clsplat.config.presets import Preset, Schedule, bundled
+from clsplat.config.training import OptimiserConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.images.reading import read_image
@@ -29,6 +31,7 @@ from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
 from clsplat.scenes import doubts
 from clsplat.scenes.scene import load_scene
+from clsplat.training.loop import late_settings
 
 FEW = short(iterations=3, sh_degree_every=1, report=False, density={"every": 0})
 
@@ -179,3 +182,49 @@ def test_an_evaluation_of_a_model_that_is_not_seen_says_so(run: Path, capfd: Cap
     model.save(run / "model.ply")
     assert main(["eval", str(run)]) == 0
     assert "no Gaussian is seen by any of the 2 held-out views" in capfd.readouterr().err
+
+
+LATE = {
+    "prune": (
+        {"density": {"every": 0, "prune_at": (2, 5, 9), "prune_fraction": 0.1}},
+        "--density.prune-at 5,9: nothing is pruned then, training ends at step 3; expected at most --iterations 3",
+    ),
+    "cooldown": (
+        {"optimiser": OptimiserConfig(cooldown=6, cooldown_to=0.25)},
+        (
+            "--optimiser.cooldown 6: the learning rates begin at 0.5 of what they are, training has 3 steps; expected "
+            "at most --iterations 3"
+        ),
+    ),
+    "warmup": (
+        {"warmup": (1, 3, 9)},
+        (
+            "--warmup 3,9: the training resolution does not double then, training ends at step 3 at 1/4 of the size; "
+            "expected less than --iterations 3"
+        ),
+    ),
+    "frequency": (
+        {"frequency_steps": 500},
+        (
+            "--frequency-steps 500: the training resolution does not rise to the full size, training ends at step 3; "
+            "expected at most --iterations 3"
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LATE)
+def test_what_comes_after_the_last_step_is_told(name: str, scene: Path, default_device: Device) -> None:
+    settings, text = LATE[name]
+    config = short(**{"iterations": 3, "report": False, "warmup": (), "density": {"every": 0}, **settings})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        train(load_scene(scene), config, device=default_device)
+    assert [str(each.message) for each in caught if "--iterations" in str(each.message)] == [text]
+
+
+def test_defaults_are_silent_for_every_number_of_iterations() -> None:
+    for iterations in (*range(1, 40), 249, 250, 251, 499, 500, 7000):
+        for preset in get_args(Preset):
+            for schedule in (None, *get_args(Schedule)):
+                assert list(late_settings(bundled(preset, schedule, iterations))) == []

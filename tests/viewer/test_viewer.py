@@ -22,6 +22,8 @@ from viewer_browser import clsplat
 
 from clsplat.cli.main import main, parse
 from clsplat.cli.train import Train
+from clsplat.errors import InputError
+from clsplat.images.colour import LINEAR, comment
 from clsplat.runs.run import Run
 from clsplat.viewer.server import Address, refused
 
@@ -50,6 +52,16 @@ def test_a_model_without_gaussians(tmp_path: Path, capsys: Capture) -> None:
     random_gaussians(0).save(tmp_path / "empty.ply")
     assert main(["view", str(tmp_path / "empty.ply"), "--port", "0"]) == 2
     assert "empty.ply" in error_line(capsys)
+
+
+def test_the_page_has_the_models_colour_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    def shown(*given: object) -> None:
+        raise InputError(f"shown in {given[4:]}")
+
+    monkeypatch.setattr("clsplat.viewer.models.HeldModel", shown)
+    random_gaussians(5).save(tmp_path / "linear.ply", comments=[comment(LINEAR)])
+    assert main(["view", str(tmp_path / "linear.ply"), "--port", "0"]) == 2
+    assert f"shown in ('{LINEAR}',)" in error_line(capsys)
 
 
 def test_a_scene_that_is_missing(model: Path, tmp_path: Path, capsys: Capture) -> None:

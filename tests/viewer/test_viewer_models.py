@@ -15,6 +15,7 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
 from clsplat.gaussians import Gaussians
+from clsplat.images.colour import LINEAR, SRGB, displayed
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.training.trainer import Trainer
@@ -50,6 +51,22 @@ def test_every_mode_is_the_renderers(default_device: Device) -> None:
         assert got.std() > 1, mode
 
 
+def test_a_linear_model_is_shown_in_srgb(default_device: Device) -> None:
+    """As `clsplat render --colorspace sRGB` writes it; what is no colour stays as it is."""
+    gaussians, background = hidden_model(), (0.2, 0.3, 0.4)
+    config = RasterizerConfig()
+    plain, linear = (HeldModel(gaussians, default_device, config, background, space) for space in (SRGB, LINEAR))
+    frame = Renderer(default_device).render(gaussians, CAMERA, background)
+    shown = colour_picture(displayed(frame.image, LINEAR))
+    assert (shown[0, 0] > colour_picture(frame.image)[0, 0] + 50).all(), "the background too"
+    for look in (Look(), Look(size=0.5)):
+        assert (linear.picture(CAMERA, look, exact=True)[0] >= plain.picture(CAMERA, look, exact=True)[0]).all()
+    np.testing.assert_array_equal(linear.picture(CAMERA, Look(), exact=True)[0], shown)
+    for mode in ("alpha", "depth", "count"):
+        pictures = [model.picture(CAMERA, Look(mode), exact=True)[0] for model in (plain, linear)]  # type: ignore[arg-type]
+        np.testing.assert_array_equal(*pictures)
+
+
 def test_drafts_are_near_and_leave_exact_ones_alone(default_device: Device) -> None:
     model = HeldModel(hidden_model(), default_device, RasterizerConfig(), BLACK)
     exact, _ = model.picture(CAMERA, Look(), exact=True)
@@ -80,6 +97,15 @@ def test_a_model_far_from_the_origin(default_device: Device) -> None:
         near.camera(), Look(), exact=True
     )
     assert np.abs(got.astype(int) - wanted).max() <= 1  # the camera is known to 1e-9 of a unit there
+
+
+def test_a_training_on_linear_photographs_is_shown_in_srgb(default_device: Device, photographs: Scene) -> None:
+    views = [replace(view, path=view.path.with_suffix(".exr")) for view in photographs.views]
+    trainer = Trainer(photographs, CONFIG, default_device)
+    as_it_is, _ = LiveModel(trainer, BLACK).picture(CAMERA, Look(), exact=True)
+    trainer.scene = replace(photographs, views=views)
+    brighter, _ = LiveModel(trainer, BLACK).picture(CAMERA, Look(), exact=True)
+    assert brighter.mean() > as_it_is.mean() + 5
 
 
 def test_other_models_make_room(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR
+from clsplat.config.checks import misfit
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
@@ -186,7 +187,7 @@ def write(
     check_comments(comments)
     values.check_writable(Path(path), gaussians)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    if not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
+    if misfit(int, degree) or not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
         raise ValueError(f"sh_degree {degree}: expected {gaussians.sh_degree} (the model's) to {MAX_SH_DEGREE}")
     stored, padded = gaussians.sh.shape[1] - 1, (degree + 1) ** 2 - 1
     rest_names = [f"f_rest_{index}" for index in range(3 * padded)]
