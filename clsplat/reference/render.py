@@ -52,13 +52,12 @@ def forward(
     camera: Camera,
     background: Sequence[float] | Float64 = BLACK,
     sh_degree: int | None = None,
-    margins: bool = False,
 ) -> Forward:
     """Project, sort, blend; sh_degree None uses all bands there are."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     projected = project(**parameters(gaussians), camera=camera, sh_degree=degree)
     order = depth_order(projected.depths, projected.visible)
-    return Forward(projected, order, blend(projected, order, camera.width, camera.height, background, margins))
+    return Forward(projected, order, blend(projected, order, camera.width, camera.height, background))
 
 
 def render(

@@ -151,4 +151,4 @@ class Bench:
         splats = self.splats()
         order = depth_order(splats.depths, splats.visible)
         camera, background = self.camera, self.frozen.background.astype(np.float64)
-        return reference_blend.blend(splats, order, camera.width, camera.height, background, margins=True)
+        return reference_blend.blend(splats, order, camera.width, camera.height, background)

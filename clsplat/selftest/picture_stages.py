@@ -83,7 +83,6 @@ def _channels(bench: Bench) -> Outcome:
     order = depth_order(splats.depths, splats.visible)
     wanted = reference_channels.channels(splats, order, camera, _after(camera), **_geometry(bench))
     means, whole = (cropped(planes, camera) for planes in arrays)
-    assert frame.margin is not None
     sure = (frame.margin > MARGIN) & (wanted.doubt > DOUBT)
     # a sum that cancels, as normals may where little is opaque, has no digits of its own
     solid = sure & (frame.transmittance < 0.5)
@@ -107,7 +106,6 @@ def _deep(bench: Bench) -> Outcome:
         lambda: deep(device, bench.work, given, *arguments), lambda slices: [slices.get()]
     )
     splats, margin = bench.splats(), bench.blend_reference().margin
-    assert margin is not None
     order = depth_order(splats.depths, splats.visible)
     wanted = reference_deep.deep(splats, order, camera.width, camera.height, bounds)[:, margin > MARGIN]
     got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, margin > MARGIN]
