@@ -121,7 +121,7 @@ def _duplicate(bench: Bench) -> Outcome:
         return duplicate(device, work, projected.splats, bench.counted, bench.tiles, bench.band)
 
     bench.pairs, arrays, ms, trouble = bench.twice(
-        launch, lambda pairs: [pairs.tile_keys.get(), pairs.pair_ids.get(), pairs.first_slots.get()]
+        launch, lambda pairs: [pairs.tile_keys.get(), pairs.pair_ids.get(), bench.counted.first_slots.get()]
     )
     tile_keys, ids, first_slots = arrays
     counts, got = projected.tile_counts.get().astype(np.int64), bench.splats()
@@ -190,7 +190,6 @@ def _blend(bench: Bench) -> Outcome:
         lambda blended: [blended.image.get(), blended.transmittance.get(), blended.stops.get()],
     )
     wanted = bench.blend_reference()
-    assert wanted.margin is not None
     clear = wanted.margin > MARGIN
     image, transmittance = (cropped(planes, camera)[clear] for planes in arrays[:2])
     parts = {
@@ -228,7 +227,6 @@ def _pixels(bench: Bench, planes: Array) -> Float64:
 def _blend_grad(bench: Bench) -> Outcome:
     device, camera, splats = bench.device, bench.camera, bench.splats()
     margin = bench.blend_reference().margin
-    assert margin is not None
     planes = padded(camera, 31, -0.5, 0.5)
     exact = planes.copy()
     exact[:, : camera.height, : camera.width] *= margin > MARGIN
