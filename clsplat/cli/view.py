@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians
     from clsplat.scenes.scene import Scene
     from clsplat.viewer.models import HeldModel
-    from clsplat.viewer.server import Server, World
+    from clsplat.viewer.page import World
+    from clsplat.viewer.server import Server
     from clsplat.viewer.training_view import TrainingView
 
 FIRST = (640, 360)
@@ -90,9 +91,10 @@ def training_view(options: PageOptions, config: TrainConfig) -> Callable[[Scene]
     """The page of a training, which is open as long as the context is. Raises InputError where it cannot be served, at
     once, before anything is trained or written."""
     from clsplat.images.alpha import background_colour
+    from clsplat.viewer.page import World
     from clsplat.viewer.pose import extent_of, start_of
     from clsplat.viewer.scheduler import Viewing
-    from clsplat.viewer.server import Address, Server, World
+    from clsplat.viewer.server import Address, Server
     from clsplat.viewer.training_view import TrainingView
 
     address = Address(options.host, options.port, options.paths)
@@ -125,8 +127,8 @@ def _scene(services: Services, path: Path | None, config: TrainConfig, *, given:
 
 
 def _world(gaussians: Gaussians, scene: Scene | None, title: str) -> World:
+    from clsplat.viewer.page import World
     from clsplat.viewer.pose import extent_of, start_of
-    from clsplat.viewer.server import World
 
     views = scene.views if scene else []
     low, high = extent_of(gaussians.means)

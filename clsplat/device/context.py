@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -14,18 +14,16 @@ import numpy as np
 import pyopencl as cl
 
 from clsplat.device.account import Memory
-from clsplat.device.buffers import allocate
 from clsplat.device.child import patience
 from clsplat.device.known import tell_once
-from clsplat.device.launch import launch_groups
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Recorder
-from clsplat.device.program import Kernels, build, variant_of
-from clsplat.device.quirks import compiles_by_size, kind_of, no_device
+from clsplat.device.program import Kernel, Kernels, build, variant_of
+from clsplat.device.quirks import compiles_by_size, kind_of, no_device, title
 from clsplat.device.rehearsal import Rehearsal
 from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text, why_another
 from clsplat.device.source import kernel_source
-from clsplat.errors import DeviceError
+from clsplat.errors import DeviceError, DriverError
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ class Device:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
         self._switches: Mapping[str, object] = {}
-        self.recorder = Recorder()
+        self.recorder = Recorder(self.queue)
         self.rehearsal = Rehearsal(device, all_devices().index(device), self.shape.label)
         self._fma: list[dict[str, object]] = []
 
@@ -170,6 +168,28 @@ class Device:
         begin at multiples of it; and whole vectors of lanes."""
         return max(int(self.cl_device.mem_base_addr_align) // 32, self.shape.lanes, 32)
 
+    def enqueue(
+        self,
+        kernel: Kernel,
+        size: tuple[int, ...],
+        local: tuple[int, ...] | None,
+        values: Sequence[Any],
+        *,
+        wait: bool = False,
+    ) -> cl.Event:
+        """Put a kernel on the queue, and wait for it if asked to. Raises DriverError."""
+        try:
+            event = kernel.cl_kernel(self.queue, size, local, *values)
+            if wait:  # so that the last kernel that was named is the one that fails
+                self.finish()
+        except cl.Error as error:
+            text = " ".join(str(error).split())
+            where = f"{kernel.variant.stem}.cl, {kernel.name}"
+            raise DriverError(
+                f"{title(self.cl_device)}, kernels in the shape {self.shape.label}: {where}, cannot be launched: {text}"
+            ) from None
+        return event
+
     def finish(self) -> None:
         """Wait until the device has nothing to do."""
         self.queue.finish()
@@ -182,10 +202,14 @@ class Device:
         """
         if self.shape.lanes == 1:
             return {}
-        kernels = self._built("probe", {"FMA_BY_CONTRACTION": True})
-        out = allocate(self, (2 * self.shape.lanes,), np.float32)
-        launch_groups(self, kernels.probe_fma, 1, 1, out, 1 + 2.0**-12, -(1 + 2.0**-11))
-        return {"FMA_BY_CONTRACTION": True} if np.all(out.get() == np.float32(2.0**-24)) else {}
+        fused: dict[str, object] = {"FMA_BY_CONTRACTION": True}
+        kernel, results = self._built("probe", fused).probe_fma, np.empty(2 * self.shape.lanes, np.float32)
+        buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, results.nbytes)
+        values = (buffer, np.float32(1 + 2.0**-12), np.float32(-(1 + 2.0**-11)))
+        self.rehearsal.launch(kernel, (1,), (1,), values)
+        self.enqueue(kernel, (1,), (1,), values)
+        cl.enqueue_copy(self.queue, results, buffer, is_blocking=True)
+        return fused if np.all(results == np.float32(2.0**-24)) else {}
 
     def __repr__(self) -> str:
         return f"<Device {self.name} | {self.driver.split('  ')[0].strip()} | {self.shape.label}>"

@@ -14,20 +14,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import clsplat
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import digest
 from clsplat.gaussians import Gaussians
+from clsplat.images.video import VideoWriter
 from clsplat.sequence.existing import is_complete, remove_temporaries, stamp
 from clsplat.sequence.frame_renderer import FrameRenderer, open_frame_renderer
 from clsplat.sequence.task import Record, RenderOptions, Task
 from clsplat.sequence.workers import HOST_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
-
-if TYPE_CHECKING:
-    from clsplat.images.video import VideoWriter
 
 THREADS = 2
 """Threads of a local worker: one frame is encoded while the next is rendered."""
