@@ -14,7 +14,7 @@ import pyopencl as cl
 
 from clsplat.device import known
 from clsplat.device.child import regardless
-from clsplat.device.quirks import kind_of, most_lanes
+from clsplat.device.quirks import kind_of, most_lanes, title
 from clsplat.errors import DeviceError, reason_of
 from clsplat.files import atomic_write, parse_json
 
@@ -91,7 +91,7 @@ def wanted_shape(device: cl.Device) -> Shape:
     default = default_shape(device)
     text = asked_shape()
     if not text:
-        text = saved_shapes().get(_key(device), "")
+        text = saved_shapes().get(known.device_key(device), "")
         shape = _parsed(text, default)
         return default if shape is None or shape.items > most_items(device) else shape
     shape = _parsed(text, default)
@@ -152,9 +152,8 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
     """The warning that another shape is taken."""
-    driver = device.platform.version.split("  ")[0].strip()
     return (
-        f"{device.name.strip()}, {driver}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
+        f"{title(device)}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
         f"taken (clsplat selftest tries {wanted.label} anew)"
     )
 
@@ -199,13 +198,9 @@ def save_shape(device: cl.Device, shape: Shape | None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         saved = saved_shapes()
-    saved.pop(_key(device), None)
+    saved.pop(known.device_key(device), None)
     if shape is not None:
-        saved[_key(device)] = shape.label
+        saved[known.device_key(device)] = shape.label
     path = saved_path()
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, (json.dumps(saved, indent=2, sort_keys=True) + "\n").encode())
-
-
-def _key(device: cl.Device) -> str:
-    return f"{device.name.strip()} | {device.platform.version.strip()} | {device.driver_version.strip()}"
