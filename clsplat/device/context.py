@@ -21,7 +21,7 @@ from clsplat.device.profile import Recorder
 from clsplat.device.program import Kernel, Kernels, build, variant_of
 from clsplat.device.quirks import compiles_by_size, kind_of, no_device, title
 from clsplat.device.rehearsal import Rehearsal
-from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text, why_another
+from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError, DriverError
 
@@ -88,8 +88,7 @@ class Device:
         self.name = device.name.strip()
         self.driver = device.platform.version.strip()
         self.kind = kind_of(device)
-        self.shape = shape or shape_of(device)
-        self._why_another = why if shape else why_another(device, self.shape)
+        self.shape, self._why_another = (shape, why) if shape else shape_of(device)
         self.only_tries = False
         self.compiles_by_size = compiles_by_size(device)
         self.max_allocation = int(device.max_mem_alloc_size)
@@ -221,21 +220,19 @@ def select(selector: str | None) -> cl.Device:
     Without one: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
     """
     patience()  # what the environment says of drivers is looked at before it is needed
-    devices, infos = all_devices(), list_devices()
+    devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
         raise no_device()
     named = f"--device {selector}" if selector else f"CLSPLAT_DEVICE={os.environ.get('CLSPLAT_DEVICE', '')}"
     selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
     if selector is None:
-        return next((d for d, i in zip(devices, infos, strict=True) if i.kind == "gpu"), devices[0])
-    if selector.isdigit() and int(selector) < len(devices):
-        return devices[int(selector)]
+        return next((device for device, info in devices if info.kind == "gpu"), devices[0][0])
     wanted = selector.lower()
-    for device, info in zip(devices, infos, strict=True):
+    for device, info in devices:
         words = f"{info.name} {info.platform} {info.version}".lower()
-        if not selector.isdigit() and (wanted == info.kind or wanted in words):
+        if int(wanted) == info.index if wanted.isdigit() else wanted == info.kind or wanted in words:
             return device
-    names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for info in infos)
+    names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for _, info in devices)
     raise DeviceError(f"{named}: no such device, expected cpu, gpu, a part of a name, or an index of these: {names}")
 
 
@@ -246,8 +243,7 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 
 @lru_cache(maxsize=8)
-def _open(index: int, shape: Shape) -> Device:
-    why = why_another(all_devices()[index], shape)
+def _open(index: int, shape: Shape, why: str) -> Device:
     return Device(all_devices()[index], shape, why=why)
 
 
@@ -257,5 +253,5 @@ def open_device(selector: str | None = None, memory_limit: int | None = None) ->
     memory_limit: bytes that the buffers of this object's users may take together.
     """
     chosen: Any = select(selector)
-    device = _open(all_devices().index(chosen), shape_of(chosen))
+    device = _open(all_devices().index(chosen), *shape_of(chosen))
     return device if memory_limit is None else device.with_memory_limit(memory_limit)

@@ -114,28 +114,21 @@ def failures(device: cl.Device) -> dict[str, str]:
     return {label: entry.failed for label, entry in known.entries(device).items() if entry.failed}
 
 
-def shape_of(device: cl.Device) -> Shape:
-    """The shape that a device gets which is opened without another: `wanted_shape`, or the first other one where the
-    driver has failed in that before. Raises DeviceError as `wanted_shape`."""
+def shape_of(device: cl.Device) -> tuple[Shape, str]:
+    """The shape that a device gets which is opened without another: `wanted_shape`, or, with the warning, the first
+    other one where the driver has failed in that before. Raises DeviceError as `wanted_shape`."""
     wanted, failed = wanted_shape(device), failures(device)
-    if wanted.label not in failed:
-        return wanted
-    others = (shape for shape in shapes_in_turn(device) if shape.label not in failed)
-    return next(others, wanted)  # with none left it is told when it fails again
-
-
-def why_another(device: cl.Device, shape: Shape) -> str:
-    """The warning that this shape is taken, as the driver has failed in the one that is wanted; or nothing."""
-    wanted, failed = wanted_shape(device), failures(device)
-    if shape == wanted or wanted.label not in failed:
-        return ""
-    return instead(device, wanted, shape, failed[wanted.label])
+    if wanted.label in failed:
+        for other in shapes_in_turn(device):
+            if other.label not in failed:
+                return other, instead(device, wanted, other, failed[wanted.label])
+    return wanted, ""  # with none left it is told when it fails again
 
 
 def shape_text(device: cl.Device) -> str:
     """The shape in the list of devices, or that the device cannot take what CLSPLAT_SHAPE asks for."""
     try:
-        shape = shape_of(device)
+        shape, _ = shape_of(device)
     except DeviceError:
         return f"too small for CLSPLAT_SHAPE={asked_shape()}"
     return f"{shape.lanes} lanes x {shape.items} items"
