@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 import clsplat
 from clsplat.device import cl
 from clsplat.device.context import Device
-from clsplat.device.layout import SlotFields
 from clsplat.errors import CapacityError
+from clsplat.rendering.contributions import sums_of_weights
 from clsplat.stages.device_gaussians import HostGaussians
-from clsplat.stages.project import add_slots
 
 if TYPE_CHECKING:
     from clsplat.training.trainer import Trainer
@@ -100,18 +99,13 @@ def largest_contributions(trainer: Trainer, seconds: float = SECONDS) -> tuple[N
     It looks at as many training views, spread evenly, as `seconds` allow. Changes nothing that training goes by. Raises
     CapacityError.
     """
-    device, rasterizer, views = trainer.device, trainer.rasterizer, trainer.views
-    fields, looked = SlotFields(contributions=True), 0
+    rasterizer, views, looked = trainer.rasterizer, trainer.views, 0
     largest: NDArray[np.float32] = np.zeros(trainer.parameters.count, np.float32)
     start = time.perf_counter()
     for index in _spread(len(views)):
         camera = trainer.local(views[index].camera)
         frame = rasterizer.forward(trainer.parameters, camera, trainer.background)
-        slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=fields)  # weights are of any gradient
-        sums = slots.values
-        if slots.first_slots is not None:
-            sums = add_slots(device, rasterizer.work, frame.projected.tile_counts, slots, None, fields=fields)
-        np.maximum(largest, sums.get()[:, -1], out=largest)
+        np.maximum(largest, sums_of_weights(rasterizer, frame), out=largest)
         looked += 1
         if looked == 1:
             start = time.perf_counter()  # kernels may have been built
