@@ -62,12 +62,11 @@ class _Held:
 
     def __init__(self) -> None:
         self.turn, self.room = threading.Lock(), threading.Semaphore(HELD)
-        self.key: tuple[Any, ...] | None = None
+        self.key: str | None = None
         self.renderer: FrameRenderer | None = None
 
     def renderer_for(self, job: WorkerJob) -> FrameRenderer:
-        key = (job.model, job.digest, job.device, job.memory_limit, repr(job.options), repr(job.rasterizer))
-        if self.renderer is None or key != self.key:
+        if self.renderer is None or repr(job) != self.key:
             self.key = self.renderer = None  # its memory is free before the next takes some
             gaussians = Gaussians.load(job.model)
             if (content := digest(job.model)) != job.digest:
@@ -75,7 +74,7 @@ class _Held:
             self.renderer = open_frame_renderer(
                 gaussians, job.options, job.rasterizer, device=job.device, memory_limit=job.memory_limit
             )
-            self.key = key
+            self.key = repr(job)
         return self.renderer
 
 

@@ -122,10 +122,7 @@ def open_frame_renderer(
     memory_limit: int | None = None,
     profile: bool = False,
 ) -> FrameRenderer:
-    """A renderer of frames of the model on the device that `device` names. Raises DeviceError.
-
-    profile: note what the device is busy with.
-    """
+    """A renderer of frames of the model on the device that `device` names. Raises DeviceError."""
     if profile:
         opened = Device(select(device), profile=True)
         opened.memory.limit = memory_limit

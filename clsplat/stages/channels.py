@@ -71,7 +71,6 @@ class Channels:
     """Planes padded to whole tiles: means (floats + 2, rows, stride) of the features and, behind them, DEPTHS; whole
     (2, rows, stride): WHOLE. `Features.named` takes them apart."""
 
-    features: Features
     means: DeviceArray
     whole: DeviceArray
 
@@ -127,4 +126,4 @@ def channels(
     arrays = (lists.ranges, lists.gaussian_from_sorted, projected.splats, rows, blended.stops, means, whole)
     rays = (camera_array,) if device.switched("RAYS") else ()
     launch_tiles(device, "channels", wanted.defines, lists, stride // TILE, height, *arrays, *rays)
-    return Channels(wanted, means, whole)
+    return Channels(means, whole)
