@@ -11,6 +11,7 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,7 +70,7 @@ def choose(trials: list[Trial]) -> Shape:
 
 
 def _in_a_process(index: int, shape: Shape) -> float | None:
-    with Child(python_module("clsplat.bench.shapes", str(index), str(shape.lanes), str(shape.items))) as child:
+    with closing(Child(python_module("clsplat.bench.shapes", str(index), str(shape.lanes), str(shape.items)))) as child:
         try:
             answer = child.receive(patience())
         except TimeoutError:

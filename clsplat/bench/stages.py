@@ -121,7 +121,7 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> tuple[f
     for _ in range(repeat):
         walls.append(wall_ms(device, work))
         for records, wait in ((by_events, False), (by_waiting, True)):
-            with device.recorder.recording(device, wait=wait) as stages:
+            with device.recorder.recording(wait=wait) as stages:
                 work()
             records.append(stages)
     by_wall = not any(record.ms for stages in by_events for record in stages.values())

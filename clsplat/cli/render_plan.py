@@ -74,7 +74,7 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
         "devices": [
             {
                 "device": device.device,
-                "needed": device.plan.needed,
+                "needed": device.plan.need.total,
                 "allowed": device.plan.allowed,
                 "pieces": any(device.plan.pieces),
                 "strips": device.strips,
@@ -133,7 +133,7 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
             sizes = (on_tiles(part)[0], job.verb.rasterizer, floats_beside, planes)
             plan = plan_frame(device, len(job.gaussians), floats, *sizes)
             plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
-    return max(plans, key=lambda device: device.plan.needed)
+    return max(plans, key=lambda device: device.plan.need.total)
 
 
 def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:

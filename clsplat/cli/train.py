@@ -140,7 +140,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
 
     def print_plan(plan: Plan) -> None:
         if device.memory.limit is not None or any(plan.pieces):
-            print(f"{plan.gaussians:,} Gaussians: {plan}", file=sys.stderr)
+            print(f"{plan.need.gaussians:,} Gaussians: {plan}", file=sys.stderr)
 
     how = {"device": device, "run": run, "resume": run.resuming, "on_plan": print_plan}
     try:

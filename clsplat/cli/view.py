@@ -56,9 +56,10 @@ def run(verb: View, services: Services) -> int:
     from clsplat.selftest.result import FORWARD
     from clsplat.viewer.appearance import Look
     from clsplat.viewer.models import HeldModel
+    from clsplat.viewer.page import World
     from clsplat.viewer.pose import extent_of, looking, start_of
     from clsplat.viewer.scheduler import Viewing
-    from clsplat.viewer.server import Address, Server, World
+    from clsplat.viewer.server import Address, Server
     from clsplat.viewer.training_view import LONGEST_WAIT
 
     address = Address(verb.page.host, verb.page.port, verb.page.paths)
@@ -97,9 +98,10 @@ def training_view(options: PageOptions, config: TrainConfig) -> Callable[[Scene]
     """The page of a training, which is open as long as the context is. Raises InputError where it cannot be served, at
     once, before anything is trained or written."""
     from clsplat.images.alpha import background_colour
+    from clsplat.viewer.page import World
     from clsplat.viewer.pose import extent_of, start_of
     from clsplat.viewer.scheduler import Viewing
-    from clsplat.viewer.server import Address, Server, World
+    from clsplat.viewer.server import Address, Server
     from clsplat.viewer.training_view import TrainingView
 
     address = Address(options.host, options.port, options.paths)

@@ -35,15 +35,12 @@ def folder() -> Path:
     return Path(os.environ.get(FOLDER, "").strip() or cache_folder() / "binaries")
 
 
-def _processor() -> str:
-    """The processor's features, where the system tells them. Its name is not enough: a home may serve many machines."""
-    return " ".join((platform.machine(), platform.processor(), *sorted(features())))
-
-
 def _path(device: cl.Device, digest: str) -> Path:
     settings = sorted(f"{name}={value}" for name, value in os.environ.items() if name.startswith(TARGET))
     driver = (device.name, device.platform.version, device.driver_version)
-    key = "\0".join((digest, *driver, _processor(), *settings))
+    # a processor's name is not enough: a home may serve many machines
+    processor = " ".join((platform.machine(), platform.processor(), *sorted(features())))
+    key = "\0".join((digest, *driver, processor, *settings))
     return folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.bin"
 
 

@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike, NDArray
 
+from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError, amount
-
-if TYPE_CHECKING:
-    from clsplat.device.context import Device
 
 
 @dataclass(frozen=True, eq=False)

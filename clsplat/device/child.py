@@ -15,7 +15,7 @@ import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import IO, Any
 
 from clsplat.errors import DriverError, InputError, switched_on
@@ -214,14 +214,6 @@ class Child:
         assert self._process.stdin is not None
         with suppress(OSError):  # closing writes what the process never read
             self._process.stdin.close()
-
-    def __enter__(self) -> Child:  # noqa: PYI034  # Self came with Python 3.11
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 _NO_PYTHON = (

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -14,18 +14,16 @@ import numpy as np
 import pyopencl as cl
 
 from clsplat.device.account import Memory
-from clsplat.device.buffers import allocate
 from clsplat.device.child import patience
 from clsplat.device.known import tell_once
-from clsplat.device.launch import launch_groups
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Recorder
-from clsplat.device.program import Kernels, build, variant_of
-from clsplat.device.quirks import compiles_by_size, kind_of, no_device
+from clsplat.device.program import Kernel, Kernels, build, variant_of
+from clsplat.device.quirks import compiles_by_size, kind_of, no_device, title
 from clsplat.device.rehearsal import Rehearsal
-from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text, why_another
+from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text
 from clsplat.device.source import kernel_source
-from clsplat.errors import DeviceError
+from clsplat.errors import DeviceError, DriverError
 
 
 @dataclass(frozen=True)
@@ -90,8 +88,7 @@ class Device:
         self.name = device.name.strip()
         self.driver = device.platform.version.strip()
         self.kind = kind_of(device)
-        self.shape = shape or shape_of(device)
-        self._why_another = why if shape else why_another(device, self.shape)
+        self.shape, self._why_another = (shape, why) if shape else shape_of(device)
         self.only_tries = False
         self.compiles_by_size = compiles_by_size(device)
         self.max_allocation = int(device.max_mem_alloc_size)
@@ -106,7 +103,7 @@ class Device:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
         self._switches: Mapping[str, object] = {}
-        self.recorder = Recorder()
+        self.recorder = Recorder(self.queue)
         self.rehearsal = Rehearsal(device, all_devices().index(device), self.shape.label)
         self._fma: list[dict[str, object]] = []
 
@@ -170,6 +167,28 @@ class Device:
         begin at multiples of it; and whole vectors of lanes."""
         return max(int(self.cl_device.mem_base_addr_align) // 32, self.shape.lanes, 32)
 
+    def enqueue(
+        self,
+        kernel: Kernel,
+        size: tuple[int, ...],
+        local: tuple[int, ...] | None,
+        values: Sequence[Any],
+        *,
+        wait: bool = False,
+    ) -> cl.Event:
+        """Put a kernel on the queue, and wait for it if asked to. Raises DriverError."""
+        try:
+            event = kernel.cl_kernel(self.queue, size, local, *values)
+            if wait:  # so that the last kernel that was named is the one that fails
+                self.finish()
+        except cl.Error as error:
+            text = " ".join(str(error).split())
+            where = f"{kernel.variant.stem}.cl, {kernel.name}"
+            raise DriverError(
+                f"{title(self.cl_device)}, kernels in the shape {self.shape.label}: {where}, cannot be launched: {text}"
+            ) from None
+        return event
+
     def finish(self) -> None:
         """Wait until the device has nothing to do."""
         self.queue.finish()
@@ -182,10 +201,14 @@ class Device:
         """
         if self.shape.lanes == 1:
             return {}
-        kernels = self._built("probe", {"FMA_BY_CONTRACTION": True})
-        out = allocate(self, (2 * self.shape.lanes,), np.float32)
-        launch_groups(self, kernels.probe_fma, 1, 1, out, 1 + 2.0**-12, -(1 + 2.0**-11))
-        return {"FMA_BY_CONTRACTION": True} if np.all(out.get() == np.float32(2.0**-24)) else {}
+        fused: dict[str, object] = {"FMA_BY_CONTRACTION": True}
+        kernel, results = self._built("probe", fused).probe_fma, np.empty(2 * self.shape.lanes, np.float32)
+        buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, results.nbytes)
+        values = (buffer, np.float32(1 + 2.0**-12), np.float32(-(1 + 2.0**-11)))
+        self.rehearsal.launch(kernel, (1,), (1,), values)
+        self.enqueue(kernel, (1,), (1,), values)
+        cl.enqueue_copy(self.queue, results, buffer, is_blocking=True)
+        return fused if np.all(results == np.float32(2.0**-24)) else {}
 
     def __repr__(self) -> str:
         return f"<Device {self.name} | {self.driver.split('  ')[0].strip()} | {self.shape.label}>"
@@ -199,21 +222,20 @@ def select(selector: str | None) -> cl.Device:
     if not isinstance(selector, str | None):
         raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
     patience()  # what the environment says of drivers is looked at before it is needed
-    devices, infos = all_devices(), list_devices()
+    devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
         raise no_device()
     named = f"--device {selector}" if selector else f"CLSPLAT_DEVICE={os.environ.get('CLSPLAT_DEVICE', '')}"
     selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
     if selector is None:
-        return next((d for d, i in zip(devices, infos, strict=True) if i.kind == "gpu"), devices[0])
-    if selector.isdigit() and int(selector) < len(devices):
-        return devices[int(selector)]
+        return next((device for device, info in devices if info.kind == "gpu"), devices[0][0])
     wanted = selector.lower() if selector.strip() else None  # blanks are in every name
-    for device, info in zip(devices, infos, strict=True):
+    for device, info in devices:
         words = f"{info.name} {info.platform} {info.version}".lower()
-        if not selector.isdigit() and wanted and (wanted == info.kind or wanted in words):
+        by_name = wanted is not None and (wanted == info.kind or wanted in words)
+        if int(selector) == info.index if selector.isdigit() else by_name:
             return device
-    names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for info in infos)
+    names = "; ".join(f"{info.index}: {info.name} ({info.version.split('  ')[0]})" for _, info in devices)
     raise DeviceError(f"{named}: no such device, expected cpu, gpu, a part of a name, or an index of these: {names}")
 
 
@@ -224,8 +246,7 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 
 @lru_cache(maxsize=8)
-def _open(index: int, shape: Shape) -> Device:
-    why = why_another(all_devices()[index], shape)
+def _open(index: int, shape: Shape, why: str) -> Device:
     return Device(all_devices()[index], shape, why=why)
 
 
@@ -235,5 +256,5 @@ def open_device(selector: str | None = None, memory_limit: int | None = None) ->
     memory_limit: bytes that the buffers of this object's users may take together.
     """
     chosen: Any = select(selector)
-    device = _open(all_devices().index(chosen), shape_of(chosen))
+    device = _open(all_devices().index(chosen), *shape_of(chosen))
     return device if memory_limit is None else device.with_memory_limit(memory_limit)

@@ -63,11 +63,14 @@ def _kernels_digest(broken: str) -> str:
     return f"{zlib.crc32((texts + broken).encode()):08x}"
 
 
+def device_key(device: cl.Device) -> str:
+    """A device and its driver."""
+    return f"{device.name.strip()} | {device.platform.version.strip()} | {device.driver_version.strip()}"
+
+
 def driver_key(device: cl.Device) -> str:
     """Everything beside the shape that an entry counts for."""
-    driver = f"{device.platform.version.strip()} | {device.driver_version.strip()}"
-    kernels = _kernels_digest(os.environ.get(BREAK, ""))
-    return f"{device.name.strip()} | {driver} | clsplat {clsplat.__version__} {kernels}"
+    return f"{device_key(device)} | clsplat {clsplat.__version__} {_kernels_digest(os.environ.get(BREAK, ''))}"
 
 
 def _entry(value: object) -> Entry:

@@ -6,18 +6,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import prod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import pyopencl as cl
 
 from clsplat.device.buffers import DeviceArray
+from clsplat.device.context import Device
 from clsplat.device.program import Kernel
 from clsplat.device.quirks import tells_group_sizes
-from clsplat.errors import DriverError
-
-if TYPE_CHECKING:
-    from clsplat.device.context import Device
 
 _LOCAL = 64
 """Work-items a group where they do not co-operate: enough for a GPU's wave, short enough for a CPU's chunk."""
@@ -106,16 +102,7 @@ def _enqueue(
         _first(device, kernel, size, local, values, form)
     if device.only_tries:
         return
-    try:
-        event = kernel.cl_kernel(device.queue, size, local, *values)
-        if first and device.rehearsal.say is not None:  # so that the last kernel that was named is the one that fails
-            device.queue.finish()
-    except cl.Error as error:
-        text = " ".join(str(error).split())
-        raise DriverError(
-            f"{device.name}, {device.driver.split('  ')[0].strip()}, kernels in the shape {device.shape.label}: "
-            f"{kernel.variant.stem}.cl, {kernel.name}, cannot be launched: {text}"
-        ) from None
+    event = device.enqueue(kernel, size, local, values, wait=first and device.rehearsal.say is not None)
     if device.recorder.on:
         name = kernel.name
         arrays = [argument for argument in arguments if isinstance(argument, DeviceArray)]

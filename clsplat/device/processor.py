@@ -13,7 +13,7 @@ import ctypes
 import os
 import struct
 from contextlib import suppress
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import pyopencl as cl
@@ -33,6 +33,7 @@ _kept: dict[int, ctypes.Array[ctypes.c_char]] = {}
 """Texts that the devices' records point to, by address of a device."""
 
 
+@cache
 def features(path: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
     """The processor's features, as Linux calls them; none on another system."""
     with suppress(OSError):
@@ -60,17 +61,12 @@ def name_processor(device: cl.Device) -> str:
     if address is None:
         return ""
     name = _text(_word(address)) or ""
-    better = better_name(name, _features())
+    better = better_name(name, features())
     if better != name:
         # kept for as long as the process runs: the driver reads it at every build
         _kept[address] = ctypes.create_string_buffer(better.encode())
         ctypes.c_void_p.from_address(address).value = ctypes.addressof(_kept[address])
     return better
-
-
-@lru_cache(maxsize=1)
-def _features() -> frozenset[str]:
-    return features()
 
 
 def _place(record: int) -> int | None:

@@ -8,12 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import wraps
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import pyopencl as cl
-
-if TYPE_CHECKING:
-    from clsplat.device.context import Device
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -37,7 +34,8 @@ class StageRecord:
 class Recorder:
     """A device has one. Off unless inside `recording`; then every launch and transfer is noted under its stage."""
 
-    def __init__(self) -> None:
+    def __init__(self, queue: cl.CommandQueue) -> None:
+        self._queue = queue
         self.on = False
         self._wait = False
         self._stack: list[str] = []
@@ -45,7 +43,7 @@ class Recorder:
         self._events: list[tuple[str, str, Any]] = []
 
     @contextmanager
-    def recording(self, device: Device, *, wait: bool) -> Iterator[dict[str, StageRecord]]:
+    def recording(self, *, wait: bool) -> Iterator[dict[str, StageRecord]]:
         """The stages of what is done inside, filled in at the end.
 
         wait: finish the queue around each stage for `wall_ms`; without it the device runs ahead as it always does, and
@@ -55,7 +53,7 @@ class Recorder:
         self.on, self._wait, self._stages, self._events = True, wait, stages, []
         try:
             yield stages
-            device.finish()
+            self._queue.finish()
             for stage, kernel, event in self._events:
                 times, taken = stages[stage].kernels, _milliseconds(event)
                 times[kernel] = times.get(kernel, 0.0) + taken
@@ -72,33 +70,42 @@ class Recorder:
         self._events.append((stage, name, event))
 
     @contextmanager
-    def stage(self, device: Device, name: str) -> Iterator[None]:
+    def stage(self, name: str) -> Iterator[None]:
         """Inside, work is that of stage `name`, unless a stage is already going on."""
         outermost = not self._stack
         self._stack.append(name)
         timed = outermost and self._wait
         if timed:
-            device.finish()
+            self._queue.finish()
         start = time.perf_counter()
         try:
             yield
             if timed:
-                device.finish()
+                self._queue.finish()
                 record = self._stages.setdefault(name, StageRecord())
                 record.wall_ms += 1e3 * (time.perf_counter() - start)
         finally:
             self._stack.pop()
 
 
-def stage(name: str) -> Callable[[Callable[Concatenate[Device, P], R]], Callable[Concatenate[Device, P], R]]:
+class Recorded(Protocol):
+    """A device, which has a recorder."""
+
+    recorder: Recorder
+
+
+D = TypeVar("D", bound=Recorded)
+
+
+def stage(name: str) -> Callable[[Callable[Concatenate[D, P], R]], Callable[Concatenate[D, P], R]]:
     """Marks a function whose first argument is the device as a stage of the pipeline."""
 
-    def decorate(function: Callable[Concatenate[Device, P], R]) -> Callable[Concatenate[Device, P], R]:
+    def decorate(function: Callable[Concatenate[D, P], R]) -> Callable[Concatenate[D, P], R]:
         @wraps(function)
-        def call(device: Device, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        def call(device: D, /, *args: P.args, **kwargs: P.kwargs) -> R:
             if not device.recorder.on:
                 return function(device, *args, **kwargs)
-            with device.recorder.stage(device, name):
+            with device.recorder.stage(name):
                 return function(device, *args, **kwargs)
 
         return call

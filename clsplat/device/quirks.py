@@ -39,6 +39,11 @@ def kind_of(device: cl.Device) -> str:
     return "cpu" if device.type & CPU else "other"
 
 
+def title(device: cl.Device) -> str:
+    """A device and its driver for a line of text: PoCL lists its build options after two spaces."""
+    return f"{device.name.strip()}, {device.platform.version.split('  ')[0].strip()}"
+
+
 def _pocl_version(device: cl.Device) -> tuple[int, int] | None:
     words = device.platform.version.split()
     if "PoCL" not in words:

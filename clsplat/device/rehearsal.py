@@ -4,8 +4,6 @@
 A driver's compiler may abort or hang, at the build or, as PoCL's code generator does, not before the launch. So the
 first time that a kernel's text and options meet a driver, another process builds it, and launches it on arrays of
 zeros of the same sizes. What came back is remembered (`known`), and never tried again with that driver.
-
-As a program it is that other process: it answers lines of JSON with lines of JSON.
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ import pyopencl as cl
 from clsplat.device import known
 from clsplat.device.child import REGARDLESS, Child, ending_at_once, patience, python_module, regardless
 from clsplat.device.program import Kernel, Variant, text_of
+from clsplat.device.quirks import title
 from clsplat.errors import DriverError
 
 IDLE = 20.0
@@ -163,24 +162,17 @@ class Rehearsal:
         trouble: str,
         *,
         lasting: bool = True,
-        name: str = "",
-        message: Mapping[str, Any] | None = None,
+        trial: Mapping[str, Any] | None = None,
     ) -> DriverError:
-        """The error to raise; lasting: remember too that the driver cannot be used in this shape; name and message: of
-        the trial that failed, if it was one."""
+        """The error to raise; lasting: remember too that the driver cannot be used in this shape; trial: what failed
+        (`known.Entry`), if it was one."""
         text = f"{variant.stem}.cl{f', {kernel},' if kernel else ''} {trouble}"
         advice = f"--device takes another device, {REGARDLESS}=1 goes on regardless"
         if lasting and not regardless():
-            trial: dict[str, Any] = {"name": name or f"{variant.digest} {kernel}"}
-            if message is not None:
-                trial["build"] = {"stem": variant.stem, "options": variant.options}
-                trial.update({key: value for key, value in message.items() if key != "build"})
+            trial = trial or {"name": f"{variant.digest} {kernel}"}
             known.remember(self._device, self._shape, failed=text, trial=trial)
             advice = f"the next process takes another shape if one works; {advice}"
-        driver = self._device.platform.version.split("  ")[0].strip()
-        return DriverError(
-            f"{self._device.name.strip()}, {driver}, kernels in the shape {self._shape}: {text}; {advice}"
-        )
+        return DriverError(f"{title(self._device)}, kernels in the shape {self._shape}: {text}; {advice}")
 
     @cached_property
     def _known(self) -> dict[str, str]:
@@ -199,7 +191,8 @@ class Rehearsal:
             )
             return
         if trouble := _trouble(answer, ending):
-            error = self.fail(variant, kernel, trouble, lasting=crashed or not ending, name=name, message=message)
+            trial = {**message, "name": name, "build": {"stem": variant.stem, "options": variant.options}}
+            error = self.fail(variant, kernel, trouble, lasting=crashed or not ending, trial=trial)
             self._failed[name] = str(error)  # not to wait for it again
             raise error
         self._known[name] = str(answer.get("salt", ""))

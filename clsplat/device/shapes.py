@@ -14,7 +14,7 @@ import pyopencl as cl
 
 from clsplat.device import known
 from clsplat.device.child import regardless
-from clsplat.device.quirks import kind_of, most_lanes
+from clsplat.device.quirks import kind_of, most_lanes, title
 from clsplat.errors import DeviceError, reason_of
 from clsplat.files import atomic_write, parse_json
 
@@ -91,7 +91,7 @@ def wanted_shape(device: cl.Device) -> Shape:
     default = default_shape(device)
     text = asked_shape()
     if not text:
-        text = saved_shapes().get(_key(device), "")
+        text = saved_shapes().get(known.device_key(device), "")
         shape = _parsed(text, default)
         return default if shape is None or shape.items > most_items(device) else shape
     shape = _parsed(text, default)
@@ -114,28 +114,21 @@ def failures(device: cl.Device) -> dict[str, str]:
     return {label: entry.failed for label, entry in known.entries(device).items() if entry.failed}
 
 
-def shape_of(device: cl.Device) -> Shape:
-    """The shape that a device gets which is opened without another: `wanted_shape`, or the first other one where the
-    driver has failed in that before. Raises DeviceError as `wanted_shape`."""
+def shape_of(device: cl.Device) -> tuple[Shape, str]:
+    """The shape that a device gets which is opened without another: `wanted_shape`, or, with the warning, the first
+    other one where the driver has failed in that before. Raises DeviceError as `wanted_shape`."""
     wanted, failed = wanted_shape(device), failures(device)
-    if wanted.label not in failed:
-        return wanted
-    others = (shape for shape in shapes_in_turn(device) if shape.label not in failed)
-    return next(others, wanted)  # with none left it is told when it fails again
-
-
-def why_another(device: cl.Device, shape: Shape) -> str:
-    """The warning that this shape is taken, as the driver has failed in the one that is wanted; or nothing."""
-    wanted, failed = wanted_shape(device), failures(device)
-    if shape == wanted or wanted.label not in failed:
-        return ""
-    return instead(device, wanted, shape, failed[wanted.label])
+    if wanted.label in failed:
+        for other in shapes_in_turn(device):
+            if other.label not in failed:
+                return other, instead(device, wanted, other, failed[wanted.label])
+    return wanted, ""  # with none left it is told when it fails again
 
 
 def shape_text(device: cl.Device) -> str:
     """The shape in the list of devices, or that the device cannot take what CLSPLAT_SHAPE asks for."""
     try:
-        shape = shape_of(device)
+        shape, _ = shape_of(device)
     except DeviceError:
         return f"too small for CLSPLAT_SHAPE={asked_shape()}"
     return f"{shape.lanes} lanes x {shape.items} items"
@@ -152,9 +145,8 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
     """The warning that another shape is taken."""
-    driver = device.platform.version.split("  ")[0].strip()
     return (
-        f"{device.name.strip()}, {driver}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
+        f"{title(device)}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
         f"taken (clsplat selftest tries {wanted.label} anew)"
     )
 
@@ -199,13 +191,9 @@ def save_shape(device: cl.Device, shape: Shape | None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         saved = saved_shapes()
-    saved.pop(_key(device), None)
+    saved.pop(known.device_key(device), None)
     if shape is not None:
-        saved[_key(device)] = shape.label
+        saved[known.device_key(device)] = shape.label
     path = saved_path()
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, (json.dumps(saved, indent=2, sort_keys=True) + "\n").encode())
-
-
-def _key(device: cl.Device) -> str:
-    return f"{device.name.strip()} | {device.platform.version.strip()} | {device.driver_version.strip()}"

@@ -49,7 +49,7 @@ class _Stage:
                 if caches_programs(self._device) and build(self._context, self._device, variant.anew(salt))[1]:
                     return {"trouble": "has no kernels when it comes from the driver's cache"}
             if "launch" in message:
-                self._launch(self._kernels[variant.digest], **message["launch"])
+                self._launch(self._kernels[variant.digest], message["launch"])
         except (MemoryError, cl.MemoryError):
             return {"memory": True}
         except KernelBuildError as error:
@@ -60,16 +60,10 @@ class _Stage:
             return {"trouble": "cannot be launched: " + " ".join(str(error).split())[:300]}
         return {"salt": salt}
 
-    def _launch(
-        self,
-        kernels: dict[str, Any],
-        kernel: str,
-        size: list[int],
-        local: list[int] | None,
-        arguments: list[tuple[str, Any]],
-    ) -> None:
-        given = [_given(self._context, self._queue, *argument) for argument in arguments]
-        kernels[kernel](self._queue, tuple(size), None if local is None else tuple(local), *given)
+    def _launch(self, kernels: dict[str, Any], launch: dict[str, Any]) -> None:
+        arguments = [_given(self._context, self._queue, *argument) for argument in launch["arguments"]]
+        size, local = tuple(launch["size"]), launch["local"] and tuple(launch["local"])
+        kernels[launch["kernel"]](self._queue, size, local, *arguments)
         self._queue.finish()
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,9 @@ from clsplat.camera import Camera
 from clsplat.config.channels import CHANNELS, feature_names, light_and_rest
 from clsplat.device.layout import TILE
 from clsplat.frame.window import crop, reframed
+from clsplat.gaussians import Gaussians
+from clsplat.rendering.renderer import Renderer
 from clsplat.stages.channels import Features
-
-if TYPE_CHECKING:
-    from clsplat.gaussians import Gaussians
-    from clsplat.rendering.renderer import Renderer
-
 
 Planes = dict[str, NDArray[Any]]
 """Channels by name, (height, width) or (height, width, floats); rgb over the background, so over black it is associated

@@ -8,7 +8,6 @@ what comes out is converted. A strip is a window of the picture, so that it goes
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,12 +15,9 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig
 from clsplat.frame.draw import Draw, Planes, drawn_by
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
+from clsplat.gaussians import Gaussians
 from clsplat.images.colour import SRGB, Colours
-
-if TYPE_CHECKING:
-    from clsplat.gaussians import Gaussians
-    from clsplat.rendering.renderer import Renderer
-
+from clsplat.rendering.renderer import Renderer
 
 UNSEEN = 1e-6
 """Most that a colour differs from the background's where nothing is seen: averages of equal samples are rounded."""

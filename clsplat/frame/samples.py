@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,14 +69,9 @@ def supersampled(draw: Draw, config: FramingConfig) -> Draw:
     taps = filter_taps(config)
 
     def shrunk(plane: Float32, axis: int, size: int) -> Float32:
-        parts = [slice(None)] * plane.ndim
-        total: Float32 | None = None
-        for at, weight in enumerate(taps):
-            parts[axis] = slice(at, at + samples * (size - 1) + 1, samples)
-            part = weight * plane[tuple(parts)]
-            total = part if total is None else total + part
-        assert total is not None
-        return total
+        lines, reach = np.moveaxis(plane, axis, 0), samples * (size - 1) + 1
+        parts = (weight * lines[at : at + reach : samples] for at, weight in enumerate(taps))
+        return np.moveaxis(reduce(np.add, parts), 0, axis)
 
     def filtered(camera: Camera, names: Collection[str]) -> Planes:
         planes = draw(finer(camera, config), names)

@@ -6,12 +6,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.config.pictures import STRIP_PIXELS, Encoding, FramingConfig
+from clsplat.device.context import Device
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, feature_floats
@@ -20,9 +20,6 @@ from clsplat.images.channels import check_target, encoded
 from clsplat.images.exr_header import Header
 from clsplat.images.writing import write_rows
 from clsplat.rendering.memory_needs import frame_pixels
-
-if TYPE_CHECKING:
-    from clsplat.device.context import Device
 
 
 def strip_rows(

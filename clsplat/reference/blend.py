@@ -6,10 +6,11 @@ Equation numbers are those of docs/gradients.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float64, Int64
 from clsplat.reference.project import ALPHA_MIN, Projected
@@ -28,14 +29,14 @@ and margins up to that are true."""
 class Blended:
     """image (H, W, 3); transmittance (H, W), what is left for the background; last (H, W), position in `order` of
     the last Gaussian that was added, -1 for none; count (H, W), how many were added; margin (H, W), the smallest
-    relative distance of a decision to its threshold (alpha to 1/255 and to 0.99, T to 1e-4), cut at 0.05, or None.
+    relative distance of a decision to its threshold (alpha to 1/255 and to 0.99, T to 1e-4), cut at 0.05.
     """
 
     image: Float64
     transmittance: Float64
     last: Int64
     count: Int64
-    margin: Float64 | None
+    margin: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,45 +85,63 @@ def footprint(projected: Projected, gaussian: int, width: int, height: int) -> F
     return Footprint(slice(first[1], stop[1]), slice(first[0], stop[0]), dx, dy, falloff, opacity * falloff)
 
 
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One Gaussian, `position` in the order, on the pixels of its box: alpha; before, after: transmittance in front of
+    it and behind; added: where it is in the picture; margin: as of `Blended`, infinite where nothing is decided."""
+
+    position: int
+    gaussian: int
+    box: tuple[slice, slice]
+    alpha: Float64
+    before: Float64
+    after: Float64
+    added: NDArray[np.bool_]
+    margin: Float64
+
+
+def layers(projected: Projected, order: Int64, width: int, height: int) -> Iterator[Layer]:
+    """Eqs. (14) to (16): the Gaussians that `order` (M,) lists, rows of `projected`, front to back."""
+    transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
+    for position, gaussian in enumerate(order):
+        splat = footprint(projected, int(gaussian), width, height)
+        if splat is None or not alive[box := (splat.rows, splat.columns)].any():
+            continue
+        alpha = np.minimum(ALPHA_MAX, splat.raw)
+        before, seen = transmittance[box].copy(), alive[box] & (alpha >= ALPHA_MIN)
+        after = before * (1 - alpha)
+        added = seen & (after > TRANSMITTANCE_MIN)
+        margin = np.minimum(np.abs(splat.raw / ALPHA_MIN - 1), np.abs(splat.raw / ALPHA_MAX - 1))
+        margin = np.minimum(margin, np.where(seen, np.abs(after / TRANSMITTANCE_MIN - 1), np.inf))
+        margin = np.where(alive[box], margin, np.inf)
+        transmittance[box] = after = np.where(added, after, before)
+        alive[box] &= added | ~seen
+        yield Layer(position, int(gaussian), box, alpha, before, after, added, margin)
+
+
 def blend(
     projected: Projected,
     order: Int64,
     width: int,
     height: int,
     background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
-    margins: bool = False,
 ) -> Blended:
-    """Eqs. (14) to (16): `order` (M,) lists the rows of `projected` front to back."""
+    """The picture of the `layers`."""
     image = np.zeros((height, width, 3))
     transmittance = np.ones((height, width))
-    alive = np.ones((height, width), np.bool_)
     last = np.full((height, width), -1, np.int64)
     count = np.zeros((height, width), np.int64)
     margin = np.full((height, width), BOX_SLACK / 2)
-    for position, gaussian in enumerate(order):
-        splat = footprint(projected, int(gaussian), width, height)
-        if splat is None:
-            continue
-        box = (splat.rows, splat.columns)
-        if not alive[box].any():
-            continue
-        alpha = np.minimum(ALPHA_MAX, splat.raw)
-        seen = alive[box] & (alpha >= ALPHA_MIN)
-        after = transmittance[box] * (1 - alpha)
-        added = seen & (after > TRANSMITTANCE_MIN)
-        if margins:
-            distance = np.abs(splat.raw / ALPHA_MIN - 1)
-            distance = np.minimum(distance, np.abs(splat.raw / ALPHA_MAX - 1))
-            distance = np.minimum(distance, np.where(seen, np.abs(after / TRANSMITTANCE_MIN - 1), np.inf))
-            margin[box] = np.where(alive[box], np.minimum(margin[box], distance), margin[box])
-        weight = np.where(added, transmittance[box] * alpha, 0.0)
-        image[box] += weight[:, :, None] * projected.colors[gaussian]
-        transmittance[box] = np.where(added, after, transmittance[box])
-        last[box] = np.where(added, position, last[box])
+    for layer in layers(projected, order, width, height):
+        box, added = layer.box, layer.added
+        margin[box] = np.minimum(margin[box], layer.margin)
+        weight = np.where(added, layer.before * layer.alpha, 0.0)
+        image[box] += weight[:, :, None] * projected.colors[layer.gaussian]
+        transmittance[box] = layer.after
+        last[box] = np.where(added, layer.position, last[box])
         count[box] += added
-        alive[box] &= added | ~seen
     image += transmittance[:, :, None] * np.asarray(background, np.float64)
-    return Blended(image, transmittance, last, count, margin if margins else None)
+    return Blended(image, transmittance, last, count, margin)
 
 
 def blend_grad(

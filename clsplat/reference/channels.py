@@ -10,9 +10,9 @@ import numpy as np
 
 from clsplat.arrays import Float64, Int64
 from clsplat.camera import Camera
-from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN, footprint
+from clsplat.reference.blend import layers
 from clsplat.reference.cameras import period, pixel_from_world, wrapped
-from clsplat.reference.project import ALPHA_MIN, Projected, rotation_matrices, view_directions
+from clsplat.reference.project import Projected, rotation_matrices, view_directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,24 +74,14 @@ def channels(
         axis=1,
     )
     sums, total = np.zeros((height, width, rows.shape[1])), np.zeros((height, width))
-    transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
-    median, first, largest = (np.zeros((height, width)) for _ in range(3))
-    second = np.zeros((height, width))
+    median, first, largest, second = (np.zeros((height, width)) for _ in range(4))
     count, index = np.zeros((height, width), np.int64), np.full((height, width), -1, np.int64)
     doubt = np.full((height, width), np.inf)
-    for gaussian in order:
-        splat = footprint(projected, int(gaussian), width, height)
-        if splat is None:
-            continue
-        box = (splat.rows, splat.columns)
-        alpha = np.minimum(ALPHA_MAX, splat.raw)
-        seen = alive[box] & (alpha >= ALPHA_MIN)
-        before = transmittance[box].copy()
-        after_it = before * (1 - alpha)
-        added = seen & (after_it > TRANSMITTANCE_MIN)
-        weight = np.where(added, before * alpha, 0.0)
-        depth = projected.depths[gaussian]
-        sums[box] += weight[:, :, None] * rows[gaussian]
+    for layer in layers(projected, order, width, height):
+        box, added, before, after_it = layer.box, layer.added, layer.before, layer.after
+        weight = np.where(added, before * layer.alpha, 0.0)
+        depth = projected.depths[layer.gaussian]
+        sums[box] += weight[:, :, None] * rows[layer.gaussian]
         total[box] += weight
         median[box] = np.where(added & (before > 0.5) & (after_it <= 0.5), depth, median[box])
         doubt[box] = np.where(added, np.minimum(doubt[box], np.abs(after_it - 0.5)), doubt[box])
@@ -99,10 +89,8 @@ def channels(
         count[box] += added
         heavier = weight > largest[box]
         second[box] = np.where(heavier, largest[box], np.maximum(second[box], weight))
-        index[box] = np.where(heavier, gaussian, index[box])
+        index[box] = np.where(heavier, layer.gaussian, index[box])
         largest[box] = np.maximum(largest[box], weight)
-        transmittance[box] = np.where(added, after_it, before)
-        alive[box] &= added | ~seen
     some = total > 0
     means_of = sums / np.where(some, total, 1.0)[:, :, None]
     length = np.linalg.norm(sums[:, :, 1:4], axis=2)

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
-from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN, footprint
-from clsplat.reference.project import ALPHA_MIN, Projected
+from clsplat.reference.blend import layers
+from clsplat.reference.project import Projected
 
 
 def deep(
@@ -18,24 +18,13 @@ def deep(
     at which the next bin begins, float32 as the kernel compares them."""
     slices = np.zeros((len(bounds) + 1, height, width, 6))
     left = np.ones((len(bounds) + 1, height, width))
-    transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
-    for gaussian in order:
-        splat = footprint(projected, int(gaussian), width, height)
-        if splat is None:
-            continue
-        box = (splat.rows, splat.columns)
-        alpha = np.minimum(ALPHA_MAX, splat.raw)
-        seen = alive[box] & (alpha >= ALPHA_MIN)
-        after = transmittance[box] * (1 - alpha)
-        added = seen & (after > TRANSMITTANCE_MIN)
-        depth = projected.depths[gaussian]
+    for layer in layers(projected, order, width, height):
+        box, alpha, added, depth = layer.box, layer.alpha, layer.added, projected.depths[layer.gaussian]
         index = int(np.searchsorted(bounds, np.float32(depth), side="right"))
         here, u = slices[index][box], left[index][box]
-        here[:, :, :3] += np.where(added, u * alpha, 0.0)[:, :, None] * projected.colors[gaussian]
+        here[:, :, :3] += np.where(added, u * alpha, 0.0)[:, :, None] * projected.colors[layer.gaussian]
         here[:, :, 4] = np.where(added & (u == 1), depth, here[:, :, 4])
         here[:, :, 5] = np.where(added, depth, here[:, :, 5])
         left[index][box] = np.where(added, u * (1 - alpha), u)
-        transmittance[box] = np.where(added, after, transmittance[box])
-        alive[box] &= added | ~seen
     slices[:, :, :, 3] = 1 - left
     return slices

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import GROUPS, Gaussians
-from clsplat.reference.blend import Blended, blend, blend_grad
+from clsplat.reference.blend import Blended, BlendGradients, blend, blend_grad
 from clsplat.reference.project import Projected, covariance_grad, project, project_grad
 from clsplat.reference.sort import depth_order
 
@@ -29,14 +29,10 @@ class Forward:
 
 
 @dataclass(frozen=True, eq=False)
-class Gradients:
-    """parameters: by the name of the array in `Gaussians`, same shapes; means2d and abs_means2d (N, 2): by the
-    mean on the image, in pixels, and contributions (N,), also in pixels, for density control; visible (N,)."""
+class Gradients(BlendGradients):
+    """Those on the image, and parameters: by the name of the array in `Gaussians`, same shapes; visible (N,)."""
 
     parameters: dict[str, Float64]
-    means2d: Float64
-    abs_means2d: Float64
-    contributions: Float64
     visible: NDArray[np.bool_]
 
 
@@ -52,13 +48,12 @@ def forward(
     camera: Camera,
     background: Sequence[float] | Float64 = BLACK,
     sh_degree: int | None = None,
-    margins: bool = False,
 ) -> Forward:
     """Project, sort, blend; sh_degree None uses all bands there are."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     projected = project(**parameters(gaussians), camera=camera, sh_degree=degree)
     order = depth_order(projected.depths, projected.visible)
-    return Forward(projected, order, blend(projected, order, camera.width, camera.height, background, margins))
+    return Forward(projected, order, blend(projected, order, camera.width, camera.height, background))
 
 
 def render(
@@ -95,4 +90,4 @@ def render_grad(
         d_opacities=screen.opacities,
         d_colors=screen.colors,
     )
-    return Gradients(by_parameter, screen.means2d, screen.abs_means2d, screen.contributions, projected.visible)
+    return Gradients(**vars(screen), parameters=by_parameter, visible=projected.visible)

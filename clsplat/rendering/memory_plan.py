@@ -68,16 +68,6 @@ class Plan:
     groups: int
 
     @property
-    def gaussians(self) -> int:
-        """The number that it was made for."""
-        return self.need.gaussians
-
-    @property
-    def needed(self) -> int:
-        """Bytes with everything at once, estimated."""
-        return self.need.total
-
-    @property
     def pieces(self) -> tuple[bool, bool, bool]:
         """True for each that is done in pieces: parameters, image, loss."""
         return self.streamed, self.groups > 1, self.channels < 3
@@ -96,7 +86,7 @@ class Plan:
             how.append(f"the image is done in about {self.groups} groups of tiles")
         if self.channels < 3:
             how.append("the loss is done by channel")
-        needed, allowed = mebibytes(self.needed), mebibytes(self.allowed)
+        needed, allowed = mebibytes(self.need.total), mebibytes(self.allowed)
         return f"about {needed} of device memory needed, {allowed} allowed: " + (", ".join(how) or "all at once")
 
 

@@ -132,12 +132,8 @@ class Rasterizer:
         """The frame's channels beside colour; after: the packed camera that motion goes to."""
         device, work, projected = self.device_of(frame.camera), self.work, frame.projected
         rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected)
-        pixels = (projected, frame.blended, frame.camera.height)
-
-        def blended(part: Part) -> Channels:
-            return channels(device, work, wanted, rows, part.lists, *pixels, part.lists.band, frame.camera_array)
-
-        return self.by_band(frame, blended)[-1]
+        pixels = (projected, frame.blended, frame.camera.height, frame.camera_array)
+        return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1]
 
     def deep(self, frame: Frame, bounds: DeviceArray) -> DeviceArray:
         """The frame in slices by depth: the array of `stages.deep`."""

@@ -118,7 +118,7 @@ def _duplicate(bench: Bench) -> Outcome:
         return duplicate(device, work, projected.splats, bench.counted, bench.tiles, bench.band)
 
     bench.pairs, outcome = bench.twice(
-        launch, lambda pairs: [pairs.tile_keys.get(), pairs.pair_ids.get(), pairs.first_slots.get()]
+        launch, lambda pairs: [pairs.tile_keys.get(), pairs.pair_ids.get(), bench.counted.first_slots.get()]
     )
     tile_keys, ids, first_slots = outcome.arrays
     counts, got = projected.tile_counts.get().astype(np.int64), bench.splats()

@@ -11,11 +11,13 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 
 from clsplat.device import known, rehearsal
 from clsplat.device.child import REGARDLESS, Child, patience, python_module, regardless
 from clsplat.device.context import Device, all_devices
+from clsplat.device.quirks import title
 from clsplat.device.shapes import Shape, failures, instead, shapes_in_turn, wanted_shape
 from clsplat.errors import DeviceError, DriverError
 from clsplat.selftest.result import FORWARD, STAGES, TRAINING, Result
@@ -73,7 +75,7 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = STAGES, *, quick: 
     report = Report(wanted=tuple(stages))
     begun, seconds = "starting", patience()
     words = [str(index), str(shape.lanes), str(shape.items), ",".join(stages), *(["quick"] if quick else [])]
-    with Child(python_module("clsplat.selftest.child", *words)) as child:
+    with closing(Child(python_module("clsplat.selftest.child", *words))) as child:
         try:
             while (message := child.receive(seconds)) is not None:
                 begun = message.get("begins", begun)
@@ -109,7 +111,7 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
         tried = device if shape == given else device.with_shape(lanes=shape.lanes, items=shape.items)
         if not _has_passed(tried, stages):
             if not announced:
-                print(f"{_name(device)}: used for the first time, a short test of its driver", file=sys.stderr)
+                print(f"{title(cl_device)}: used for the first time, a short test of its driver", file=sys.stderr)
             announced = True
             if failure := _short_test(tried, stages):
                 known.remember(cl_device, shape.label, failed=failure)
@@ -120,16 +122,12 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
             known.tell_once(instead(cl_device, first, shape, failed[first.label]))
         return tried
     raise DriverError(
-        f"{_name(device)}, kernels in the shape {given.label}: {failed[given.label]}; none of {', '.join(failed)} "
-        f"works; {_ADVICE}"
+        f"{title(cl_device)}, kernels in the shape {given.label}: {failed[given.label]}; none of "
+        f"{', '.join(failed)} works; {_ADVICE}"
     )
 
 
 _ADVICE = f"clsplat selftest tells more, --device takes another device, {REGARDLESS}=1 goes on regardless"
-
-
-def _name(device: Device) -> str:
-    return f"{device.name}, {device.driver.split('  ')[0].strip()}"
 
 
 def _has_passed(device: Device, stages: Sequence[str]) -> bool:
@@ -145,11 +143,11 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
     if report.crashed:
         return report.end
     if report.end:
-        raise DriverError(f"{_name(device)}: its test could not be made: {report.end}; {_ADVICE}")
+        raise DriverError(f"{title(device.cl_device)}: its test could not be made: {report.end}; {_ADVICE}")
     if report.failure:
-        raise DeviceError(f"{_name(device)}: the driver {report.verdict}; {_ADVICE}")
+        raise DeviceError(f"{title(device.cl_device)}: the driver {report.verdict}; {_ADVICE}")
     if report.other_bits:
-        warnings.warn(f"{_name(device)}: {report.verdict}", stacklevel=2)
+        warnings.warn(f"{title(device.cl_device)}: {report.verdict}", stacklevel=2)
     known.remember(device.cl_device, device.shape.label, stages=wanted, kernels=report.kernels, failed="")
     return ""
 

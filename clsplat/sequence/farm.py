@@ -14,20 +14,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import clsplat
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import digest
 from clsplat.gaussians import Gaussians
+from clsplat.images.video import VideoWriter
 from clsplat.sequence.existing import is_complete, remove_temporaries, stamp
 from clsplat.sequence.frame_renderer import FrameRenderer, open_frame_renderer
 from clsplat.sequence.task import Record, RenderOptions, Task
 from clsplat.sequence.workers import HOST_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
-
-if TYPE_CHECKING:
-    from clsplat.images.video import VideoWriter
 
 THREADS = 2
 """Threads of a local worker: one frame is encoded while the next is rendered."""
@@ -64,12 +62,11 @@ class _Held:
 
     def __init__(self) -> None:
         self.turn, self.room = threading.Lock(), threading.Semaphore(HELD)
-        self.key: tuple[Any, ...] | None = None
+        self.key: str | None = None
         self.renderer: FrameRenderer | None = None
 
     def renderer_for(self, job: WorkerJob) -> FrameRenderer:
-        key = (job.model, job.digest, job.device, job.memory_limit, repr(job.options), repr(job.rasterizer))
-        if self.renderer is None or key != self.key:
+        if self.renderer is None or repr(job) != self.key:
             self.key = self.renderer = None  # its memory is free before the next takes some
             gaussians = Gaussians.load(job.model)
             if (content := digest(job.model)) != job.digest:
@@ -77,7 +74,7 @@ class _Held:
             self.renderer = open_frame_renderer(
                 gaussians, job.options, job.rasterizer, device=job.device, memory_limit=job.memory_limit
             )
-            self.key = key
+            self.key = repr(job)
         return self.renderer
 
 

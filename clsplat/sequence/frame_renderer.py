@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clsplat.camera import Camera
 from clsplat.config.channels import light_and_rest
@@ -17,13 +17,11 @@ from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes
 from clsplat.frame.pipeline import FramePipeline
 from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
+from clsplat.gaussians import Gaussians
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, RAYS
 from clsplat.selftest.trust import require
 from clsplat.sequence.task import RenderOptions, Task, camera_after, header, picture_camera
-
-if TYPE_CHECKING:
-    from clsplat.gaussians import Gaussians
 
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
@@ -70,7 +68,7 @@ class FrameRenderer:
         if not self._profile:
             return self._frame(task)
         device = self._renderer.device
-        with device.recorder.recording(device, wait=False) as stages:
+        with device.recorder.recording(wait=False) as stages:
             frame = self._frame(task)
         times = [(name, taken) for record in stages.values() for name, taken in record.kernels.items()]
         kernels = sum(taken for name, taken in times if name not in TRANSFERS)
@@ -129,10 +127,7 @@ def open_frame_renderer(
     memory_limit: int | None = None,
     profile: bool = False,
 ) -> FrameRenderer:
-    """A renderer of frames of the model on the device that `device` names. Raises DeviceError.
-
-    profile: note what the device is busy with.
-    """
+    """A renderer of frames of the model on the device that `device` names. Raises DeviceError."""
     if profile:
         opened = Device(select(device), profile=True)
         opened.memory.limit = memory_limit

@@ -167,11 +167,6 @@ def plain(value: Any) -> Any:
     return value
 
 
-def encoding_of(encoding: Encoding, extension: str) -> dict[str, Any]:
-    """The settings that a file of that extension depends on."""
-    return {name: getattr(encoding, name) for name in _ENCODED.get(extension, ())}
-
-
 def digest_of(*parts: Any) -> str:
     """128 bits of SHA-256, in hexadecimal, of values that `plain` takes."""
     return hashlib.sha256(json.dumps(plain(parts), sort_keys=True).encode()).hexdigest()[:32]
@@ -179,7 +174,8 @@ def digest_of(*parts: Any) -> str:
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
     """Digest of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer."""
-    extension, pictures = task.path.suffix.lower(), options.pictures
+    pictures = options.pictures
+    encoding = {name: getattr(options.encoding, name) for name in _ENCODED.get(task.path.suffix.lower(), ())}
     cameras = [picture_camera(task, options)]
     if "motion" in options.channels and (after := camera_after(task, options)) is not None:
         cameras.append(after)
@@ -189,7 +185,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     sampling = pictures.sampling if pictures.sampling.on else None
     made = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
-    return digest_of(cameras, made, encoding_of(options.encoding, extension), colour, pictures.framing, sampling)
+    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling)
 
 
 def _content(source: str) -> str:

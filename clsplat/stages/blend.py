@@ -89,17 +89,10 @@ def blend(
     if record and not rays and tile_items(device) == 1 and device.shape.lanes >= 8:
         cells = work.array("cells_from_sorted", lists.gaussian_from_sorted.shape, np.uint32)
     extra = ([cells] if cells else []) + ([camera_array] if rays else [])
-    _launch_blend(
-        device, {"RECORD_CELLS": True} if cells else {}, lists, width, height, splats, background, *planes, *extra
-    )
+    arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, *extra)
+    defines = {"RECORD_CELLS": True} if cells else {}
+    launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *arrays)
     return Blended(*planes, cells)
-
-
-def _launch_blend(
-    device: Device, defines: Mapping[str, object], lists: TileLists, width: int, height: int, *arrays: Any
-) -> None:
-    listed = (lists.ranges, lists.gaussian_from_sorted)
-    launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *listed, *arrays)
 
 
 def count_pairs(
@@ -114,10 +107,11 @@ def count_pairs(
 
     Contributing: added to the pixel's colour. Evaluated: alpha was worked out, in a lane of a vector that was visited.
     """
-    size = (camera.width, camera.height)
-    planes = _planes(work, *size, kept=True)  # those of `blend`: it writes the same values again
+    width, height = camera.width, camera.height
+    planes = _planes(work, width, height, kept=True)  # those of `blend`: it writes the same values again
     counts = work.array("counts", (lists.band.tiles * tile_items(device), 2), np.uint32)
-    _launch_blend(device, {"COUNT_PAIRS": True}, lists, *size, splats, background, *planes, counts)
+    arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, counts)
+    launch_tiles(device, "blend", {"COUNT_PAIRS": True}, lists, -(-width // TILE), width, height, *arrays)
     contributing, evaluated = counts.get().sum(axis=0, dtype=np.uint64)
     return int(contributing), int(evaluated)
 

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from clsplat.config.channels import floats_of
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
-from clsplat.device.launch import launch_groups, launch_items
+from clsplat.device.launch import launch_items
 from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
-from clsplat.stages.blend import Blended, tile_items
+from clsplat.stages.blend import Blended, launch_tiles
 from clsplat.stages.device_gaussians import AnyGaussians, parts
-from clsplat.stages.duplicate import Band
 from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists
 
@@ -72,7 +71,6 @@ class Channels:
     """Planes padded to whole tiles: means (floats + 2, rows, stride) of the features and, behind them, DEPTHS; whole
     (2, rows, stride): WHOLE. `Features.named` takes them apart."""
 
-    features: Features
     means: DeviceArray
     whole: DeviceArray
 
@@ -118,30 +116,14 @@ def channels(
     projected: Projected,
     blended: Blended,
     height: int,
-    band: Band | None = None,
     camera_array: DeviceArray | None = None,
 ) -> Channels:
-    """Blend the features with the weights of `blended`, which is of the same lists; the band's tiles, or all.
-    camera_array: for pixels that are rays."""
+    """Blend the features with the weights of `blended`, which is of the same lists. camera_array: for pixels that are
+    rays."""
     plane_rows, stride = blended.stops.shape
     means = work.array("channel_means", (wanted.floats + len(DEPTHS), plane_rows, stride))
     whole = work.array("channel_whole", (len(WHOLE), plane_rows, stride), np.int32)
-    items = tile_items(device)
-    launch_groups(
-        device,
-        device.kernels("channels", ITEMS=items, **wanted.defines).channels,
-        band.tiles if band else (plane_rows // TILE) * (stride // TILE),
-        items,
-        band.first if band else 0,
-        stride // TILE,
-        height,
-        lists.ranges,
-        lists.gaussian_from_sorted,
-        projected.splats,
-        rows,
-        blended.stops,
-        means,
-        whole,
-        *([camera_array] if device.switched("RAYS") else []),
-    )
-    return Channels(wanted, means, whole)
+    arrays = (lists.ranges, lists.gaussian_from_sorted, projected.splats, rows, blended.stops, means, whole)
+    rays = (camera_array,) if device.switched("RAYS") else ()
+    launch_tiles(device, "channels", wanted.defines, lists, stride // TILE, height, *arrays, *rays)
+    return Channels(means, whole)

@@ -28,17 +28,7 @@ def gaussian_bytes(*, agreement: bool, contributions: bool) -> int:
     return 4 * (3 + agreement + 4 * contributions)
 
 
-@dataclass(frozen=True, eq=False)
-class EpochContributions:
-    """Contributions of each Gaussian to the pictures of an epoch, in pixels: totals (n,), over its views; largest (n,),
-    of one of them. Infinite, from its first view on, for Gaussians that were not there or not looked at."""
-
-    totals: DeviceArray
-    largest: DeviceArray
-
-    def rows(self, start: int, stop: int) -> EpochContributions:
-        """The contributions of the Gaussians from start to before stop."""
-        return EpochContributions(self.totals.rows(start, stop), self.largest.rows(start, stop))
+CONTRIBUTIONS = ("current_totals", "current_largest", "whole_totals", "whole_largest")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,38 +36,32 @@ class DensityStatistics:
     """Since the last densification, per Gaussian: gradient_sums, seen (views), radii (largest, in pixels), agreeing
     (views with a gradient over the threshold; None where they are not counted); (n,).
 
-    Contributions are of epochs of the training views, whenever Gaussians were densified: of the one under way and of
-    the last whole one; None where nothing goes by them.
+    CONTRIBUTIONS to the pictures of an epoch of the training views, in pixels, whenever Gaussians were densified: over
+    the views of the current one and of the last whole one, and the largest to one of them. Infinite, from its first
+    view on, for Gaussians that were not there or not looked at; None where nothing goes by them.
     """
 
     gradient_sums: DeviceArray
     seen: DeviceArray
     radii: DeviceArray
     agreeing: DeviceArray | None = None
-    current: EpochContributions | None = None
-    whole: EpochContributions | None = None
+    current_totals: DeviceArray | None = None
+    current_largest: DeviceArray | None = None
+    whole_totals: DeviceArray | None = None
+    whole_largest: DeviceArray | None = None
 
     def rows(self, start: int, stop: int) -> DensityStatistics:
         """The statistics of the Gaussians from start to before stop."""
-        arrays = {name: array.rows(start, stop) for name, array in vars(self).items() if array is not None}
-        return DensityStatistics(**arrays)
+        return DensityStatistics(**{name: array.rows(start, stop) for name, array in self.named().items()})
 
     def named(self) -> dict[str, DeviceArray]:
-        """Every array by its name in a checkpoint."""
-        arrays: dict[str, DeviceArray] = {}
-        for name, value in vars(self).items():
-            if isinstance(value, EpochContributions):
-                arrays |= {f"{name}_totals": value.totals, f"{name}_largest": value.largest}
-            elif value is not None:
-                arrays[name] = value
-        return arrays
+        """Every array by its name, which it has in a checkpoint too."""
+        return {name: array for name, array in vars(self).items() if array is not None}
 
     def moved(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_], *, densified: bool) -> dict[str, Float32]:
         """The arrays that are kept, on the host by `named`, when row j becomes what row rows[j] was: contributions,
         infinite for fresh rows; and everything else if nothing was densified."""
-        going_on = self.named()
-        if densified:
-            going_on = {name: array for name, array in going_on.items() if name.startswith(("current_", "whole_"))}
+        going_on = {name: array for name, array in self.named().items() if name in CONTRIBUTIONS or not densified}
         values = {name: array.get()[rows] for name, array in going_on.items()}
         for array in values.values():
             array[fresh] = np.inf
@@ -91,35 +75,36 @@ class DensityStatistics:
 
     def forget_contributions(self) -> None:
         """Forget the Gaussians' contributions, until the next epoch is over."""
-        for epoch in (self.current, self.whole):
-            if epoch is not None:
-                epoch.totals.fill(np.inf)
-                epoch.largest.fill(np.inf)
+        for name, array in self.named().items():
+            if name in CONTRIBUTIONS:
+                array.fill(np.inf)
 
     def next_epoch(self) -> DensityStatistics:
         """The same with the epoch under way as the last whole one, and a new one that begins."""
-        if self.current is None or self.whole is None:
+        if self.whole_totals is None or self.whole_largest is None:
             return self
-        self.whole.totals.fill(0.0)
-        self.whole.largest.fill(0.0)
-        return replace(self, current=self.whole, whole=self.current)
+        self.whole_totals.fill(0.0)
+        self.whole_largest.fill(0.0)
+        return replace(
+            self,
+            current_totals=self.whole_totals,
+            current_largest=self.whole_largest,
+            whole_totals=self.current_totals,
+            whole_largest=self.current_largest,
+        )
 
 
 def new_statistics(
     device: Device, count: int, *, agreement: bool = False, contributions: bool = False
 ) -> DensityStatistics:
     """Statistics of `count` Gaussians of which nothing is known yet: zeros, contributions infinite."""
-
-    def filled(value: float) -> DeviceArray:
-        array = allocate(device, (count,), np.float32)
-        array.fill(value)
-        return array
-
-    def unknown() -> EpochContributions | None:
-        return EpochContributions(filled(np.inf), filled(np.inf)) if contributions else None
-
-    agreeing = filled(0.0) if agreement else None
-    return DensityStatistics(filled(0.0), filled(0.0), filled(0.0), agreeing, unknown(), unknown())
+    names = ["gradient_sums", "seen", "radii", *(["agreeing"] if agreement else [])]
+    arrays = {
+        name: allocate(device, (count,), np.float32) for name in [*names, *(CONTRIBUTIONS if contributions else ())]
+    }
+    for name, array in arrays.items():
+        array.fill(np.inf if name in CONTRIBUTIONS else 0.0)
+    return DensityStatistics(**arrays)
 
 
 @stage("statistics")
@@ -144,13 +129,13 @@ def add_statistics(
 
 @stage("statistics")
 def add_contributions(
-    device: Device, epoch: EpochContributions, projected: Projected, contributions: DeviceArray, area: float
+    device: Device, statistics: DensityStatistics, projected: Projected, contributions: DeviceArray, area: float
 ) -> None:
     """Add what one view's Gaussians contributed, (n,), to the epoch under way. area: what a pixel counts, as with less
     than the full resolution it is several."""
     n = projected.tile_counts.shape[0]
     kernel, view = device.kernels("density").contribution_statistics, (projected.tile_counts, contributions)
-    launch_items(device, kernel, n, n, area, *view, epoch.totals, epoch.largest)
+    launch_items(device, kernel, n, n, area, *view, statistics.current_totals, statistics.current_largest)
 
 
 def try_gather(device: Device, count: int, source: AnyGaussians) -> None:

@@ -66,12 +66,10 @@ class Counted:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """tile_keys (pairs), pair_ids (pairs, 2): the slot and the Gaussian, both by depth, ties by index of the Gaussian;
-    first_slots (n): where a Gaussian's slots begin."""
+    """tile_keys (pairs), pair_ids (pairs, 2): slot and Gaussian, both by depth, ties by index of the Gaussian."""
 
     tile_keys: DeviceArray
     pair_ids: DeviceArray
-    first_slots: DeviceArray
 
 
 @stage("duplicate")
@@ -170,7 +168,7 @@ def duplicate(
     device: Device, work: Workspace, splats: DeviceArray, counted: Counted, tiles: tuple[int, int], band: Band
 ) -> Pairs:
     """Sort the visible Gaussians by depth and emit their pairs in that order."""
-    visible, pairs, first_slots = counted.visible, counted.pairs, counted.first_slots
+    visible, pairs = counted.visible, counted.pairs
     kernels = device.kernels("duplicate")
     _, order = sort(device, work, "depth", counted.depth_keys, counted.key_bits, counted.least_key)
     gaussian_from_rank = work.array("gaussian_from_rank", (visible,), np.uint32)
@@ -181,9 +179,9 @@ def duplicate(
     scan(device, work, counts, offsets, work.array("pairs_total", (1,), np.uint32))
     tile_keys = work.array("tile_keys", (pairs,), np.uint32)
     pair_ids = work.array("pair_ids", (pairs, 2), np.uint32)
-    extent, arrays = (*tiles, band.first, band.end), (gaussian_from_rank, offsets, first_slots, splats)
+    extent, arrays = (*tiles, band.first, band.end), (gaussian_from_rank, offsets, counted.first_slots, splats)
     launch_items(device, kernels.duplicate, visible, visible, *extent, *arrays, tile_keys, pair_ids)
-    return Pairs(tile_keys, pair_ids, first_slots)
+    return Pairs(tile_keys, pair_ids)
 
 
 @stage("duplicate")
@@ -205,4 +203,4 @@ def duplicate_and_sort(
     pair_ids = work.array("pair_ids", (pairs, 2), np.uint32)
     ordered = (slot_from_pair, tile_from_slot, gaussian_from_slot, tile_keys, pair_ids)
     launch_items(device, kernels.order_pairs, pairs, pairs, *ordered)
-    return Pairs(tile_keys, pair_ids, counted.first_slots)
+    return Pairs(tile_keys, pair_ids)

@@ -62,7 +62,7 @@ def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
     """
     device.finish()
     start = time.perf_counter()
-    with device.recorder.recording(device, wait=True) as stages:
+    with device.recorder.recording(wait=True) as stages:
         result = work()
     total = 1e3 * (time.perf_counter() - start)
     times = {name: record.wall_ms for name, record in stages.items() if record.wall_ms > 0}

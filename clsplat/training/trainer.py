@@ -110,10 +110,10 @@ class _Watched(StepProbe):
         device, camera, screen = self.trainer.device, self.camera, rows.screen
         if self.needs.gradients:
             add_statistics(device, statistics, camera, rows.projected, screen, self.needs.threshold)
-        if screen.contributions is not None and statistics.current is not None:
+        if screen.contributions is not None and statistics.current_totals is not None:
             full = self.trainer.views[self.view].camera
             area = full.width * full.height / (camera.width * camera.height)
-            add_contributions(device, statistics.current, rows.projected, screen.contributions, area)
+            add_contributions(device, statistics, rows.projected, screen.contributions, area)
 
 
 class Trainer:

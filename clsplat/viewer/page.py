@@ -6,25 +6,26 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from clsplat.arrays import Float64
 from clsplat.errors import ClsplatError, InputError, plain
 from clsplat.rotations import quaternion_of
 from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
 from clsplat.viewer.path_recorder import FPS, Recorder, save_path
-from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose
+from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose, Start
 from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import View
     from clsplat.viewer.models import Model
-    from clsplat.viewer.server import World
 
 THUMBNAIL = 240
 """Longest side of a photo on the page."""
@@ -35,6 +36,19 @@ CAMERAS = ("hidden", "frames", "photos")
 CAMERA_COLOURS = {"train": (80, 160, 255), "test": (255, 160, 60), "key": (255, 60, 90)}
 SIZE = (1280, 720)
 """Width and height of a path's pictures and of screenshots, unless another is asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Facts that the pages begin with. origin (3,): subtracted from the world for the browser, whose numbers are
+    float32; box: corners (3,) of what the crop's sliders reach; degree: of the model's SH."""
+
+    title: str
+    start: Start
+    origin: Float64
+    box: tuple[Float64, Float64]
+    degree: int
+    views: Sequence[View] = ()
 
 
 class ViserPage:

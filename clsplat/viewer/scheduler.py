@@ -11,23 +11,29 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from clsplat.errors import ClsplatError
-from clsplat.viewer.appearance import Look
+from clsplat.viewer.appearance import Image, Look
 from clsplat.viewer.pose import Pose, fitted
 from clsplat.viewer.refinement import Level, Refinement, Share
 
 if TYPE_CHECKING:
     from clsplat.viewer.models import Model
-    from clsplat.viewer.page import ViserPage
+
+
+class Page(Protocol):
+    """A place that shows a viewer's pictures, with a remark on each, and messages: `page.ViserPage`."""
+
+    def show(self, image: Image, level: Level, text: str) -> None: ...
+    def tell(self, message: str) -> None: ...
 
 
 @dataclass(eq=False)
 class Viewer:
     """One viewer: page, refinement, look and pose; trouble: the message that the page has shown last."""
 
-    page: ViserPage
+    page: Page
     refinement: Refinement
     look: Look = field(default_factory=Look)
     pose: Pose | None = None
@@ -47,7 +53,7 @@ class Viewing:
     def __len__(self) -> int:
         return len(self._viewers)
 
-    def join(self, page: ViserPage) -> Viewer:
+    def join(self, page: Page) -> Viewer:
         """Take in a viewer that has opened a page."""
         viewer = Viewer(page, Refinement(self.clock()))
         with self._news:

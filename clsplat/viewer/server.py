@@ -17,40 +17,23 @@ import re
 import socket
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from clsplat.arrays import Float64
 from clsplat.config.verbs import HOST, PORT
 from clsplat.errors import InputError, plain
-from clsplat.viewer.page import ViserPage
-from clsplat.viewer.pose import Start, read_pose
+from clsplat.viewer.page import ViserPage, World
+from clsplat.viewer.pose import read_pose
 from clsplat.viewer.scheduler import Viewer, Viewing
-
-if TYPE_CHECKING:
-    from clsplat.scenes.scene import View
 
 LOCAL = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
 """Names, as a pattern, by which a server for this machine alone may be asked."""
 FAR = 1000.0
 """viser's own far plane, of what it draws itself: cameras and boxes."""
-
-
-@dataclass(frozen=True, eq=False)
-class World:
-    """Facts that the pages begin with. origin (3,): subtracted from the world for the browser, whose numbers are
-    float32; box: corners (3,) of what the crop's sliders reach; degree: of the model's SH."""
-
-    title: str
-    start: Start
-    origin: Float64
-    box: tuple[Float64, Float64]
-    degree: int
-    views: Sequence[View] = ()
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ def brute_force_evaluated(pipeline: Pipeline, lanes: int, items: int, reached: C
 @pytest.mark.parametrize("name", ["overlap", "saturating", "many_per_tile", "random_cloud"])
 def test_contributing_pairs_are_those_of_the_reference(default_device: Device, name: str) -> None:
     scene = scenes.NAMED[name]()
-    wanted = reference.forward(*scene, BACKGROUND, margins=True).blended
+    wanted = reference.forward(*scene, BACKGROUND).blended
     got, _ = counted(Pipeline.run(shaped(default_device, 8, 1), scene))
     doubtful = wanted.margin < 1e-5  # pixels where a threshold may fall the other way, by one Gaussian or so
     assert abs(got - wanted.count.sum()) <= doubtful.sum()
@@ -134,7 +134,7 @@ def test_contributing_pairs_are_those_of_the_reference(default_device: Device, n
 
 def test_contributing_pairs_exactly(default_device: Device) -> None:
     scene = scenes.NAMED["one"]()
-    wanted = reference.forward(*scene, BACKGROUND, margins=True).blended
+    wanted = reference.forward(*scene, BACKGROUND).blended
     assert wanted.margin.min() > 1e-5
     assert counted(Pipeline.run(default_device, scene))[0] == wanted.count.sum()
 
@@ -214,7 +214,7 @@ def test_wall_time_where_events_have_none(default_device: Device) -> None:
 
 def test_nothing_is_recorded_unless_asked(profiled: Device) -> None:
     assert not profiled.recorder.on
-    with profiled.recorder.recording(profiled, wait=False) as stages:
+    with profiled.recorder.recording(wait=False) as stages:
         pass
     assert stages == {}
     assert not profiled.recorder.on

@@ -79,7 +79,7 @@ def test_another_machine_has_files_of_its_own(fresh: Device, monkeypatch: pytest
     if other == "target":
         monkeypatch.setenv("CL_CONFIG_CPU_TARGET_ARCH", "corei7")
     elif other == "processor":
-        monkeypatch.setattr(binaries, "_processor", lambda: "flags: sse2")
+        monkeypatch.setattr(binaries, "features", lambda: frozenset({"sse2"}))
     else:
         digest = Variant(VARIANT.stem, VARIANT.source, (*VARIANT.options, "-DMORE")).digest
     assert binaries.load(fresh.context, fresh.cl_device, digest, VARIANT.options) is None

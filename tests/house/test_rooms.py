@@ -85,6 +85,28 @@ def test_a_planted_import_is_found(copy: Path, module: str, line: str, told: str
     assert told in " ".join(done.stdout.split())
 
 
+LATE = {
+    "clsplat.gaussians": {"clsplat.models.formats"},  # Gaussians.load and save
+    # a verb imports its own work when it is called
+    "clsplat.cli.render": {"clsplat.cli.render_request", "clsplat.cli.render_plan"},
+    "clsplat.cli.convert": {"clsplat.cli.convert_edits"},
+}
+"""Imports that a function makes on purpose, against the order of the modules."""
+
+
+@pytest.mark.needs("importlinter")  # which brings grimp
+def test_no_imports_go_in_a_circle() -> None:
+    """Imports for types alone count: a circle cannot be read from its beginning."""
+    import grimp
+
+    graph = grimp.build_graph("clsplat", exclude_type_checking_imports=False, cache_dir=None)
+    imports = {name: graph.find_modules_directly_imported_by(name) - LATE.get(name, set()) for name in graph.modules}
+    imports["clsplat"] = set()  # types of the public names, which are loaded when they are first used
+    while outside := {name for name in imports if not imports[name] or not any(name in of for of in imports.values())}:
+        imports = {name: of - outside for name, of in imports.items() if name not in outside}
+    assert imports == {}
+
+
 def test_imports_are_at_the_top_of_their_modules() -> None:
     """But in `cli`, so that --help is quick."""
     found = []

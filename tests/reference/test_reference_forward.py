@@ -154,7 +154,7 @@ def test_poison_culls_its_own_gaussian_only(field: str, value: float) -> None:
 def test_boxes_lose_nothing_and_margins_see_the_thresholds() -> None:
     """Against an evaluation of every pixel; and moving each threshold by less than the margin changes no pixel."""
     gaussians, camera = scenes.random_cloud(60, 3, 40, 30)
-    result = forward(gaussians, camera, margins=True)
+    result = forward(gaussians, camera)
     projected = result.projected
     image = np.zeros((30, 40, 3))
     transmittance, done = np.ones((30, 40)), np.zeros((30, 40), np.bool_)

@@ -249,7 +249,7 @@ def test_no_such_device(capsys: Capture) -> None:
 def child(monkeypatch: pytest.MonkeyPatch, code: str) -> Report:
     monkeypatch.setattr(trust, "python_module", lambda *_, **__: [sys.executable, "-c", code])
     monkeypatch.setenv(TIMEOUT, "2")
-    return examine(0, shape_of(all_devices()[0]))
+    return examine(0, shape_of(all_devices()[0])[0])
 
 
 def test_a_driver_that_aborts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,7 +25,7 @@ SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
 
 def assert_image(device: Device, name: str) -> None:
     scene = scenes.NAMED[name]()
-    wanted = reference.forward(*scene, BACKGROUND, margins=True).blended
+    wanted = reference.forward(*scene, BACKGROUND).blended
     # 2e-5 is the project's contract for a frame; the band is where a threshold may fall the other way.
     assert_close_images(Pipeline.run(device, scene).image, wanted.image, 2e-5, ignore=wanted.margin < 1e-4)
 
@@ -45,7 +45,7 @@ def test_image_in_every_shape(shaped_device: Device, name: str) -> None:
 def test_sizes_at_the_seams(shaped_device: Device, size: tuple[int, int]) -> None:
     scene = scenes.random_cloud(200, 3, *size)
     run = Pipeline.run(shaped_device, scene)
-    wanted = reference.forward(*scene, BACKGROUND, margins=True).blended
+    wanted = reference.forward(*scene, BACKGROUND).blended
     assert run.image.shape == (size[1], size[0], 3)
     assert_close_images(run.image, wanted.image, 2e-5, ignore=wanted.margin < 1e-4)
     padded = run.frame.blended.image.get()
@@ -106,7 +106,7 @@ def test_nothing_visible(shaped_device: Device) -> None:
 
 def test_saturated_pixels_stop_where_the_contract_says(shaped_device: Device) -> None:
     scene = scenes.saturating()
-    run, wanted = Pipeline.run(shaped_device, scene), reference.forward(*scene, margins=True).blended
+    run, wanted = Pipeline.run(shaped_device, scene), reference.forward(*scene).blended
     clear = wanted.margin > 1e-4
     got = run.crop(run.frame.blended.transmittance.get())
     assert_close(got[clear], wanted.transmittance[clear], relative=1e-4, absolute=1e-7)

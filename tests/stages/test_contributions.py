@@ -15,7 +15,7 @@ from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SLOT, SlotFields
 from clsplat.reference import render as reference
-from clsplat.stages.density import add_contributions, new_statistics
+from clsplat.stages.density import CONTRIBUTIONS, add_contributions, new_statistics
 from clsplat.stages.project import Projected
 
 WITH = SlotFields(contributions=True)
@@ -100,33 +100,28 @@ def test_epochs(device: Device, count: int) -> None:
     def view(area: float) -> np.ndarray:
         tiles = rng.integers(0, 2, count).astype(np.uint32)
         values = rng.uniform(0.1, 5, count).astype(np.float32)
-        assert statistics.current is not None
         splats = upload(device, np.zeros((count, 16), np.float32))
-        add_contributions(
-            device, statistics.current, Projected(splats, upload(device, tiles)), upload(device, values), area
-        )
+        add_contributions(device, statistics, Projected(splats, upload(device, tiles)), upload(device, values), area)
         return np.where(tiles > 0, np.float32(area) * values, np.float32(0))
 
     view(1.0)
-    assert statistics.current is not None
-    assert np.isinf(statistics.current.totals.get()).all(), "the epoch had begun before"
+    assert statistics.current_totals is not None and statistics.current_largest is not None
+    assert np.isinf(statistics.current_totals.get()).all(), "the epoch had begun before"
     for _ in range(3):
         statistics = statistics.next_epoch()
         views = [view(area) for area in (1.0, 4.0, 1.0)]
-        assert statistics.current is not None
-        assert_same_bits(statistics.current.totals.get(), views[0] + views[1] + views[2])
-        assert_same_bits(statistics.current.largest.get(), np.maximum.reduce(views))
+        assert statistics.current_totals is not None and statistics.current_largest is not None
+        assert_same_bits(statistics.current_totals.get(), views[0] + views[1] + views[2])
+        assert_same_bits(statistics.current_largest.get(), np.maximum.reduce(views))
         before = statistics
     statistics = statistics.next_epoch()
-    assert statistics.whole is before.current
-    assert statistics.current is not None
-    assert not statistics.current.totals.get().any()
-    assert not statistics.current.largest.get().any()
+    assert statistics.whole_totals is before.current_totals
+    assert statistics.current_totals is not None and statistics.current_largest is not None
+    assert not statistics.current_totals.get().any()
+    assert not statistics.current_largest.get().any()
     statistics.forget_contributions()
-    for epoch in (statistics.current, statistics.whole):
-        assert epoch is not None
-        assert np.isinf(epoch.totals.get()).all()
-        assert np.isinf(epoch.largest.get()).all()
+    for name in CONTRIBUTIONS:
+        assert np.isinf(statistics.named()[name].get()).all()
 
 
 def test_what_goes_on_when_rows_move(device: Device) -> None:

@@ -184,7 +184,7 @@ def test_fewer_bits_are_fewer_launches(default_device: Device) -> None:
         config = BenchSwitches(key_bits=key_bits)  # type: ignore[arg-type]  # one of them
         run = Pipeline.run(device, (gaussians, camera), config=config)
         assert run.visible.sum() > BITONIC_WINS["cpu"]
-        with device.recorder.recording(device, wait=False) as stages:
+        with device.recorder.recording(wait=False) as stages:
             run.rasterizer.forward(run.gaussians, run.camera, run.frame.background)
         launches[key_bits] = {name: stages[name].launches for name in ("duplicate", "ranges")}
     for name in ("duplicate", "ranges"):

@@ -31,8 +31,7 @@ of a size of 100, is rounded to 1e-14, a slope so to 1e-6 of gradients of a size
 def subject(name: str) -> tuple[tuple[Gaussians, scenes.Camera], np.ndarray]:
     """Scene and the image's gradient, which is 0 where float32 may decide otherwise."""
     gaussians, camera = scenes.NAMED[name]()
-    margin = forward(gaussians, camera, BACKGROUND, margins=True).blended.margin
-    assert margin is not None
+    margin = forward(gaussians, camera, BACKGROUND).blended.margin
     band = margin < BAND
     assert band.mean() <= MOST_IN_BAND.get(name, 0.005), "the band hides more than its share"
     d_image = np.random.default_rng(5).standard_normal((camera.height, camera.width, 3))

@@ -111,7 +111,7 @@ def test_after_an_opacity_reset_the_whole_ellipse_learns(device: Device) -> None
     gaussians, camera = scenes.overlap()
     scene = replace(gaussians, opacity_logits=np.full(len(gaussians), np.log(0.01 / 0.99), np.float32)), camera
     run = Pipeline.run(device, scene)
-    forward = reference.forward(*scene, margins=True)
+    forward = reference.forward(*scene)
     d_image = image_gradient(run)
     d_image[forward.blended.margin < 1e-4] = 0
     got, _ = run.backward(d_image)
@@ -131,7 +131,7 @@ def test_clamps_follow_an_off_centre_principal_point(device: Device, cx: float) 
     means = scenes.world_from_pixels(moved, pixels, depths).astype(np.float32)
     scene = replace(gaussians, means=means, log_scales=gaussians.log_scales + np.float32(1.5)), moved
     run = Pipeline.run(device, scene)
-    forward = reference.forward(*scene, BACKGROUND, margins=True)
+    forward = reference.forward(*scene, BACKGROUND)
     band = forward.blended.margin < 1e-4
     assert_close_images(run.image, forward.blended.image, 1e-5, ignore=band)
     d_image = image_gradient(run)
@@ -147,7 +147,7 @@ def test_numbers_of_tiles_that_are_powers_of_two(device: Device, tiles: int) -> 
     """Keys a bit too narrow for the last tile."""
     scene = scenes.random_cloud(200, 5, TILE * tiles, TILE)
     run = Pipeline.run(device, scene)
-    forward = reference.forward(*scene, BACKGROUND, margins=True)
+    forward = reference.forward(*scene, BACKGROUND)
     assert_close_images(run.image, forward.blended.image, 1e-5, ignore=forward.blended.margin < 1e-4)
     assert run.frame.part.lists.ranges.shape[0] == tiles
 

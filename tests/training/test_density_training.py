@@ -22,6 +22,7 @@ from clsplat.gaussians import GROUPS
 from clsplat.reference.render import render_grad
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
+from clsplat.stages.density import CONTRIBUTIONS
 from clsplat.stages.device_gaussians import HostGaussians
 from clsplat.training.density import ModelState, RowPlan, adaptive
 from clsplat.training.trainer import Trainer
@@ -115,16 +116,16 @@ def test_contributions_are_those_of_an_epoch(scene: Scene, default_device: Devic
         trainer.train_step()
     nothing = np.zeros((views[0].camera.height, views[0].camera.width, 3))
     each = np.array([render_grad(model, view.camera, nothing).contributions for view in views])
-    assert trainer.statistics.whole is not None
+    assert trainer.statistics.whole_totals is not None
     # 4/255 a view, as of the stage itself
-    assert_close(trainer.statistics.whole.totals.get(), each.sum(axis=0), relative=1e-4, absolute=len(views) * 4 / 255)
-    assert_close(trainer.statistics.whole.largest.get(), each.max(axis=0), relative=1e-4, absolute=4 / 255)
+    assert_close(trainer.statistics.whole_totals.get(), each.sum(axis=0), relative=1e-4, absolute=len(views) * 4 / 255)
+    assert_close(trainer.statistics.whole_largest.get(), each.max(axis=0), relative=1e-4, absolute=4 / 255)
     coarse = Trainer(scene, replace(config, warmup=(99,)), default_device)
     for _ in range(len(views) + 1):
         coarse.train_step()
-    assert coarse.statistics.whole is not None
+    assert coarse.statistics.whole_totals is not None
     # half the pixels a side: the low-pass of 0.3 square pixels weighs four times as much, which makes small ones larger
-    ratio = coarse.statistics.whole.totals.get().sum() / each.sum()
+    ratio = coarse.statistics.whole_totals.get().sum() / each.sum()
     assert ratio == pytest.approx(1.0, abs=0.1)
 
 
@@ -132,12 +133,11 @@ def test_a_reset_forgets_contributions(scene: Scene, default_device: Device) -> 
     trainer = Trainer(scene, EVERYTHING, default_device)
     for _ in range(20):
         trainer.train_step()
-    assert trainer.statistics.whole is not None
-    assert np.isfinite(trainer.statistics.whole.totals.get()).any()
+    assert trainer.statistics.whole_totals is not None
+    assert np.isfinite(trainer.statistics.whole_totals.get()).any()
     trainer._control_density()
-    for epoch in (trainer.statistics.whole, trainer.statistics.current):
-        assert epoch is not None
-        assert np.isinf(epoch.totals.get()).all()
+    for name in CONTRIBUTIONS:
+        assert np.isinf(trainer.statistics.named()[name].get()).all()
 
 
 @pytest.mark.parametrize("step", quick([7, 8, 12, 19, 20, 22, 40, 41, 45], 8, 20, 41))
@@ -160,8 +160,8 @@ def test_settings_that_come_with_resume(scene: Scene, default_device: Device, tm
     assert checkpoint is not None
     trainer = Trainer(scene, EVERYTHING, default_device)
     trainer.restore(checkpoint)
-    assert trainer.statistics.whole is not None
-    assert np.isinf(trainer.statistics.whole.largest.get()).all()
+    assert trainer.statistics.whole_largest is not None
+    assert np.isinf(trainer.statistics.whole_largest.get()).all()
     assert trainer.statistics.seen.get().any(), "what it has is taken"
     train(scene, EVERYTHING, device=default_device, run=run, resume=True)
     assert run.model_path.exists()
