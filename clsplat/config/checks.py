@@ -45,7 +45,7 @@ def misfit(kind: Any, value: object) -> str | None:
     elif kind is int:
         fits, expected = _is_whole(value), f"a whole number below {MOST}"
     elif kind is float:
-        fits = isinstance(value, Real) and not _is_truth(value) and not 1e300 <= abs(float(value)) < inf  # type: ignore[operator]
+        fits = isinstance(value, Real) and not _is_truth(value) and not 1e300 <= abs(value) < inf  # type: ignore[operator]
         expected = "a number below 1e300"
     else:
         fits = _is_truth(value) if kind is bool else isinstance(value, kind)

@@ -29,7 +29,7 @@ from clsplat.spherical_harmonics import C0
 def told(scene: Scene, device: Device, **changes: object) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        train(scene, short(**changes), device=device)
+        train(scene, short(warmup=(), **changes), device=device)
     return [str(warning.message) for warning in caught]
 
 
