@@ -172,7 +172,7 @@ def compare(device: Device, scene: Scene, rng: np.random.Generator) -> FrameOutc
     """A frame and its gradient for a random gradient of the image, which is 0 in the band."""
     gaussians, camera = scene
     rasterizer, on_device, frame, image = frame_of(device, scene)
-    wanted = reference.forward(gaussians, camera, BACKGROUND, margins=True)
+    wanted = reference.forward(gaussians, camera, BACKGROUND)
     blended = wanted.blended
     assert blended.margin is not None
     band = blended.margin < BAND
@@ -222,7 +222,7 @@ def compare_8k(device: Device, rng: np.random.Generator, *, count: int = 2000, c
     for _ in range(crops):
         x, y = (int(rng.choice([0, size - side, rng.integers(0, size - side)])) for size in (width, height))
         moved = replace(projected, means2d=projected.means2d - (x, y))
-        blended = blend(moved, order, side, side, BACKGROUND, margins=True)
+        blended = blend(moved, order, side, side, BACKGROUND)
         assert blended.margin is not None
         near = blended.margin < BAND
         error = np.abs(image[y : y + side, x : x + side] - blended.image).max(axis=2) / scale

@@ -168,7 +168,7 @@ def test_a_scene_of_one_point(tmp_path: Path, capfd: Capture) -> None:
     scene = write_scene(tmp_path / "scene")
     points = scene / "sparse" / "0" / "points3D.txt"
     points.write_text(points.read_text().splitlines()[0] + "\n")
-    assert train(scene, tmp_path / "run", short(iterations=2)) == 0
+    assert train(scene, tmp_path / "run", short(iterations=2, warmup=())) == 0
     warned = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
     assert warned == [
         f"clsplat: warning: {scene}: has a single point, training starts from one Gaussian of next to no size"
