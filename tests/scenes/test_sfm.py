@@ -182,7 +182,7 @@ def test_exif_orientation_subfolders_and_a_photo_of_something_else(pictures, tmp
     messages = [str(warning.message) for warning in caught if warning.category is UserWarning]
     assert any("phone.heic" in message for message in messages)
     assert any("stray.jpg" in message and "could not be placed" in message for message in messages)
-    assert sfm.unregistered(output) == ["stray.jpg"]
+    assert json.loads((output / sfm.RECORD).read_text())["unregistered"] == ["stray.jpg"]
 
     found = sorted(path.relative_to(output / "images").as_posix() for path in (output / "images").rglob("*.JPG"))
     assert found == [f"{'left' if index < 6 else 'right'}/{index:02d}.JPG" for index in range(COUNT)]
