@@ -9,6 +9,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import make_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -19,23 +20,27 @@ from tyro.conf import subcommand
 from clsplat.cli.options import Verb
 
 DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
-VERBS = (
-    "devices",
-    "demo",
-    "sfm",
-    "train",
-    "eval",
-    "render",
-    "view",
-    "report",
-    "compare",
-    "convert",
-    "info",
-    "bench",
-    "tune",
-    "selftest",
-)
-"""The verbs, as --help lists them. Each is a module of `clsplat.cli`, with a class of its name and a function `run`."""
+VERBS = {
+    "devices": "List the OpenCL devices.",
+    "demo": "Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable.",
+    "sfm": "Turn a folder of photos into a scene: COLMAP's cameras and points, and the undistorted images.",
+    "train": "Train a scene.",
+    "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS where the extra is installed.",
+    "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",
+    "view": "Look at a model in the browser: the device renders, the page shows it.",
+    "report": "Write a run's report: one HTML file with curves, pictures, figures and settings, that "
+    "loads nothing else.",
+    "compare": "Print runs side by side: scores, Gaussians, times, and the settings that differ.",
+    "convert": "Write a model in another format, by the files' endings, and say what was lost; or edit it on the way.",
+    "info": "Say what a model file holds: format, count, SH, bounds, scales, opacities, colour space, "
+    "what is not finite.",
+    "bench": "Measure each stage of a frame and of a training step, and the device's own limits in the same run.",
+    "tune": "Find the quickest shape of the kernels for a device by a short trial, and keep it for later runs.",
+    "selftest": "Test every device: build the kernels, run each stage on frozen scenes, compare with "
+    "float64 and stored digests.",
+}
+"""The verbs in the order of --help, with the first sentence of each one's help. Each is a module of `clsplat.cli`, with
+a class of its name and a function `run`. A module is imported when its verb is called."""
 
 
 def verb_module(name: str) -> Any:
@@ -49,10 +54,16 @@ def verb_class(name: str) -> type[Verb]:
     return kind
 
 
+def _listed(name: str) -> type:
+    """A verb that is not called: its line in the list of verbs, without arguments."""
+    return make_dataclass(name.capitalize(), (), namespace={"__doc__": VERBS[name]})
+
+
 def parse(arguments: Sequence[str]) -> Verb:
     """The verb that the command line asks for. Raises InputError, and SystemExit with the trouble reported in one line,
     or after the help has been printed."""
-    commands: Any = Union[tuple(Annotated[verb_class(name), subcommand(name)] for name in VERBS)]  # noqa: UP007
+    kinds = {name: verb_class(name) if name in arguments else _listed(name) for name in VERBS}
+    commands: Any = Union[tuple(Annotated[kind, subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
     report = io.StringIO()
     helping = not {"-h", "--help"}.isdisjoint(arguments)
     try:

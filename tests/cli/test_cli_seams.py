@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import fields, replace
 from importlib import import_module
 from pathlib import Path
@@ -28,6 +30,23 @@ def test_every_verb_is_a_module_with_its_arguments_and_its_function() -> None:
         module = parsing.verb_module(name)
         assert issubclass(parsing.verb_class(name), Verb), name
         assert callable(module.run), name
+
+
+def test_the_list_of_verbs_says_what_their_help_begins_with() -> None:
+    for name, sentence in parsing.VERBS.items():
+        help_text = " ".join((parsing.verb_class(name).__doc__ or "").split())
+        assert help_text.startswith(sentence), name
+
+
+@pytest.mark.parametrize(("words", "called"), [(["--help"], []), (["info", "--help"], ["info"])])
+def test_no_other_verb_is_imported_than_the_one_that_is_called(words: list[str], called: list[str]) -> None:
+    code = (
+        "import sys; from clsplat.cli.main import main; main(sys.argv[1:]); "
+        "from clsplat.cli.parsing import VERBS; "
+        "print([name for name in VERBS if f'clsplat.cli.{name}' in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == str(called)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ STARTS = {
 
 @pytest.mark.parametrize("start", STARTS)
 @pytest.mark.parametrize(
-    "module", ["clsplat.cli.main", "tyro", "clsplat.config.training", "clsplat.cli.devices", "pyopencl"]
+    "module", ["clsplat.cli.main", "tyro", "clsplat.cli.options", "clsplat.cli.devices", "pyopencl"]
 )
 def test_ctrl_c_during_an_import(start: str, module: str) -> None:
     code = INTERRUPTED.format(module=module, start=STARTS[start])
