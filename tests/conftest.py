@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sys
 from collections import Counter
@@ -25,7 +26,7 @@ from dying import standing  # noqa: F401  # a fixture
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from needs import missing
 from pipeline import QUICK_SHAPES, shaped, shapes_of
-from tiny import CONFIG, short, write_scene
+from tiny import CONFIG, FEW, short, write_scene
 
 from clsplat.device.context import Device, open_device
 
@@ -109,3 +110,17 @@ def reported(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("reported") / "a run"
     assert train(scene, run, short(stages_every=10, eval_at=(10, 30))) == 0
     return run
+
+
+@pytest.fixture(scope="session")
+def begun(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of FEW by the command line; not to be changed."""
+    run = tmp_path_factory.mktemp("begun") / "run"
+    assert train(scene, run, FEW) == 0
+    return run
+
+
+@pytest.fixture
+def run(begun: Path, tmp_path: Path) -> Path:
+    """A copy of that run, to be changed."""
+    return Path(shutil.copytree(begun, tmp_path / "run"))

@@ -62,16 +62,15 @@ def digest_of(record: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def known_digests(run: Run) -> set[str]:
-    """Digests of the scene of scene.json, and of those that it has taken the place of."""
-    record = read(run)
+def known_digests(record: dict[str, Any] | None) -> set[str]:
+    """Digests of the scene of a record, and of those that it has taken the place of."""
     return {digest_of(record), *record.get("earlier", [])} if record is not None else set()
 
 
 def write(run: Run, scene: Scene) -> None:
     """Write scene.json. Checkpoints that are there stay those of the run: their scenes are kept as earlier ones."""
     record, there = record_of(scene, run.config.resolution), {scene_of(path) for _, path in run.checkpoints()}
-    earlier = known_digests(run) | {digest for digest in there if digest}
+    earlier = known_digests(read(run)) | {digest for digest in there if digest}
     record["earlier"] = sorted(earlier - {digest_of(record)})
     atomic_write(run.path / NAME, (json.dumps(record, allow_nan=False) + "\n").encode())
 
@@ -137,10 +136,11 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
 
     Raises InputError where it differs otherwise, or where the model would not lie where its numbers say.
     """
-    earlier, known = read(run), known_digests(run)
+    earlier = read(run)
     if earlier is None:
         return False
-    others = [path for _, path in run.checkpoints() if (scene_of(path) or next(iter(known))) not in known]
+    known = known_digests(earlier)
+    others = [path for _, path in run.checkpoints() if (digest := scene_of(path)) and digest not in known]
     if others and not accept:
         raise InputError(
             f"{others[-1]}: is of a training on another scene than {run.path} is of, expected one of this run; remove "

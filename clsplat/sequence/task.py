@@ -193,8 +193,8 @@ def _content(source: str) -> str:
     if not source or not is_file(Path(source)):
         return source
     patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
-    tables = sorted({path for each in patterns for path in glob(each) if is_file(Path(path))})  # noqa: PTH207
-    return " ".join(_digest_at(str(each), Path(each).stat().st_mtime_ns) for each in (source, *tables))
+    tables = sorted({path for pattern in patterns for path in glob(pattern) if is_file(Path(path))})  # noqa: PTH207
+    return " ".join(_digest_at(path, Path(path).stat().st_mtime_ns) for path in (source, *tables))
 
 
 @lru_cache(maxsize=4096)
@@ -211,11 +211,11 @@ def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG0
     places = re.split(r"[\n\[\],:;]|\s-\s", listed[1]) if listed else []
     names = re.findall(r"\bsrc:[ \t]*(\"[^\"]*\"|'[^']*'|[^,}\n]+)", text)
     folders, files = (
-        {re.sub(r"\$\{\w+\}|\$\w+|%\w+%", "*", escape(each.strip(" \t\"'"))) for each in found}
-        for found in (places, names)
+        {re.sub(r"\$\{\w+\}|\$\w+|%\w+%", "*", escape(text.strip(" \t\"'"))) for text in texts}
+        for texts in (places, names)
     )
-    beside = Path(escape(str(Path(source).parent)))
-    return tuple(sorted({str(beside / folder / file) for folder in folders | {""} for file in files}))
+    home = Path(escape(str(Path(source).parent)))
+    return tuple(sorted({str(home / folder / file) for folder in folders | {""} for file in files}))
 
 
 def header(task: Task, options: RenderOptions) -> Header:

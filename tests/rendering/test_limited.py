@@ -190,7 +190,7 @@ def test_no_buffer_is_over_the_devices_limit_of_one(
 
 @pytest.mark.parametrize("capacity", [None, 3000])
 def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int | None) -> None:
-    """What a step took, at once and in bands, against what the stages say. They may say more: of the photograph, and
+    """Memory of a step, at once and in bands, against what the stages say. They may say more: of the photograph, and
     of Gaussians that are not visible."""
     device = with_limit(default_device, 2**40)  # a limit, so that no array has room to spare
     gaussians, camera = random_cloud(6000, 11, 100, 80)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the readers of camera files share: the same values are refused in the same words, whatever the format."""
+"""Checks that the readers of camera files share: the same values are refused in the same words, whatever the format."""
 
 from __future__ import annotations
 

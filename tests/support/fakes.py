@@ -48,7 +48,7 @@ class FakeDevice:
 
 @dataclass
 class Pipeline:
-    """What the fakes were asked for, and what they are to do; `main` is the command line on them."""
+    """Calls that the fakes have had, and what they are to do; `main` is the command line on them."""
 
     calls: list[tuple[Any, ...]] = field(default_factory=list)
     written: dict[str, np.ndarray] = field(default_factory=dict)

@@ -125,6 +125,10 @@ def short(**changes: object) -> TrainConfig:
     return replace(config, density=replace(config.density, **density))  # type: ignore[arg-type]
 
 
+FEW = short(iterations=3, sh_degree_every=1, report=False, density={"every": 0})
+"""A training of three steps, without density control."""
+
+
 def loss_curve(scene: Scene, device: Device) -> list[float]:
     """The losses of 20 steps in which everything happens: `golden/loss_curve.json`.
 

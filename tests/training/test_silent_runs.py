@@ -16,8 +16,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from calls import Capture, error_line
-from calls import train as command_train
-from tiny import short, write_scene
+from tiny import FEW, short, write_scene
 
 import clsplat
 from clsplat.api import train
@@ -32,21 +31,6 @@ from clsplat.runs.run import Run
 from clsplat.scenes import doubts
 from clsplat.scenes.scene import load_scene
 from clsplat.training.loop import late_settings
-
-FEW = short(iterations=3, sh_degree_every=1, report=False, density={"every": 0})
-
-
-@pytest.fixture(scope="module")
-def begun(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of three steps; not to be changed."""
-    run = tmp_path_factory.mktemp("begun") / "run"
-    assert command_train(scene, run, FEW) == 0
-    return run
-
-
-@pytest.fixture
-def run(begun: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(begun, tmp_path / "run"))
 
 
 def test_the_module_of_the_command_line_is_one() -> None:
