@@ -58,8 +58,8 @@ def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
 def opacities(logits: Float32) -> Float64:
     """0 to 1 of logits."""
     with np.errstate(over="ignore"):  # exp of a large number: the opacity is 0 then, as it should be
-        opacities: Float64 = 1 / (1 + np.exp(-logits.astype(np.float64)))
-    return opacities
+        values: Float64 = 1 / (1 + np.exp(-logits.astype(np.float64)))
+    return values
 
 
 def logits(opacity: NDArray[Any]) -> Float32:
