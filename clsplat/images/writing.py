@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import errno
-import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -15,8 +13,8 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.errors import ClsplatError, InputError, WriteError, plain
-from clsplat.files import is_file, native_name, replace, require_room, room_error, temporary_name, write_error
+from clsplat.errors import ClsplatError, InputError, plain
+from clsplat.files import atomic_name, native_name, require_room, room_error
 from clsplat.images.alpha import associate
 from clsplat.images.reading import decodes, one_line, opened, png_is_whole
 
@@ -123,48 +121,31 @@ class Output:
         return native_name(self.temporary)
 
     def take(self, done: bool) -> None:
-        """Take what the file's methods return. Raises WriteError or ClsplatError where that is failure."""
+        """Take what the file's methods return. Raises OSError or ClsplatError where that is failure."""
         if not done:
             self.fail(self.file.geterror())
 
     def fail(self, reason: str) -> NoReturn:
-        """Raise WriteError where the system refuses to write, else ClsplatError: OpenImageIO seldom says which."""
-        written = self.temporary.stat().st_size if is_file(self.temporary) else 0
+        """Raise OSError where the system refuses to write, else ClsplatError: OpenImageIO seldom says which."""
         if error := room_error(self.temporary.parent):
-            self.file.close()
-            with suppress(OSError):  # so that the message has what is free without it
-                self.temporary.unlink()
-            raise write_error(self.path, error, written) from None
+            raise OSError(error.errno, error.strerror)
         raise ClsplatError(f"{self.path}: cannot be written: {plain(one_line(reason))}")
 
 
 @contextmanager
 def atomic_output(path: Path, specs: Sequence[Any], kind: str) -> Iterator[Output]:
-    """A file to write that takes the place of `path` when the block ends well, and never exists otherwise.
-
-    specs: of its parts; raises ClsplatError if writing fails."""
-    # Not through files.atomic_writer: OpenImageIO writes to a name, not to an open file.
-    target = Path(os.path.realpath(path))
-    temporary = temporary_name(target)
-    output = Output(oiio.ImageOutput.create(kind), temporary, path)
+    """OpenImageIO's file of an `atomic_name`. specs: of its parts. Raises ClsplatError if writing fails."""
     # libjpeg ends the process when it cannot write
     most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
-    try:
-        if target.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        with require_room(path, most):
-            # several parts have to be announced together
-            output.take(output.file.open(output.name, specs[0] if len(specs) == 1 else tuple(specs)))
-            yield output
-            output.take(output.file.close())
-        if not _is_whole(temporary, kind, len(specs)):  # the last bytes of a full disk are lost without a word
-            output.fail("the file is not whole")
-        replace(temporary, target)
-    except WriteError:
-        raise
-    except OSError as error:
-        raise write_error(path, error) from None
-    finally:
-        output.file.close()
-        with suppress(OSError):  # it is gone if all went well
-            temporary.unlink()
+    with atomic_name(path) as temporary:
+        output = Output(oiio.ImageOutput.create(kind), temporary, path)
+        try:
+            with require_room(path, most):
+                # several parts have to be announced together
+                output.take(output.file.open(output.name, specs[0] if len(specs) == 1 else tuple(specs)))
+                yield output
+                output.take(output.file.close())
+            if not _is_whole(temporary, kind, len(specs)):  # the last bytes of a full disk are lost without a word
+                output.fail("the file is not whole")
+        finally:
+            output.file.close()
