@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clsplat.config.pictures import FPS, VideoConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import FULL, atomic_name, native_name
-from clsplat.images.channels import VIDEO
+from clsplat.images.frame_files import VIDEO
 
 _LUMA = (0.2126, 0.7152, 0.0722)
 _BLUE, _RED = np.float32(2 * (1 - 0.0722)), np.float32(2 * (1 - 0.2126))

@@ -87,7 +87,7 @@ PICTURES = """
 import sys
 from pathlib import Path
 import numpy as np
-from clsplat.config.pictures import Encoding; from clsplat.images.channels import is_whole, write_channels
+from clsplat.config.pictures import Encoding; from clsplat.images.frame_files import is_whole, write_channels
 folder, name = Path(sys.argv[1]), sys.argv[2]
 rng = np.random.default_rng(0)
 for size in range(*map(int, sys.argv[3:])):

@@ -19,11 +19,11 @@ from calls import left_behind
 from scenes import tilted_camera
 
 from clsplat.camera import Camera
+from clsplat.config.channels import CHANNELS
 from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import temporary_name
 from clsplat.frame.draw import Planes
-from clsplat.images.channels import CHANNELS
 from clsplat.sequence import existing, workers
 from clsplat.sequence.existing import is_complete
 from clsplat.sequence.frame_renderer import FrameRenderer, RenderedFrame
