@@ -168,7 +168,7 @@ class VideoWriter:
 
     @contextmanager
     def _refusals(self) -> Iterator[None]:
-        """What FFmpeg raises as errors of the system, or of ours."""
+        """Turn what FFmpeg raises into errors of the system, or of ours."""
         import av
 
         try:

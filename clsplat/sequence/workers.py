@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from clsplat.config.channels import CHANNELS, DEEP
 from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig
 from clsplat.device.child import abandon
-from clsplat.images import channels
+from clsplat.images import frame_files
 from clsplat.images.video import VideoWriter, frame_planes, video_writer
 from clsplat.sequence.existing import MOST_WRITERS
 from clsplat.sequence.frame_renderer import RenderedFrame, RenderFrame
@@ -47,7 +47,7 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
         assert frame.planes is not None, "frames of a video are not written one by one"
         yuv = frame_planes(frame.finish(frame.planes)["rgb"])
     elif frame.planes is not None:
-        channels.write_channels(task.path, frame.finish(frame.planes), options.encoding, header(task, options))
+        frame_files.write_channels(task.path, frame.finish(frame.planes), options.encoding, header(task, options))
     seconds = frame.seconds + time.monotonic() - start
     return record_of(task, options, seconds=seconds, **frame.measured), yuv
 
