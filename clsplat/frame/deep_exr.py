@@ -28,8 +28,7 @@ from clsplat.frame.draw import on_tiles
 from clsplat.frame.strips import strips
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import Colours
-from clsplat.images.exr_header import Header
-from clsplat.images.frame_files import HALF_MAX, deep_spec
+from clsplat.images.frame_files import HALF_MAX, Header, deep_spec
 from clsplat.images.writing import write_rows
 from clsplat.rendering.memory_needs import frame_pixels
 from clsplat.rendering.renderer import Renderer

@@ -21,8 +21,7 @@ from clsplat.errors import InputError
 from clsplat.files import digest, is_file
 from clsplat.frame.window import framed
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
-from clsplat.images.exr_header import Header, camera_matrices
-from clsplat.images.frame_files import VIDEO
+from clsplat.images.frame_files import VIDEO, Header, camera_matrices
 from clsplat.shots import Shot
 from clsplat.shots.frame_numbers import output_paths
 from clsplat.shots.motion import Stretch, stretches

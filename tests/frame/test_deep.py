@@ -23,7 +23,7 @@ from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep, writ
 from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import LINEAR, Colours
-from clsplat.images.exr_header import Header, camera_matrices
+from clsplat.images.frame_files import Header, camera_matrices
 from clsplat.reference import deep as twin
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
