@@ -2,9 +2,7 @@
 """Reading transforms.json of Blender synthetic (NeRF), nerfstudio and instant-ngp data sets.
 
 Poses there are `world_from_camera` with OpenGL's camera axes (x right, y up, z backward). Here the camera's axes
-become COLMAP's; the world stays that of the file. So instant-ngp's `scale`, `offset` and `aabb_scale`, which place
-the scene in its own unit cube, touch no pose (they only bound the volume of random points), and nerfstudio's
-`applied_transform` is not undone: its sparse points have been through it as well.
+become COLMAP's; the world stays that of the file (docs/conventions.md, Scenes).
 """
 
 from __future__ import annotations
@@ -46,14 +44,11 @@ EXPORT_AGAIN = "export the data set anew or add it"
 def read_transforms(path: Path) -> DataSet:
     """Read one transforms.json.
 
-    Intrinsics may stand in the file or in each frame: `fl_x fl_y` or `camera_angle_x camera_angle_y`, `cx cy` (the
-    middle if absent), `w h` (the picture's own size, or its proportions, if absent), `k1 k2 k3 k4 p1 p2`,
-    `camera_model` or `is_fisheye`.
-    `file_path` is relative to the file, with or without extension. nerfstudio's `ply_file_path` and its
-    `train_filenames`, `val_filenames` and `test_filenames` are honoured: what is in the last two, or not in the first,
-    is held out. Warns of what is ignored and of what contradicts itself. Raises InputError that
-    names the file and the key for JSON that does not parse, a key that is missing or of the wrong kind, and listed
-    pictures that are missing.
+    docs/conventions.md (Scenes) has the keys that are read, in the file or in each frame. `file_path` is relative to
+    the file. nerfstudio's `ply_file_path` and its `train_filenames`, `val_filenames` and `test_filenames` are honoured:
+    what is in the last two, or not in the first, is held out. Warns of what is ignored and of what contradicts itself.
+    Raises InputError that names the file and the key for JSON that does not parse, a key that is missing or of the
+    wrong kind, and listed pictures that are missing.
     """
     document = load_document(path)
     readers = _readers(path, document)
