@@ -27,7 +27,7 @@ from clsplat.gaussians import GROUPS, floats_of
 from clsplat.progress import Progress, aligned, no_progress
 from clsplat.rendering.rasterizer import Frame
 from clsplat.rendering.renderer import Renderer, held_sh
-from clsplat.scenes.lens import Lens
+from clsplat.scenes.data_set import Lens
 from clsplat.scenes.scene import Scene, View
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.device_gaussians import upload_gaussians

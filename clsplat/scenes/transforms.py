@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float32, Float64, numbers
-from clsplat.camera import Projection, focal_length
+from clsplat.camera import Camera, Projection, focal_length
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.images.reading import EXTENSIONS, image_size, require_images
 from clsplat.models.formats import ply
-from clsplat.scenes.data_set import MAX_NUMBER, DataSet, PosedImage
-from clsplat.scenes.lens import MAX_SIZE, Lens, absurd, check_lens
+from clsplat.scenes.data_set import MAX_NUMBER, MAX_SIZE, DataSet, Lens, PosedImage, cameras_of, check_lens
 
 DRIVE = re.compile(r"\A[A-Za-z]:/")
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -68,17 +67,14 @@ def read_transforms(path: Path) -> DataSet:
     return data
 
 
-def read_poses(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
-    """The cameras of a transforms.json alone, in its order.
+def read_poses(path: Path, size: tuple[int, int] | None = None) -> dict[str, Camera]:
+    """The cameras of a transforms.json alone by image name, in its order; distorted ones as `cameras_of`.
 
     Its pictures need not be there where the file says `w h`; else, where a picture is missing, too, it counts as one of
     `size`, (width, height). Raises InputError as `read_transforms`; warns of what contradicts itself, and of
     lenses beyond reason.
     """
-    images = _images(path, _readers(path, load_document(path)), size)
-    if doubt := absurd([(image.name, image.lens) for image in images]):
-        warn(doubt)
-    return images
+    return cameras_of(_images(path, _readers(path, load_document(path)), size))
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
