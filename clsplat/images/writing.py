@@ -100,7 +100,8 @@ def _write(path: Path, specs: Sequence[Any], kind: str, steps: Callable[[Any, st
     # libjpeg ends the process when it cannot write
     most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
     with atomic_name(path) as temporary:
-        file, name = oiio.ImageOutput.create(kind), native_name(temporary)
+        file: Any = oiio.ImageOutput.create(kind)
+        name = native_name(temporary)
         try:
             with require_room(path, most):
                 # several parts have to be announced together

@@ -190,9 +190,10 @@ class Keys:
             raise self.wrong(key, "a number")
         return float(value)
 
-    def require(self, key: str) -> float:
-        """The number of `key`; InputError for what `number` refuses, and where there is none."""
-        if (value := self.number(key)) is None:
+    def require(self, key: str, default: float | None = None) -> float:
+        """The number of `key`, else the default; InputError for what `number` refuses, and where there is neither."""
+        value = self.number(key)
+        if (value := default if value is None else value) is None:
             raise self.wrong(key, "a number")
         return value
 
@@ -305,12 +306,11 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
             f"{keys.where}: has neither 'fl_x' nor 'camera_angle_x', expected the focal length in pixels or the "
             "horizontal angle of view in radians; add one of them to the file"
         )
-    cx, cy = keys.number("cx"), keys.number("cy")
     core = [
         fx if fx is not None else fy,
         fy if fy is not None else fx,
-        cx if cx is not None else width / 2,
-        cy if cy is not None else height / 2,
+        keys.require("cx", width / 2),
+        keys.require("cy", height / 2),
     ]
     model, extra = _distortion(keys)
     params = tuple(float(value) for value in (*core, *extra) if value is not None)
