@@ -12,7 +12,7 @@ from clsplat.arrays import Float64, Int64
 from clsplat.camera import Camera
 from clsplat.reference.blend import layers
 from clsplat.reference.cameras import period, pixel_from_world, wrapped
-from clsplat.reference.project import Projected, rotation_matrices, view_directions
+from clsplat.reference.project import Seen, rotation_matrices, view_directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ def motions(means: Float64, camera: Camera, after: Camera) -> Float64:
 
 
 def channels(
-    projected: Projected,
+    projected: Seen,
     order: Int64,
     camera: Camera,
     after: Camera,

@@ -17,7 +17,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.adam import adam
-from clsplat.reference.blend import ALPHA_MAX, blend, blend_grad, footprint
+from clsplat.reference.blend import ALPHA_MAX, blend, blend_grad
 from clsplat.reference.loss import l1_dssim
 from clsplat.reference.project import ALPHA_MIN, covariance_grad, frustum_limits, project, project_grad
 from clsplat.reference.render import forward, parameters, render_grad
@@ -210,12 +210,12 @@ def test_whitened_moments_give_the_same_gradients(scene: str) -> None:
     alphas = np.zeros((len(order), height, width))
     free = np.zeros(alphas.shape, np.bool_)
     for position, gaussian in enumerate(order):
-        splat = footprint(projected, int(gaussian), width, height)
+        splat = projected.footprint(int(gaussian), width, height)
         if splat is None:
             continue
         raw = splat.raw
-        alphas[position, splat.rows, splat.columns] = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0)
-        free[position, splat.rows, splat.columns] = (raw >= ALPHA_MIN) & (raw <= ALPHA_MAX)
+        alphas[position][splat.box] = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0)
+        free[position][splat.box] = (raw >= ALPHA_MIN) & (raw <= ALPHA_MAX)
     added = np.arange(len(order))[:, None, None] <= result.blended.last
     alphas *= added
     before = np.cumprod(np.concatenate([np.ones((1, height, width)), 1 - alphas]), axis=0)
