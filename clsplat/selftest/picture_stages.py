@@ -12,7 +12,7 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.camera import PROJECTIONS, Camera, Projection
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import upload
 from clsplat.device.layout import RAY
 from clsplat.reference import channels as reference_channels
 from clsplat.reference import deep as reference_deep
@@ -20,14 +20,11 @@ from clsplat.reference import every_pixel
 from clsplat.reference import rays as reference_rays
 from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
+from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, joined
-from clsplat.stages.blend import Blended, blend
 from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera
-from clsplat.stages.duplicate import count, duplicate
-from clsplat.stages.project import Projected, project
-from clsplat.stages.ranges import tile_lists
 
 ALL = Features.of(WIDTHS)
 SIDEWAYS = 1e-4
@@ -129,28 +126,18 @@ def _amid(camera: Camera, projection: Projection) -> Camera:
 
 
 def _of_rays(bench: Bench, projection: Projection) -> Outcome:
-    device = bench.device.with_switches(PROJECTIONS[projection].defines)
-    # memory of its own: the next stages want what those before have made
-    work, camera, gaussians = Workspace(device), _amid(bench.camera, projection), bench.frozen.gaussians
-    camera_array = upload(device, pack_camera(camera))
-    depth = Features.of(())
+    # with memory of its own: the next stages want what those before have made
+    rasterizer, camera, gaussians = Rasterizer(bench.device), _amid(bench.camera, projection), bench.frozen.gaussians
 
-    def launch() -> tuple[Projected, Blended, Channels]:
-        projected = project(device, work, bench.model, camera, camera_array)
-        counted = count(device, work, projected)
-        pairs = duplicate(device, work, projected.splats, counted, bench.tiles, bench.band)
-        lists = tile_lists(device, work, pairs, bench.band)
-        pixels = (projected.splats, bench.background, camera.width, camera.height)
-        blended = blend(device, work, lists, *pixels, record=False, camera_array=camera_array)
-        rows = features(device, work, depth, bench.model, camera_array, camera_array, projected)
-        of_channels = (rows, lists, projected, blended, camera.height)
-        return projected, blended, channels(device, work, depth, *of_channels, camera_array=camera_array)
+    def launch() -> tuple[Frame, Channels]:
+        frame = rasterizer.forward(bench.model, camera, bench.background, backward=False)
+        return frame, rasterizer.channels(bench.model, frame, Features(), frame.camera_array)
 
-    def take(frame: tuple[Projected, Blended, Channels]) -> list[Array]:
-        projected, blended, planes = frame
-        counts = projected.tile_counts.get()
-        arrays = (blended.image, blended.transmittance, planes.means, planes.whole)
-        return [projected.splats.get()[counts > 0], counts, *(array.get() for array in arrays)]
+    def take(results: tuple[Frame, Channels]) -> list[Array]:
+        frame, planes = results
+        counts = frame.projected.tile_counts.get()
+        arrays = (frame.blended.image, frame.blended.transmittance, planes.means, planes.whole)
+        return [frame.projected.splats.get()[counts > 0], counts, *(array.get() for array in arrays)]
 
     _, outcome = bench.twice(launch, take)
     splats, counts, image, left, means, _ = outcome.arrays
