@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.bench.stages import held_kind, picture_of, trainer_of, wall_ms
+from clsplat.bench.stages import held_kind, picture_of, trainer_of
 from clsplat.bench.subject import Subject
 from clsplat.camera import Camera
 from clsplat.config.presets import PRESETS
@@ -136,8 +136,9 @@ def compare(
     for done in range(repeat):
         say("times", done / repeat)
         for name, rasterizer in rasterizers.items():
-            both = wall_ms(device, partial(draw, rasterizer)), wall_ms(device, partial(step, rasterizer))
-            times[name].append(both)
+            _, frame_ms = device.timed(partial(draw, rasterizer))
+            _, step_ms = device.timed(partial(step, rasterizer))
+            times[name].append((frame_ms, step_ms))
     whole = (width, height) == (camera.width, camera.height)
     points: dict[str, dict[str, Any]] = {}
     for name, config in tried.items():

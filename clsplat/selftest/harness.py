@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -116,11 +115,7 @@ class Bench:
         """The stage's value, and its arrays on the host and ms, of a second run; trouble where that differs from the
         first, which had the kernels to build."""
         first = take(launch())
-        self.device.finish()
-        start = time.perf_counter()
-        value = launch()
-        self.device.finish()
-        ms = 1e3 * (time.perf_counter() - start)
+        value, ms = self.device.timed(launch)
         arrays = take(value)
         same = digest_of(first) == digest_of(arrays)
         trouble = "" if same else "two runs on the same input gave different bits"
