@@ -49,14 +49,12 @@ def render(
     after: Camera | None = None,
 ) -> Picture:
     """Front to back by depth. after: the camera that motion goes to. A pixel without a ray shows the background."""
-    arrays = parameters(gaussians)
     seen: Seen
     if camera.kind.flat:
-        seen = _Unbounded(**vars(project(**arrays, camera=camera, sh_degree=gaussians.sh_degree)))
+        seen = _Unbounded(**vars(project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)))
     else:
         seen = tangents(gaussians, camera)
     order = depth_order(seen.depths, seen.visible)
     blended = blend(seen, order, camera.width, camera.height, background)
-    geometry = {name: arrays[name] for name in ("means", "quaternions", "log_scales")}
-    others = channels(seen, order, camera, after or camera, **geometry)
+    others = channels(seen, order, gaussians, camera, after or camera)
     return Picture(**vars(others), image=blended.image, alpha=1 - blended.transmittance, margin=blended.margin)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.arrays import Float64
 from clsplat.camera import PROJECTIONS, Camera, Projection
 from clsplat.device.buffers import upload
 from clsplat.device.layout import RAY
@@ -18,7 +17,6 @@ from clsplat.reference import channels as reference_channels
 from clsplat.reference import deep as reference_deep
 from clsplat.reference import every_pixel
 from clsplat.reference import rays as reference_rays
-from clsplat.reference.render import parameters
 from clsplat.reference.sort import depth_order
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, joined
@@ -41,11 +39,6 @@ def _after(camera: Camera) -> Camera:
     return replace(camera, translation=camera.translation + np.array([-0.0625, 0.03125, 0.125]), fx=camera.fx + 2.0)
 
 
-def _geometry(bench: Bench) -> dict[str, Float64]:
-    arrays = parameters(bench.frozen.gaussians)
-    return {name: arrays[name] for name in ("means", "quaternions", "log_scales")}
-
-
 def _features(bench: Bench) -> Outcome:
     device, camera, visible = bench.device, bench.camera, bench.visible
     after = upload(device, pack_camera(_after(camera)))
@@ -54,20 +47,12 @@ def _features(bench: Bench) -> Outcome:
         lambda rows: [rows.get()[visible]],
     )
     (got,) = outcome.arrays
-    shown = {name: values[visible] for name, values in _geometry(bench).items()}
-    normals = reference_channels.normals(**shown, camera=camera)
-    away = shown["means"] - camera.position
-    clear = np.abs((away * normals).sum(axis=1)) > SIDEWAYS * np.linalg.norm(away, axis=1)
-    wanted = {
-        "depth": bench.splats().depths[visible, None],
-        "normal": normals,
-        "position": shown["means"],
-        "motion": reference_channels.motions(shown["means"], camera, _after(camera)),
-    }
-    parts = {
-        name: (got[:, at : at + WIDTHS[name]], np.asarray(wanted[name], np.float64)) for name, at in ALL.offsets.items()
-    }
-    parts["normal"] = (parts["normal"][0][clear], normals[clear])
+    every = reference_channels.features(bench.splats(), bench.frozen.gaussians, camera, _after(camera))
+    wanted = {name: values[visible] for name, values in every.items()}
+    away = wanted["position"] - camera.position
+    clear = np.abs((away * wanted["normal"]).sum(axis=1)) > SIDEWAYS * np.linalg.norm(away, axis=1)
+    parts = {name: (got[:, at : at + WIDTHS[name]], wanted[name]) for name, at in ALL.offsets.items()}
+    parts["normal"] = (parts["normal"][0][clear], wanted["normal"][clear])
     return outcome.compared(parts)
 
 
@@ -79,7 +64,7 @@ def _channels(bench: Bench) -> Outcome:
     )
     splats, (frame, clear) = bench.splats(), bench.blend_reference()
     order = depth_order(splats.depths, splats.visible)
-    wanted = reference_channels.channels(splats, order, camera, _after(camera), **_geometry(bench))
+    wanted = reference_channels.channels(splats, order, bench.frozen.gaussians, camera, _after(camera))
     means, whole = (cropped(planes, camera) for planes in outcome.arrays)
     sure = clear & (wanted.doubt > DOUBT)
     # a sum that cancels, as normals may where little is opaque, has no digits of its own
