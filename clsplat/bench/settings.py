@@ -26,7 +26,6 @@ from clsplat.progress import Progress, aligned, no_progress
 from clsplat.reference.blend import blend
 from clsplat.reference.project import project
 from clsplat.reference.render import parameters
-from clsplat.reference.sort import depth_order
 from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.rendering.renderer import held_sh
@@ -183,8 +182,7 @@ def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, i
     means = projected.means2d - (x, y)
     reach = 1.1 * projected.half_extents + 1.0
     near = (means > -reach).all(axis=1) & (means < np.array([width, height]) + reach).all(axis=1)
-    order = depth_order(projected.depths, projected.visible & near)
-    image: Float64 = blend(replace(projected, means2d=means), order, width, height).image
+    image: Float64 = blend(replace(projected, means2d=means, visible=projected.visible & near), width, height).image
     return image
 
 

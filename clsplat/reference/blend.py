@@ -63,10 +63,10 @@ class Layer:
     margin: Float64
 
 
-def layers(projected: Seen, order: Int64, width: int, height: int) -> Iterator[Layer]:
-    """Eqs. (14) to (16): the Gaussians that `order` (M,) lists, rows of `projected`, front to back."""
+def layers(projected: Seen, width: int, height: int) -> Iterator[Layer]:
+    """Eqs. (14) to (16): the visible Gaussians front to back."""
     transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
-    for position, gaussian in enumerate(order):
+    for position, gaussian in enumerate(projected.order):
         splat = projected.footprint(int(gaussian), width, height)
         if splat is None or not alive[box := splat.box].any():
             continue
@@ -84,7 +84,6 @@ def layers(projected: Seen, order: Int64, width: int, height: int) -> Iterator[L
 
 def blend(
     projected: Seen,
-    order: Int64,
     width: int,
     height: int,
     background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
@@ -95,7 +94,7 @@ def blend(
     last = np.full((height, width), -1, np.int64)
     count = np.zeros((height, width), np.int64)
     margin = np.full((height, width), BOX_SLACK / 2)
-    for layer in layers(projected, order, width, height):
+    for layer in layers(projected, width, height):
         box, added = layer.box, layer.added
         margin[box] = np.minimum(margin[box], layer.margin)
         weight = np.where(added, layer.before * layer.alpha, 0.0)
@@ -109,14 +108,13 @@ def blend(
 
 def blend_grad(
     projected: Projected,
-    order: Int64,
     width: int,
     height: int,
     background: Sequence[float] | Float64,
     d_image: Float64,
 ) -> BlendGradients:
     """Eqs. (22) to (29) and (55), back to front: d_image (H, W, 3) is dL/dC."""
-    forward = blend(projected, order, width, height, background)
+    forward, order = blend(projected, width, height, background), projected.order
     transmittance = forward.transmittance.copy()
     behind = np.broadcast_to(np.asarray(background, np.float64), (height, width, 3)).copy()
     number = len(projected.depths)

@@ -66,15 +66,15 @@ def features(projected: Seen, gaussians: Gaussians, camera: Camera, after: Camer
     }
 
 
-def channels(projected: Seen, order: Int64, gaussians: Gaussians, camera: Camera, after: Camera) -> Channels:
-    """Blend front to back: `order` (M,) lists the rows of `projected`."""
+def channels(projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera) -> Channels:
+    """Blend front to back."""
     width, height = camera.width, camera.height
     rows = np.concatenate(list(features(projected, gaussians, camera, after).values()), axis=1)
     sums, total = np.zeros((height, width, rows.shape[1])), np.zeros((height, width))
     median, first, largest, second = (np.zeros((height, width)) for _ in range(4))
     count, index = np.zeros((height, width), np.int64), np.full((height, width), -1, np.int64)
     doubt = np.full((height, width), np.inf)
-    for layer in layers(projected, order, width, height):
+    for layer in layers(projected, width, height):
         box, added, before, after_it = layer.box, layer.added, layer.before, layer.after
         weight = np.where(added, before * layer.alpha, 0.0)
         depth = projected.depths[layer.gaussian]

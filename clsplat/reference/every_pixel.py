@@ -17,7 +17,6 @@ from clsplat.reference.channels import Channels, channels
 from clsplat.reference.project import Footprint, Projected, Seen, project
 from clsplat.reference.rays import tangents
 from clsplat.reference.render import BLACK, parameters
-from clsplat.reference.sort import depth_order
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +53,6 @@ def render(
         seen = _Unbounded(**vars(project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)))
     else:
         seen = tangents(gaussians, camera)
-    order = depth_order(seen.depths, seen.visible)
-    blended = blend(seen, order, camera.width, camera.height, background)
-    others = channels(seen, order, gaussians, camera, after or camera)
+    blended = blend(seen, camera.width, camera.height, background)
+    others = channels(seen, gaussians, camera, after or camera)
     return Picture(**vars(others), image=blended.image, alpha=1 - blended.transmittance, margin=blended.margin)

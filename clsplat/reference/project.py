@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float64
+from clsplat.arrays import Float64, Int64
 from clsplat.camera import Camera, Window
 from clsplat.reference.sh import sh_basis_grad
+from clsplat.reference.sort import depth_order
 from clsplat.spherical_harmonics import sh_basis
 
 Bool = NDArray[np.bool_]
@@ -50,6 +51,11 @@ class Seen(ABC):
     opacities: Float64
     colors: Float64
     visible: Bool
+
+    @property
+    def order(self) -> Int64:
+        """Rows of the visible ones, front to back."""
+        return depth_order(self.depths, self.visible)
 
     @abstractmethod
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:

@@ -17,7 +17,6 @@ from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
 from clsplat.reference import blend as reference_blend
 from clsplat.reference import project as reference_project
-from clsplat.reference.sort import depth_order
 from clsplat.selftest.scenes import Frozen
 from clsplat.stages.blend import Blended
 from clsplat.stages.device_camera import pack_camera, tiles_of
@@ -152,7 +151,6 @@ class Bench:
     def blend_reference(self) -> tuple[reference_blend.Blended, NDArray[np.bool_]]:
         """The frame of the splats that the device made, and the pixels that are compared (MARGIN)."""
         splats = self.splats()
-        order = depth_order(splats.depths, splats.visible)
         camera, background = self.camera, self.frozen.background.astype(np.float64)
-        frame = reference_blend.blend(splats, order, camera.width, camera.height, background)
+        frame = reference_blend.blend(splats, camera.width, camera.height, background)
         return frame, frame.margin > MARGIN

@@ -17,7 +17,6 @@ from clsplat.reference import channels as reference_channels
 from clsplat.reference import deep as reference_deep
 from clsplat.reference import every_pixel
 from clsplat.reference import rays as reference_rays
-from clsplat.reference.sort import depth_order
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, joined
 from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
@@ -63,8 +62,7 @@ def _channels(bench: Bench) -> Outcome:
         lambda: channels(device, bench.work, ALL, *arguments), lambda planes: [planes.means.get(), planes.whole.get()]
     )
     splats, (frame, clear) = bench.splats(), bench.blend_reference()
-    order = depth_order(splats.depths, splats.visible)
-    wanted = reference_channels.channels(splats, order, bench.frozen.gaussians, camera, _after(camera))
+    wanted = reference_channels.channels(splats, bench.frozen.gaussians, camera, _after(camera))
     means, whole = (cropped(planes, camera) for planes in outcome.arrays)
     sure = clear & (wanted.doubt > DOUBT)
     # a sum that cancels, as normals may where little is opaque, has no digits of its own
@@ -87,8 +85,7 @@ def _deep(bench: Bench) -> Outcome:
     arguments = (bench.lists, bench.projected.splats, bench.blended, camera.height)
     _, outcome = bench.twice(lambda: deep(device, bench.work, given, *arguments), lambda slices: [slices.get()])
     (planes,), splats, (_, clear) = outcome.arrays, bench.splats(), bench.blend_reference()
-    order = depth_order(splats.depths, splats.visible)
-    wanted = reference_deep.deep(splats, order, camera.width, camera.height, bounds)[:, clear]
+    wanted = reference_deep.deep(splats, camera.width, camera.height, bounds)[:, clear]
     got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, clear]
     fields = {"colour": slice(0, 3), "alpha": slice(3, 4), "depths": slice(4, 6)}
     return outcome.compared({name: (got[..., at], wanted[..., at]) for name, at in fields.items()})
