@@ -8,12 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import wraps
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import pyopencl as cl
-
-if TYPE_CHECKING:
-    from clsplat.device.context import Device
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -91,12 +88,21 @@ class Recorder:
             self._stack.pop()
 
 
-def stage(name: str) -> Callable[[Callable[Concatenate[Device, P], R]], Callable[Concatenate[Device, P], R]]:
+class Recorded(Protocol):
+    """A device, which has a recorder."""
+
+    recorder: Recorder
+
+
+D = TypeVar("D", bound=Recorded)
+
+
+def stage(name: str) -> Callable[[Callable[Concatenate[D, P], R]], Callable[Concatenate[D, P], R]]:
     """Marks a function whose first argument is the device as a stage of the pipeline."""
 
-    def decorate(function: Callable[Concatenate[Device, P], R]) -> Callable[Concatenate[Device, P], R]:
+    def decorate(function: Callable[Concatenate[D, P], R]) -> Callable[Concatenate[D, P], R]:
         @wraps(function)
-        def call(device: Device, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        def call(device: D, /, *args: P.args, **kwargs: P.kwargs) -> R:
             if not device.recorder.on:
                 return function(device, *args, **kwargs)
             with device.recorder.stage(name):

@@ -55,7 +55,7 @@ def motions(means: Float64, camera: Camera, after: Camera) -> Float64:
 
 
 def features(projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera) -> dict[str, Float64]:
-    """What is blended of each Gaussian, (N, 1 to 3), by the name of its channel."""
+    """Features of each Gaussian, (N, 1 to 3), by the name of the channel that they are blended to."""
     arrays = parameters(gaussians)
     means = arrays["means"]
     return {
