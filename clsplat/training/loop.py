@@ -8,7 +8,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -28,7 +28,7 @@ from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.images.colour import photos_space
-from clsplat.process import Interrupted, endings
+from clsplat.process import Interrupted, endings, handled
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs import scene_record
@@ -62,33 +62,26 @@ class StepReport:
     seconds: float
 
 
-class _Interruption:
-    """Inside, the first Ctrl-C or other signal to end is noted, and the loop stops between two steps. After it a Ctrl-C
-    is Python's own, and the other signals do what they did before."""
+@contextmanager
+def _interruption() -> Iterator[Callable[[], int]]:
+    """Inside, the first Ctrl-C or other signal to end is noted, and the loop stops between two steps: the function
+    gives its number then, and 0 before. After it a Ctrl-C is Python's own, and the other signals do what they did."""
+    numbers, first = (signal.SIGINT, *endings()), 0
 
-    def __init__(self) -> None:
-        self.number = 0
-        self._previous: dict[int, Any] = {}
+    def ask(number: int, _frame: FrameType | None) -> None:
+        nonlocal first
+        first = number
+        noting.close()
 
-    def __call__(self) -> bool:
-        if not self.number:  # again, as compilers of kernels install handlers of their own
-            for number in self._previous:
-                signal.signal(number, self._ask)
-        return self.number != 0
+    def asked() -> int:
+        if not first and threading.current_thread() is threading.main_thread():
+            for number in numbers:  # again, as compilers of kernels install handlers of their own
+                signal.signal(number, ask)
+        return first
 
-    def __enter__(self) -> _Interruption:  # noqa: PYI034  # Self came with 3.11
-        if threading.current_thread() is threading.main_thread():
-            self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, *endings())}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _ask(self, number: int, _frame: FrameType | None) -> None:
-        self.number = number
-        for other, handler in self._previous.items():
-            signal.signal(other, signal.default_int_handler if other == signal.SIGINT else handler)
+    with handled([signal.SIGINT], signal.default_int_handler), ExitStack() as noting:
+        noting.enter_context(handled(numbers, ask))
+        yield asked
 
 
 class _Session:
@@ -298,18 +291,18 @@ class _Session:
     def make_steps(self, between: Between | None) -> None:
         """All steps that are left, and what is due at their end. Raises Interrupted, after a checkpoint."""
         trainer, last = self.trainer, self.trainer.config.iterations
-        with _Interruption() as interrupted:
+        with _interruption() as interrupted:
             while True:
                 while trainer.step < last and not interrupted():
                     if between is not None:
-                        between(trainer, interrupted)
+                        between(trainer, lambda: interrupted() != 0)
                     self.step()
                 self.save()
                 if trainer.step < last or not self.go_back():
                     break
             self.tell_the_rest()
             if trainer.step < last:
-                raise Interrupted(interrupted.number)
+                raise Interrupted(interrupted())
             self.doubt()
 
 
