@@ -18,11 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config.memory import parse_bytes
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.child import TrialInterrupted
-from clsplat.device.context import Device, open_device
 from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import Gaussians
@@ -84,8 +82,8 @@ def _interruption() -> Iterator[Callable[[], int]]:
         yield asked
 
 
-class _Session:
-    """One call of `train`: a trainer, the run that it writes to, and the seconds that it has trained."""
+class Session:
+    """One call of `clsplat.train`: a trainer, the run that it writes to, and the seconds that it has trained."""
 
     def __init__(
         self,
@@ -288,6 +286,26 @@ class _Session:
         if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
             self.save()
 
+    def train(self, between: Between | None) -> Gaussians:
+        """Make the steps that are left, and write down the model and its evaluation."""
+        trainer, run = self.trainer, self.run
+        self.first_step = trainer.step
+        _tell_idle_settings(trainer)
+        self.tell_plan()
+        try:
+            self.make_steps(between)
+        except (DriverError, TrialInterrupted) as error:  # with a checkpoint nothing is lost
+            written = self.rescue()
+            if written and isinstance(error, DriverError):
+                raise DriverError(f"{error}{written}") from error
+            raise
+        model = trainer.gaussians()
+        if run is not None:
+            run.save_model(model, photos_space(view.path for view in trainer.scene.views))
+            if trainer.scene.test_views:
+                run.write_eval(self.evaluate(keep=True))
+        return model
+
     def make_steps(self, between: Between | None) -> None:
         """All steps that are left, and what is due at their end. Raises Interrupted, after a checkpoint."""
         trainer, last = self.trainer, self.trainer.config.iterations
@@ -306,28 +324,37 @@ class _Session:
             self.doubt()
 
 
-def _begin(run: Run, scene: Scene, config: TrainConfig, *, resume: bool) -> None:
-    """Record in a run what is trained. Raises InputError where it has been trained already, or on another scene."""
-    if not resume and (run.checkpoints() or run.read_metrics()):
-        raise InputError(
-            f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
-            "starts again"
-        )
-    run.keep_config(config)
-    if resume:
-        scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
-    scene_record.keep(run, scene, resuming=resume)
+def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
+    """The scene to train on, with colours, recorded in the run; a warning for each doubt in it. Raises InputError where
+    the run has been trained already, or on another scene."""
+    if run is not None:
+        if not resume and (run.checkpoints() or run.read_metrics()):
+            raise InputError(
+                f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
+                "starts again"
+            )
+        run.keep_config(config)
+        if resume:
+            scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
+        scene_record.keep(run, scene, resuming=resume)
+        if resume and run.checkpoints():
+            return scene
+    for text in doubts.of_scene(scene, config.background):
+        warnings.warn(text)
+    if is_colourless(scene):
+        warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
+        scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
+    return scene
 
 
 def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
-    """The settings. Raises InputError where the arguments of `train` make no sense."""
-    for name, value, kind in (
-        ("scene", scene, Scene),
-        ("config", config, TrainConfig | None),
-        ("run", run, Run | None),
+    """The settings. Raises InputError where the arguments of `clsplat.train` make no sense."""
+    for name, value, kind, meant in (
+        ("scene", scene, Scene, "clsplat.load_scene(...)"),
+        ("config", config, TrainConfig | None, "TrainConfig(...)"),
+        ("run", run, Run | None, "Run.create(...)"),
     ):
         if not isinstance(value, kind):
-            meant = {"scene": "clsplat.load_scene(...)", "config": "TrainConfig(...)", "run": "Run.create(...)"}[name]
             raise InputError(f"{name} is {value!r:.100}, expected {meant}")
     if resume and run is None:
         raise InputError("resume=True: expected run=..., the run to go on with")
@@ -382,50 +409,3 @@ def _tell_idle_settings(trainer: Trainer) -> None:
             f"training begins with {count:,} Gaussians, more than --density.max-gaussians "
             f"{config.density.max_gaussians:,}, which stops new ones only: give the scene fewer points"
         )
-
-
-def train(
-    scene: Scene,
-    config: TrainConfig,
-    *,
-    device: Device | str | None = None,
-    max_device_mem: str | int | None = None,
-    run: Run | None = None,
-    resume: bool = False,
-    on_step: Callable[[StepReport], None] | None = None,
-    on_plan: Callable[[Plan], None] | None = None,
-    between: Between | None = None,
-) -> Gaussians:
-    """Train like `clsplat.train`, for arguments that are `checked` and a run that is locked, and write no report."""
-    limit = parse_bytes(max_device_mem)
-    opened = device if isinstance(device, Device) else open_device(device, limit)
-    if isinstance(device, Device) and limit is not None:
-        opened = device.with_memory_limit(limit)
-    if run is not None:
-        _begin(run, scene, config, resume=resume)
-    if not (resume and run is not None and run.checkpoints()):
-        for text in doubts.of_scene(scene, config.background):
-            warnings.warn(text)
-        if is_colourless(scene):
-            warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
-            scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
-    session = _Session(Trainer(scene, config, opened), run, on_step, on_plan)
-    trainer = session.trainer
-    if resume:
-        session.resume()
-    session.first_step = trainer.step
-    _tell_idle_settings(trainer)
-    session.tell_plan()
-    try:
-        session.make_steps(between)
-    except (DriverError, TrialInterrupted) as error:  # with a checkpoint nothing is lost
-        written = session.rescue()
-        if written and isinstance(error, DriverError):
-            raise DriverError(f"{error}{written}") from error
-        raise
-    model = trainer.gaussians()
-    if run is not None:
-        run.save_model(model, photos_space(view.path for view in scene.views))
-        if scene.test_views:
-            run.write_eval(session.evaluate(keep=True))
-    return model
