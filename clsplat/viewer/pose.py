@@ -36,7 +36,7 @@ class Pose:
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
         """The camera, of the page's size or another; where that has another shape, the vertical angle is kept. It is to
-        the last bit the one that a file of cameras holds (`Recorder.document`), as a quaternion and degrees."""
+        the last bit the one that a file of cameras holds (`path_document`), as a quaternion and degrees."""
         across, down = width or self.width, height or self.height
         focal = focal_length(math.radians(math.degrees(self.fov)), down)
         quaternion = quaternion_of(self.rotation)
