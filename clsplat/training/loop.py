@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -101,8 +102,7 @@ class Session:
         self.began = time.perf_counter()
         self.recorded, self.first_step = False, 0
         self.saved = 0
-        self.warned_stages: set[str] = set()
-        self.untold = 0
+        self.troubles: Counter[str] = Counter()
 
     def resume(self) -> None:
         """Go on from the latest checkpoint, if there is one."""
@@ -166,19 +166,17 @@ class Session:
     def tell_trouble(self) -> None:
         """A warning for the first trouble of each stage; the rest is counted."""
         for incident in self.trainer.watch.incidents:
-            if incident.stage in self.warned_stages:
-                self.untold += 1
-            else:
+            self.troubles[incident.stage] += 1
+            if self.troubles[incident.stage] == 1:
                 warnings.warn(f"{incident} (more of this kind will be counted only)")
-            self.warned_stages.add(incident.stage)
         self.trainer.watch.incidents.clear()
 
     def tell_the_rest(self) -> None:
         """Warn of the number of troubled steps that were only counted."""
         self.trainer.mend()
         self.tell_trouble()
-        if self.untold:
-            warnings.warn(f"{self.untold} more steps had something that was not finite")
+        if untold := self.troubles.total() - len(self.troubles):
+            warnings.warn(f"{untold} more steps had something that was not finite")
 
     def give_up(self) -> None:
         """Raise ClsplatError, with what reproduces the trouble in the run's folder."""
