@@ -235,11 +235,7 @@ def _data(figures: Figures) -> dict[str, Any]:
         "run": figures.name,
         "records": length,
         "curves": curves,
-        "stages": figures.stages,
-        "evaluation": figures.evaluation,
-        "evaluations": figures.evaluations,
-        "model": figures.model,
-        "histograms": figures.histograms,
+        **{name: getattr(figures, name) for name in ("stages", "evaluation", "evaluations", "model", "histograms")},
         "settings": dict(settings_of(figures.run.config)),
     }
 

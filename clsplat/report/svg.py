@@ -82,7 +82,7 @@ def chart(
         .get_template("chart.html")
         .render(
             title=title,
-            drawn=drawn,
+            legend=shapes,
             across=across,
             up=up,
             x=x,
@@ -92,7 +92,6 @@ def chart(
             label=f"{title}: {y} by {x}. " + " ".join(_described(curve) for curve in drawn if curve.kind != "faint"),
             # in front of others: means of what is faint, and what is lower in a stack
             shapes=sorted(shapes[:: -1 if drawn[0].kind == "area" else 1], key=lambda shape: shape["kind"] != "faint"),
-            colors=COLORS,
             width=WIDTH,
             height=HEIGHT,
         )
@@ -126,12 +125,11 @@ def thinned(points: Points, limit: int = MAX_POINTS) -> Points:
     if len(points) <= limit:
         return points
     stretch = math.ceil(2 * len(points) / limit)
-    kept = [points[0]]
+    kept = {0, len(points) - 1}
     for start in range(0, len(points), stretch):
         part = range(start, min(start + stretch, len(points)))
-        ends = {min(part, key=lambda index: points[index][1]), max(part, key=lambda index: points[index][1])}
-        kept += [points[index] for index in sorted(ends)]
-    return [*kept, points[-1]]
+        kept |= {pick(part, key=lambda index: points[index][1]) for pick in (min, max)}
+    return [points[index] for index in sorted(kept)]
 
 
 def _kept(curve: Series, log_y: bool) -> Points:

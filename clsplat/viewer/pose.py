@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -45,12 +45,8 @@ class Pose:
 
     def same(self, other: Pose | None) -> bool:
         """True if the other shows the same."""
-        return (
-            other is not None
-            and (self.fov, self.width, self.height) == (other.fov, other.width, other.height)
-            and np.array_equal(self.position, other.position)
-            and np.array_equal(self.rotation, other.rotation)
-        )
+        names = [item.name for item in fields(self)]
+        return other is not None and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
 
 def read_pose(
