@@ -53,7 +53,7 @@ class Refinement:
     def __init__(self, now: float) -> None:
         self.scale = 0.25
         self.served = -math.inf
-        self._changed, self._at = 1, now
+        self.changes, self._at = 1, now
         self._settle = START
         self._shown = 0
         self._model = 0
@@ -63,15 +63,15 @@ class Refinement:
     @property
     def moving(self) -> bool:
         """True if the picture shown is not the one asked for."""
-        return self._shown != self._changed
+        return self._shown != self.changes
 
     def changed(self, now: float) -> None:
         """The camera, or how the model is looked at."""
         apart = now - self._at
-        usual = JUMPS * apart if self._changed > 1 and apart < SETTLE[1] else 0.0
-        before = self._settle if self._changed > 1 else 0.0
+        usual = JUMPS * apart if self.changes > 1 and apart < SETTLE[1] else 0.0
+        before = self._settle if self.changes > 1 else 0.0
         self._settle = min(max(0.7 * before + 0.3 * usual, SETTLE[0]), SETTLE[1])
-        self._changed += 1
+        self.changes += 1
         self._at = now
 
     def due(self, now: float, model: int = 0) -> Level | None:
@@ -92,12 +92,8 @@ class Refinement:
             return None
         return max(0.0, self._at + self._settle - now)
 
-    def begun(self) -> int:
-        """Before a picture is made: what `shown` wants to know of it."""
-        return self._changed
-
     def shown(self, begun: int, level: Level, seconds: float, now: float, model: int = 0) -> None:
-        """A picture has been sent that took so long."""
+        """A picture has been sent that took so long; begun: the number of `changes` before it was made."""
         if level.exact:
             self._exact_takes = seconds
         elif self._shown != begun:

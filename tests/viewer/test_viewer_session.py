@@ -145,7 +145,7 @@ def test_fitted_sizes() -> None:
 
 
 def shown(refinement: Refinement, level: Level, seconds: float, now: float, model: int = 0) -> None:
-    refinement.shown(refinement.begun(), level, seconds, now, model)
+    refinement.shown(refinement.changes, level, seconds, now, model)
 
 
 def test_coarse_in_motion_exact_at_rest() -> None:
@@ -191,7 +191,7 @@ def test_the_first_exact_picture_leaves_the_browser_some_time() -> None:
 
 def test_what_changes_while_a_picture_is_made_is_shown_next() -> None:
     refinement = Refinement(0.0)
-    begun, level = refinement.begun(), refinement.due(0.0)
+    begun, level = refinement.changes, refinement.due(0.0)
     assert level is not None
     refinement.changed(0.02)
     refinement.shown(begun, level, 0.05, 0.05)
