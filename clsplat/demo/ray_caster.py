@@ -399,16 +399,15 @@ def write_photos(
     width: int = 320,
     height: int = 240,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> None:
     """Write `count` photos `photo_000.jpg` ... into folder (made if missing). The same seed gives the same photos.
 
     width, height: pixels. progress(text, fraction) is called as the work goes on. Raises ClsplatError where a
     photo cannot be written. Poses are neither returned nor written: recovering them is the point of the demo.
     """
-    report = progress or no_progress
     folder.mkdir(parents=True, exist_ok=True)
-    report("painting the scene", 0.0)
+    progress("painting the scene", 0.0)
     surfaces = still_life()
     bake(surfaces, seed)
     views = cameras(count, width, height, seed)
@@ -416,4 +415,4 @@ def write_photos(
     with ThreadPoolExecutor(2) as pool:
         for index, image in enumerate(pool.map(partial(render, surfaces), views)):
             write_jpeg(folder / f"photo_{index:03d}.jpg", image)
-            report("taking photos", (index + 1) / count)
+            progress("taking photos", (index + 1) / count)
