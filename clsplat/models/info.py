@@ -17,11 +17,9 @@ from clsplat.files import is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import recorded_space
 from clsplat.models.codec import values as packing
-from clsplat.models.edit import take
 from clsplat.models.formats import Format, resolve
 
 PERCENTILES = (0, 1, 50, 99, 100)
-_BLOCK = 1 << 16
 
 
 def model_info(path: Path) -> dict[str, Any]:
@@ -32,7 +30,8 @@ def model_info(path: Path) -> dict[str, Any]:
         origin, blocks = form.blocks(path)
     else:
         model = form.read(path)
-        origin, blocks = model.origin, _blocks(model)
+        world = packing.world_means(model).astype(np.float32)
+        origin, blocks = model.origin, iter([replace(model, means=world)])
     result |= form.describe(path)
     result |= _summary(blocks, origin)
     result["colorspace"] = recorded_space(path)
@@ -43,13 +42,6 @@ def model_info(path: Path) -> dict[str, Any]:
 def size(path: Path, form: Format) -> int:
     """Bytes of the model's files."""
     return sum(file.stat().st_size for file in (path, *form.side_files(path)) if is_file(file))
-
-
-def _blocks(model: Gaussians) -> Iterator[Gaussians]:
-    """Blocks of a whole model, in the world."""
-    for start in range(0, len(model), _BLOCK):
-        rows = slice(start, start + _BLOCK)
-        yield replace(take(model, rows), means=packing.world_means(model, rows).astype(np.float32))
 
 
 def _summary(blocks: Iterator[Gaussians], origin: NDArray[np.float64]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Float32, Float64, numbers
 from clsplat.camera import NEAR
 from clsplat.config.checks import misfit
 from clsplat.errors import InputError, examples, warn
@@ -240,11 +240,11 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             break
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
-            numbers = _numbers(words[3:])
+            given = numbers(words[3:])  # none where the comment is not one of ours after all
             if words[:3] == ORIGIN:
-                origin = numbers if len(numbers) == 3 else None
+                origin = given if len(given) == 3 and np.isfinite(given).all() else None
             if words[:3] == NEAR_PLANE:
-                near = float(numbers[0]) if len(numbers) == 1 and numbers[0] > 0 else NEAR
+                near = float(given[0]) if len(given) == 1 and 0 < given[0] < np.inf else NEAR
             comments += [" ".join(words[1:])] if words else []
             continue
         if words == ["end_header"]:
@@ -269,15 +269,6 @@ def read_header(file: BinaryIO, path: Path) -> Header:
                 f"{path}: PLY header has a line that is of no PLY header: {' '.join(words)[:80]!r}"
             ) from None
     raise InputError(f"{path}: PLY header is truncated or damaged (no line 'end_header')")
-
-
-def _numbers(words: list[str]) -> Float64:
-    """Finite numbers; none where the comment is not one of ours after all."""
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        return np.empty(0)
-    return values if np.isfinite(values).all() else np.empty(0)
 
 
 def _local_means(file: BinaryIO, header: Header) -> Float32 | None:
