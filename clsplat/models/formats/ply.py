@@ -202,8 +202,7 @@ def write(
     head = "\n".join(lines).encode("ascii")
     with atomic_writer(path, len(head) + 4 * count * (len(names) + (3 if far else 0))) as file:
         file.write(head)
-        for start in range(0, len(gaussians), BLOCK_ROWS):
-            rows = slice(start, start + BLOCK_ROWS)
+        for rows in values.row_blocks(count, BLOCK_ROWS):
             sh = gaussians.sh[rows]
             block = np.zeros((len(sh), len(names)), "<f4")
             block[:, 0:3] = gaussians.means[rows] + gaussians.origin if far else gaussians.means[rows]

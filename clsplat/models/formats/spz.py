@@ -36,7 +36,6 @@ from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import values
 from clsplat.models.codec.axes import UP_BACK, Signs, flip, quaternion_signs, sh_signs
-from clsplat.models.codec.values import BLOCK_ROWS
 
 MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 Bytes = NDArray[np.uint8]
@@ -255,9 +254,8 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
     sh_factor = np.repeat(sh_signs(signs)[1 : result.sh.shape[1], None] / np.float32(128), 3, axis=1)
     for name, stream in streams:
         width = header.widths[name]
-        for first in range(0, header.count, BLOCK_ROWS):
-            rows = slice(first, min(first + BLOCK_ROWS, header.count))
-            data = _next(stream, (rows.stop - first) * width, path, f"its {name}")
+        for rows in values.row_blocks(header.count):
+            data = _next(stream, (rows.stop - rows.start) * width, path, f"its {name}")
             block = np.frombuffer(data, np.uint8).reshape(-1, width)
             match name:
                 case "positions":
@@ -386,8 +384,7 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
 def _pack(
     name: str, gaussians: Gaussians, header: Header, sh_bits: tuple[int, int], write: Callable[[bytes], object]
 ) -> None:
-    for first in range(0, header.count, BLOCK_ROWS):
-        rows = slice(first, first + BLOCK_ROWS)
+    for rows in values.row_blocks(header.count):
         match name:
             case "positions":
                 data = _to_fixed(values.world_means(gaussians, rows) * UP_BACK * 2.0**header.fractional_bits)
