@@ -74,10 +74,8 @@ def _angles(a: NDArray[Any], b: NDArray[Any]) -> Float64:
 
 def _sh_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
     width = max(a.shape[1], b.shape[1])
-    if width == 0:
-        return np.zeros(len(a))
     p, q = (np.pad(sh.astype(np.float64), ((0, 0), (0, width - sh.shape[1]), (0, 0))) for sh in (a, b))
-    return np.asarray(np.abs(p - q).max(axis=(1, 2)))
+    return np.asarray(np.abs(p - q).max(axis=(1, 2), initial=0))
 
 
 def table(losses: dict[str, dict[str, float]]) -> str:

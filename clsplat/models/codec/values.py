@@ -19,6 +19,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import C0
 
 BLOCK_ROWS = 1 << 15
+"""Rows that are read or written at once: whole chunks of the compressed PLY."""
 LEAST_SCALE = 2.0**-149
 """Value for a scale of 0, whose log has to be finite: float32's least."""
 FREE_COUNT = 1 << 20

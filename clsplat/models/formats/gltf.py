@@ -70,7 +70,7 @@ def describe(path: Path) -> dict[str, Any]:
     """Colour space and compression in the extension of the first primitive that has it."""
     asset = Asset.open(path)
     for _, _, primitive in asset.primitives():
-        said = asset.extension(primitive)
+        said = as_object(primitive["extensions"][EXTENSION])
         compression = next((name for name in SPZ_EXTENSIONS if name in as_object(said.get("extensions"))), "none")
         return {"color_space": str(said.get("colorSpace", "")), "compression": compression}
     return {}
@@ -99,7 +99,7 @@ def read(path: Path) -> Gaussians:
 
 def _gaussians(asset: Asset, name: str, primitive: dict[str, Any]) -> Gaussians:
     """The primitive's Gaussians in our frame."""
-    said = asset.extension(primitive)
+    said = as_object(primitive["extensions"][EXTENSION])
     kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
     if kernel != "ellipse":
         raise InputError(f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse")

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from math import isqrt
 from pathlib import Path
@@ -141,22 +141,17 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         return gaussians
 
 
-def blocks(path: Path) -> tuple[Float64, Iterator[Gaussians]]:
-    """The origin, and the Gaussians in the file's order, some rows at a time, in the world; values that are not finite
-    are passed on. Raises InputError as `read`."""
+def blocks(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians in the file's order, some rows at a time, in the world, each block with the file's origin; values
+    that are not finite are passed on. Raises InputError as `read`."""
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
-    return np.zeros(3) if header.origin is None else header.origin, _read_blocks(header)
-
-
-def _read_blocks(header: Header) -> Iterator[Gaussians]:
-    with open_input(header.path, "a 3DGS PLY") as file:
-        file.seek(header.size)
         rest = _check_properties(header)
+        origin = np.zeros(3) if header.origin is None else header.origin
         if header.vertex.count == 0:
-            yield values.empty(0, _degree(rest))
+            yield replace(values.empty(0, _degree(rest)), origin=origin)
         for block in read_vertices(file, header, "Gaussian") if header.vertex.count else ():
-            gaussians = values.empty(len(block["x"]), _degree(rest))
+            gaussians = replace(values.empty(len(block["x"]), _degree(rest)), origin=origin)
             _fill(gaussians, block, rest)
             yield gaussians
 
@@ -207,9 +202,8 @@ def write(
             block = np.zeros((len(sh), len(names)), "<f4")
             block[:, 0:3] = gaussians.means[rows] + gaussians.origin if far else gaussians.means[rows]
             block[:, 6:9] = sh[:, 0]
-            rest = block[:, 9 : 9 + 3 * padded]
-            for channel in range(3):
-                rest[:, channel * padded : channel * padded + stored] = sh[:, 1:, channel]
+            rest = block[:, 9 : 9 + 3 * padded].reshape(len(sh), 3, padded)  # a view
+            rest[:, :, :stored] = sh[:, 1:].transpose(0, 2, 1)
             block[:, -8] = gaussians.opacity_logits[rows]
             block[:, -7:-4] = gaussians.log_scales[rows]
             block[:, -4:] = gaussians.quaternions[rows]

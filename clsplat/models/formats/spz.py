@@ -114,13 +114,13 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
         warn(f"{path}: trained with anti-aliasing, which this renderer does not do")
     result = values.empty(header.count, min(header.degree, MAX_SH_DEGREE))
     if header.version == 4:
-        signs = _frame(_records(file.read(header.table - 32), path), path) if header.flags & HAS_EXTENSIONS else UP_BACK
+        signs = _frame(file.read(header.table - 32), path) if header.flags & HAS_EXTENSIONS else UP_BACK
         _unpack(_zstd_streams(file, header, size, path), header, signs, result, path)
         return result
     assert stream is not None
     _unpack(((name, stream) for name in header.widths), header, UP_BACK, result, path)
     behind = _rest(stream, path)
-    if header.flags & HAS_EXTENSIONS and (signs := _frame(_records(behind, path), path)) != UP_BACK:
+    if header.flags & HAS_EXTENSIONS and (signs := _frame(behind, path)) != UP_BACK:
         flip(result, (signs[0] * UP_BACK[0], signs[1] * UP_BACK[1], signs[2] * UP_BACK[2]))
     elif behind and not header.flags & HAS_EXTENSIONS:
         warn(f"{path}: bytes after the last Gaussian ignored")
@@ -162,20 +162,17 @@ def _check(header: Header, path: Path) -> None:
         raise InputError(f"{path}: SPZ has {header.fractional_bits} fractional bits, expected at most 31")
 
 
-def _records(data: bytes, path: Path) -> dict[int, bytes]:
-    """Extensions by their type. Each is its type and its length, 32 bits each, and then its bytes."""
-    records, at = {}, 0
-    while len(data) - at >= 8:
-        kind, length = struct.unpack_from("<II", data, at)
-        if length > len(data) - at - 8:
+def _frame(extensions: bytes, path: Path) -> Signs:
+    """The signs of the axes. An extension is its type and its length, 32 bits each, and then its bytes."""
+    at, system = 0, b""
+    while len(extensions) - at >= 8:
+        kind, length = struct.unpack_from("<II", extensions, at)
+        if length > len(extensions) - at - 8:
             raise InputError(f"{path}: truncated: SPZ extension {kind:#x} of {length} bytes")
-        records[kind] = data[at + 8 : at + 8 + length]
         at += 8 + length
-    return records
-
-
-def _frame(records: dict[int, bytes], path: Path) -> Signs:
-    if len(system := records.get(COORDINATE_SYSTEM, b"")) != 4:
+        if kind == COORDINATE_SYSTEM:
+            system = extensions[at - length : at]
+    if len(system) != 4:
         return UP_BACK
     (value,) = struct.unpack("<I", system)
     if value >= len(FRAMES):
