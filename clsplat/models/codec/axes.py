@@ -25,7 +25,7 @@ SLACK = 1e-4
 def sh_signs(signs: Signs) -> Float32:
     """(16,): what the coefficients are multiplied by when axes change their sign."""
     direction = np.array([[1.0, 2.0, 4.0]]) / 21**0.5  # where none of them is 0
-    return np.sign(sh_basis(direction, 3) * sh_basis(direction * signs, 3))[0].astype(np.float32)
+    return np.asarray(np.sign(sh_basis(direction, 3) * sh_basis(direction * signs, 3))[0], np.float32)
 
 
 def quaternion_signs(signs: Signs) -> Float32:

@@ -198,7 +198,7 @@ def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
         colors = np.clip(gaussians.sh[rows, 0] * np.float32(C0) + np.float32(0.5), 0, 1)
         if color_space == COLOR_SPACES[0]:
             colors = srgb_to_linear(colors)
-        return np.rint(np.column_stack([colors, opacity(rows)]) * 65535).astype(np.uint16)
+        return np.asarray(np.rint(np.column_stack([colors, opacity(rows)]) * 65535), np.uint16)
 
     coefficients = [name for degree in range(gaussians.sh_degree + 1) for name in sh_attributes(degree)]
     return {
