@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from clsplat.cli.options import DeviceOptions, Flag, RunOrModel, ScenePath, Verb
-from clsplat.cli.session import Services, warn
+from clsplat.cli.session import Services
 from clsplat.config.checks import Rule, check_rules
 from clsplat.config.verbs import TEST_EVERY
-from clsplat.errors import InputError
+from clsplat.errors import InputError, warn
 from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:

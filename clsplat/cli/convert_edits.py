@@ -13,8 +13,8 @@ import numpy as np
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.cli.convert import Convert
-from clsplat.cli.session import Services, load_scene, warn
-from clsplat.errors import InputError
+from clsplat.cli.session import Services, load_scene
+from clsplat.errors import InputError, warn
 from clsplat.evaluation.metrics import psnr
 from clsplat.files import is_file, read_document
 from clsplat.gaussians import Gaussians
