@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import nullcontext
 
-from clsplat.config.memory import parse_bytes
+from clsplat.config.checks import parse_bytes
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
 from clsplat.gaussians import Gaussians

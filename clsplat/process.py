@@ -51,20 +51,20 @@ def interrupt(number: int, _frame: FrameType | None) -> None:
 
 
 @contextmanager
-def handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Inside, these signals call the handler. In the main thread alone: Python handles signals there."""
+def handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], object]) -> Iterator[dict[int, Any]]:
+    """Inside, these signals call the handler; yields what they did before. None of them does outside the main thread:
+    Python handles signals there."""
     if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, handler) for number in numbers}
+        numbers = ()
+    before = {number: signal.signal(number, handler) or signal.SIG_DFL for number in numbers}
     try:
-        yield
+        yield before
     finally:
         for number, previous in before.items():
-            signal.signal(number, previous if previous is not None else signal.SIG_DFL)
+            signal.signal(number, previous)
 
 
-def terminable() -> AbstractContextManager[None]:
+def terminable() -> AbstractContextManager[object]:
     """Inside, a signal that asks the process to end is a Ctrl-C: temporary files go, and children end."""
     return handled(endings(), interrupt)
 
@@ -73,22 +73,18 @@ def terminable() -> AbstractContextManager[None]:
 def undisturbed() -> Iterator[None]:
     """Inside, signals that ask the process to end wait; afterwards the first that came is raised. Handlers that a
     library installs inside are removed. In the main thread, as `handled`."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     came: list[int] = []
-    numbers = (signal.SIGINT, *endings())
 
     def note(number: int, _frame: FrameType | None) -> None:
         came.append(number)
 
     try:
-        with handled(numbers, note):
-            mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers) if sys.platform != "win32" else None
+        with handled((signal.SIGINT, *endings()), note) as before:
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, before) if sys.platform != "win32" else None
             try:
                 yield
             finally:
-                for number in numbers:
+                for number in before:
                     signal.signal(number, note)
                 if sys.platform != "win32" and mask is not None:
                     signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # signals that have waited come now

@@ -28,18 +28,20 @@ def no_progress(text: str, fraction: float | None = None) -> None:
 
 
 class _Bar:
-    """A context manager with a live bar where the stream is a terminal; `live` is None elsewhere."""
+    """A context manager with a live bar where standard error is a terminal; `live` is None elsewhere."""
 
     live: RichProgress | None = None
 
-    def __init__(self, stream: TextIO, description: str, total: int, *, counted: bool = False) -> None:
+    def __init__(self, description: str, total: int, *, counted: bool = False) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        if stream.isatty():
+        if sys.stderr.isatty():
             count = [MofNCompleteColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *count, TimeRemainingColumn())
-            self.live = Progress(*columns, console=Console(file=stream), refresh_per_second=4, speed_estimate_period=60)
+            self.live = Progress(
+                *columns, console=Console(file=sys.stderr), refresh_per_second=4, speed_estimate_period=60
+            )
             self.task = self.live.add_task(description, total=total)
 
     def __enter__(self) -> Self:
@@ -54,19 +56,16 @@ class _Bar:
 
 
 class TrainProgress(_Bar):
-    """Progress of a training; call it with each `training.loop.StepReport`, every step or now and then.
+    """Progress of a training of `total` steps; call it with each `training.loop.StepReport`, every step or now and
+    then."""
 
-    total: the last step; stream: standard error unless given; clock: seconds, for tests.
-    """
-
-    def __init__(self, total: int, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
-        self.total, self.clock = total, clock
-        self.stream = stream if stream is not None else sys.stderr
-        super().__init__(self.stream, f"step 0/{total}", total)
+    def __init__(self, total: int) -> None:
+        super().__init__(f"step 0/{total}", total)
+        self.total = total
         self.first: Any = None
         self.last: Any = None
         self.loss, self.psnr = 0.0, 0.0
-        self.printed_at, self.printed_step = clock(), -1
+        self.printed_at, self.printed_step = time.monotonic(), -1
 
     def __exit__(self, *error: object) -> None:
         super().__exit__(*error)
@@ -82,7 +81,7 @@ class TrainProgress(_Bar):
         self.psnr += SMOOTHING * (report.psnr - self.psnr)
         if self.live is not None:
             self.live.update(self.task, completed=report.step, description=self._numbers())
-        elif self.clock() - self.printed_at >= PLAIN_INTERVAL:
+        elif time.monotonic() - self.printed_at >= PLAIN_INTERVAL:
             self._print_line()
 
     def rate(self) -> float:
@@ -103,8 +102,8 @@ class TrainProgress(_Bar):
         rate = self.rate()
         left = f"  {duration((self.total - self.last.step) / rate)} left" if rate > 0 else ""
         with suppress(OSError):  # its reader has gone: a training goes on, or comes to its checkpoint
-            print(f"{self._numbers()}{left}", file=self.stream, flush=True)
-        self.printed_at, self.printed_step = self.clock(), self.last.step
+            print(f"{self._numbers()}{left}", file=sys.stderr, flush=True)
+        self.printed_at, self.printed_step = time.monotonic(), self.last.step
 
 
 class StageProgress:
@@ -113,21 +112,17 @@ class StageProgress:
     after: seconds in which nothing is said, for work that is mostly quick.
     """
 
-    def __init__(
-        self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic, after: float = 0.0
-    ) -> None:
-        self.stream = stream if stream is not None else sys.stderr
-        self.clock = clock
-        self.stage, self.printed_at = "", clock()
+    def __init__(self, after: float = 0.0) -> None:
+        self.stage, self.printed_at = "", time.monotonic()
         self.silent_until = self.printed_at + after
 
     def __call__(self, stage: str, fraction: float | None = None) -> None:
-        now = self.clock()
+        now = time.monotonic()
         if now < self.silent_until:
             return
         if stage != self.stage or now - self.printed_at >= PLAIN_INTERVAL or fraction == 1.0:
             text = stage if fraction is None else f"{stage} {100 * fraction:.0f} %"
-            print(text, file=self.stream, flush=True)
+            print(text, file=sys.stderr, flush=True)
             self.stage, self.printed_at = stage, now
 
 
@@ -140,16 +135,11 @@ class FrameProgress(_Bar):
     """
 
     def __init__(
-        self,
-        total: int,
-        style: Literal["auto", "json", "openjd", "none"] = "auto",
-        *,
-        lines: TextIO | None = None,
-        stream: TextIO | None = None,
+        self, total: int, style: Literal["auto", "json", "openjd", "none"] = "auto", *, lines: TextIO | None = None
     ) -> None:
         self.total, self.style, self.lines, self.done = total, style, lines, 0
         if style == "auto":
-            super().__init__(stream if stream is not None else sys.stderr, "frames", total, counted=True)
+            super().__init__("frames", total, counted=True)
         if self.live is not None and lines is not None and lines.isatty():
             self.lines = None
 

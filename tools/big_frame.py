@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from clsplat.bench.subject import synthetic
-from clsplat.config.memory import parse_bytes
+from clsplat.config.checks import parse_bytes
 from clsplat.device.context import open_device
 from clsplat.frame.draw import drawn_by
 from clsplat.frame.strips import strip_rows, write_in_strips

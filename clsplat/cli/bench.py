@@ -14,8 +14,7 @@ from tyro.conf import Positional, arg
 
 from clsplat.cli.options import DeviceOptions, Flag, Verb, with_given
 from clsplat.cli.session import Services
-from clsplat.config.checks import check_rules
-from clsplat.config.memory import parse_bytes
+from clsplat.config.checks import check_rules, parse_bytes
 from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import BenchSwitches
 from clsplat.errors import InputError
@@ -61,7 +60,6 @@ def run(verb: Bench, services: Services) -> int:
     from clsplat.bench import stages as bench_stages
     from clsplat.bench import subject as bench_subject
     from clsplat.bench.plots import check_plot, plot_files, plot_settings
-    from clsplat.device.context import Device, select
     from clsplat.files import check_new
     from clsplat.progress import StageProgress
 
@@ -75,8 +73,7 @@ def run(verb: Bench, services: Services) -> int:
     if verb.source is not None and not verb.source.exists():
         raise InputError(f"{verb.source}: no such file or folder, expected a scene, a run or a model file")
     progress = StageProgress()
-    device = services.require(Device(select(verb.device.selector), profile=True))
-    device.memory.limit = limit
+    device = services.require(services.open_device(verb.device.selector, limit, profile=True))
     most = int(device.cl_device.global_mem_size) // bench_stages.GAUSSIAN_BYTES
     if verb.source is None and verb.gaussians > most:
         raise InputError(f"--gaussians {verb.gaussians}: expected at most {most}, which fill {device.name}'s memory")

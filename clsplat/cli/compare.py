@@ -12,8 +12,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from clsplat.cli.options import Flag, OutputFile, Verb
-from clsplat.cli.session import Services, warn
-from clsplat.errors import InputError, plain
+from clsplat.cli.session import Services
+from clsplat.errors import InputError, warn
 
 
 @dataclass(frozen=True)
@@ -48,5 +48,5 @@ def run(verb: Compare, _: Services) -> int:
         print(f"page in {verb.output}", file=sys.stderr)
     print(json.dumps(comparison.document(), indent=2, allow_nan=False) if verb.json else comparison_table(comparison))
     for note in comparison.notes:
-        warn(plain(note))
+        warn(note)
     return 0

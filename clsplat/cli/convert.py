@@ -3,29 +3,15 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, field, fields
-from math import inf, isclose
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from clsplat.cli.options import DeviceOptions, Flag, RunOrModel, ScenePath, Verb
-from clsplat.cli.session import Services, warn
-from clsplat.config.checks import Rule, check_rules
+from clsplat.cli.session import Services
 from clsplat.config.verbs import TEST_EVERY
-from clsplat.errors import InputError
-from clsplat.progress import StageProgress
-
-if TYPE_CHECKING:
-    from clsplat.gaussians import Gaussians
-    from clsplat.models.formats import Format
-
-QUICK = 2.0
-"""Seconds that writing a file may take without a word."""
-NEAR_SLACK = 0.05
-"""A part of a near plane: where a file has none it follows from positions, which a format may have rounded."""
 
 
 @dataclass(frozen=True)
@@ -76,78 +62,7 @@ class Convert(Verb):
 
 
 def run(verb: Convert, services: Services) -> int:
-    """Read, edit, write, read back. What is wrong with the call is found before anything is written."""
-    from clsplat.cli import convert_edits
-    from clsplat.files import check_new
-    from clsplat.images import colour
-    from clsplat.models import difference, edit
-    from clsplat.models.formats import format_of, format_of_name, load, save
-    from clsplat.runs.run import model_file
+    """Read, edit, write, read back."""
+    from clsplat.cli.convert_work import convert
 
-    source, merged = model_file(verb.source), [model_file(path) for path in verb.merge]
-    _check(verb)
-    matrix = convert_edits.similarity(verb)
-    target_format = format_of_name(verb.target, writable=True)
-    check_new(verb.target, overwrite=verb.overwrite, sources=[source, *merged])
-    for companion in target_format.side_files(verb.target):
-        check_new(companion, overwrite=verb.overwrite)
-    original, space = load(source), colour.recorded_space(source)
-    edited = convert_edits.edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
-    comments = () if space == colour.SRGB else (colour.comment(space),)
-    save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK))
-    if space != colour.recorded_space(verb.target):
-        warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
-    read = load(verb.target)
-    if not isclose(read.near, edited.near, rel_tol=NEAR_SLACK):
-        warn(
-            f"{verb.target}: {target_format.name} has no place for the near plane, which is {edited.near:.4g}; readers "
-            f"will take {read.near:.4g}"
-        )
-    written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
-    result: dict[str, Any] = {
-        "source": _described(source, format_of(source), original),
-        "target": _described(verb.target, target_format, read),
-        "errors": difference.errors(written, read),
-    }
-    if verb.scene is not None:
-        result["scene"] = convert_edits.measured(verb, services, original, read, matrix)
-    if verb.json:
-        print(json.dumps(result, indent=2))
-        return 0
-    for model in (result["source"], result["target"]):
-        gaussians = f"{model['gaussians']:,} Gaussians of SH degree {model['sh_degree']}"
-        print(f"{model['path']}: {model['format']}, {gaussians}, {model['bytes']:,} bytes")
-    print(difference.table(result["errors"]))
-    if verb.scene is not None:
-        scene = result["scene"]
-        print(f"{len(scene['views'])} views  PSNR {scene['before']:.2f} dB before, {scene['after']:.2f} after; the "
-              f"renders against each other {scene['between']:.2f}, at least {scene['least_between']:.2f}")  # fmt: skip
-    return 0
-
-
-def _check(verb: Convert) -> None:
-    """Raise InputError for a number out of its range, and for flags that lack their companion."""
-    from clsplat.gaussians import MAX_SH_DEGREE
-
-    rules: tuple[Rule, ...] = (
-        (("scale",), lambda value: value is None or 0 < value < inf, "a number over 0"),
-        (("prune_opacity",), lambda value: value is None or 0 <= value <= 1, "0 to 1"),
-        (("prune_contribution",), lambda value: value is None or 0 < value < inf, "pixels, a number over 0"),
-        (("drop_sh",), lambda value: value is None or 0 <= value <= MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
-        (("test_every", "resolution"), lambda value: value >= 0, "at least 0"),
-    )
-    check_rules(verb, "--", rules)
-    if (verb.prune_contribution is None) != (verb.cameras is None):
-        raise InputError("--prune-contribution and --cameras go together: contributions are to these cameras")
-    defaults = {field.name: field.default for field in fields(verb)}
-    names = [name for name in ("test_every", "resolution", "background") if getattr(verb, name) != defaults[name]]
-    if verb.scene is None and names:
-        flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-        raise InputError(f"{flags}: of measuring on a scene, expected --scene with it")
-
-
-def _described(path: Path, form: Format, gaussians: Gaussians) -> dict[str, Any]:
-    from clsplat.models.info import size
-
-    file = {"path": str(path), "format": form.name, "bytes": size(path, form)}
-    return file | {"gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}
+    return convert(verb, services)

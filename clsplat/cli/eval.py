@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 from clsplat.cli.options import DeviceOptions, Flag, OptionalInt, RunOrModel, ScenePath, Verb
-from clsplat.cli.session import Services, load_scene, warn
+from clsplat.cli.session import Services, load_scene
 from clsplat.config.training import TrainConfig
-from clsplat.errors import CapacityError, InputError, plain
+from clsplat.errors import CapacityError, InputError, warn
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -94,7 +94,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
     with suppress(CapacityError):
         warnings.append(doubts.of_pictures(draw, views, "held-out"))
     for text in filter(None, warnings):
-        warn(plain(text))
+        warn(text)
     model_record = given_run.model_record() if given_run else {}
     result = evaluate(
         lambda view: draw(view.camera)[0],

@@ -62,7 +62,7 @@ def _run(arguments: list[str], services: Services) -> int:
             if debug:
                 traceback.print_exc()
             with contextlib.suppress(OSError):  # the terminal may be gone
-                print("clsplat: interrupted", file=sys.stderr)
+                print(" ".join(("clsplat: interrupted", *map(str, error.args))), file=sys.stderr)
             return status_of(error)
         except (ClsplatError, OSError, MemoryError) as error:
             if isinstance(error, OSError) and reader_has_gone(error):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from clsplat.config.memory import parse_bytes
+from clsplat.config.checks import parse_bytes
 from clsplat.config.verbs import HOST, PORT
 
 if TYPE_CHECKING:

@@ -11,7 +11,6 @@ import json
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 from clsplat.cli.options import Flag, Memory, OptionalInt, RunOrModel, Verb, with_given
-from clsplat.cli.session import Services, warn
+from clsplat.cli.session import Services
 from clsplat.config.pictures import (
     EXR_DEPTH,
     ColourConfig,
@@ -33,8 +32,8 @@ from clsplat.config.pictures import (
 )
 from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.errors import examples
-from clsplat.process import status_of, terminable
+from clsplat.errors import examples, warn
+from clsplat.process import terminable
 from clsplat.progress import FrameProgress
 
 if TYPE_CHECKING:
@@ -199,9 +198,8 @@ def _write_frames(job: Job, renderers: Sequence[Any]) -> int:
     except KeyboardInterrupt as error:
         count = f"{len(records)} of {len(tasks)} frames"
         advice = "nothing is left of the video" if job.is_video else "go on with --skip-existing"
-        with suppress(OSError):  # the terminal may be gone
-            print(f"clsplat: interrupted after {count}; {advice}", file=sys.stderr)
-        return status_of(error)
+        error.args = (f"after {count}; {advice}",)
+        raise
     if blank := [number for number, record in sorted(records.items()) if record.blank]:
         warn(
             f"{len(blank)} of {len(tasks)} frames show nothing of the model: {examples(blank)}; are the cameras in the "

@@ -11,10 +11,9 @@ from pathlib import Path
 import clsplat
 from clsplat.camera import Camera
 from clsplat.cli.render import Render
-from clsplat.cli.session import warn
-from clsplat.config.memory import parse_bytes
+from clsplat.config.checks import parse_bytes
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig, VideoConfig
-from clsplat.errors import InputError, examples
+from clsplat.errors import InputError, examples, warn
 from clsplat.files import check_new, digest
 from clsplat.frame.samples import finer
 from clsplat.gaussians import Gaussians

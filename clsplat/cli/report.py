@@ -13,8 +13,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from clsplat.cli.options import Flag, OutputFile, Verb
-from clsplat.cli.session import Services, warn
-from clsplat.errors import InputError, plain
+from clsplat.cli.session import Services
+from clsplat.errors import InputError, warn
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,6 @@ def run(verb: Report, _: Services) -> int:
     if verb.json:
         print(json.dumps(figures.document(), indent=2, allow_nan=False))
     for note in figures.notes:
-        warn(plain(note))
+        warn(note)
     print(f"report in {path}", file=sys.stderr)
     return 0

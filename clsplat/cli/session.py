@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surroundings of a verb: the services it calls, and its warnings."""
+"""The surroundings of a verb: the services it calls, the scene, the devices."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clsplat.errors import warn
 from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
@@ -61,8 +61,3 @@ def chosen_devices(selector: str | None) -> list[DeviceInfo]:
     if not devices:
         raise no_device()
     return devices
-
-
-def warn(text: str) -> None:
-    """Print a warning on standard error."""
-    print(f"clsplat: warning: {text}", file=sys.stderr)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Collection
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,11 +15,10 @@ from tyro.conf import Positional, arg
 
 from clsplat.cli.eval import print_summary, tell_of_lpips
 from clsplat.cli.options import DeviceOptions, Flag, Output, PageOptions, Verb, with_given
-from clsplat.cli.session import Services, load_scene, warn
+from clsplat.cli.session import Services, load_scene
 from clsplat.config.presets import Preset, Schedule, bundled
 from clsplat.config.training import TrainConfig
-from clsplat.errors import InputError
-from clsplat.process import status_of
+from clsplat.errors import InputError, warn
 from clsplat.progress import TrainProgress
 
 if TYPE_CHECKING:
@@ -149,9 +148,8 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     except KeyboardInterrupt as error:
         steps = run.checkpoints()
         at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
-        with suppress(OSError):  # the terminal may be gone
-            print(f"clsplat: interrupted {at}; go on with: clsplat train -o {run.path} --resume", file=sys.stderr)
-        return status_of(error)
+        error.args = (f"{at}; go on with: clsplat train -o {run.path} --resume",)
+        raise
     result = json.loads(run.eval_path.read_text("utf-8")) if run.eval_path.exists() else None
     if verb.json:
         print(json.dumps(result, indent=2))

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from clsplat.cli.options import DeviceOptions, PageOptions, RunOrModel, ScenePath, Verb
-from clsplat.cli.session import Services, warn
+from clsplat.cli.session import Services
 from clsplat.config.training import TrainConfig
-from clsplat.errors import InputError
+from clsplat.errors import InputError, warn
 from clsplat.process import endings, handled
 
 if TYPE_CHECKING:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules for settings, and the message where one is broken."""
+"""Rules for settings, and the message where one is broken; sizes of memory."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from math import inf
 from numbers import Integral, Real
@@ -12,6 +13,7 @@ from clsplat.errors import InputError
 
 MOST = 1 << 62
 """Below which whole numbers are, so that TOML has room for them."""
+_SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([kmgt]?)(i?b)?\s*", re.IGNORECASE)
 Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
 """Names of settings, whether a value makes sense (which NaN must not), and what is expected."""
 
@@ -65,3 +67,18 @@ def check_steps(flag: str, steps: tuple[int, ...]) -> None:
     """Raise InputError unless the steps are from 1 up and in order."""
     if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
         raise InputError(f"{flag} {','.join(map(str, steps))}: expected steps from 1 up, in order")
+
+
+def parse_bytes(text: str | int | None) -> int | None:
+    """Bytes of "256MiB", "2GiB", "1.5G" (the same as GiB), "500MB" (decimal) or a number. Raises InputError."""
+    if text is None:
+        return None
+    match = _SIZE.fullmatch(str(text))
+    size = 0
+    if match is not None:
+        number, prefix, ending = match.groups()
+        base, power = 1000 if (ending or "").lower() == "b" else 1024, ["", *"kmgt"].index(prefix.lower())
+        size = int(float(number) * base**power)
+    if size < 1:
+        raise InputError(f"--max-device-mem {text}: expected a size such as 256MiB, 1.5G or a number of bytes")
+    return size

@@ -257,15 +257,15 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 
 @lru_cache(maxsize=8)
-def _open(index: int, shape: Shape, why: str) -> Device:
-    return Device(all_devices()[index], shape, why=why)
+def _open(index: int, shape: Shape, why: str, *, profile: bool) -> Device:
+    return Device(all_devices()[index], shape, profile=profile, why=why)
 
 
-def open_device(selector: str | None = None, memory_limit: int | None = None) -> Device:
+def open_device(selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False) -> Device:
     """Open the device that `selector` names (see `select`); the same object for the same device without a limit.
 
-    memory_limit: bytes that the buffers of this object's users may take together.
+    memory_limit: bytes that the buffers of this object's users may take together; profile: its queue measures.
     """
     chosen: Any = select(selector)
-    device = _open(all_devices().index(chosen), *shape_of(chosen))
+    device = _open(all_devices().index(chosen), *shape_of(chosen), profile=profile)
     return device if memory_limit is None else device.with_memory_limit(memory_limit)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.config.memory import parse_bytes
+from clsplat.config.checks import parse_bytes
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import allocate, upload
 from clsplat.device.context import Device, open_device

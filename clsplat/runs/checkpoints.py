@@ -63,8 +63,8 @@ def read_arrays(path: Path, expected: str) -> Arrays:
     return arrays
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
-    """Raises ValueError, InputError or what zipfile does where it is not as `save_checkpoint` makes it."""
+def read_checkpoint(path: Path, expected: int) -> Checkpoint:
+    """Raises ValueError, InputError or what zipfile does where it is not as `save_checkpoint` makes it of that step."""
     arrays = read_arrays(path, "a checkpoint")
     record = parse_json(arrays.pop(STATE_KEY).tobytes())
     if not isinstance(record, dict) or type(step := record.get("step")) is not int or step < 0:
@@ -79,6 +79,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
         for name, array in arrays.items():
             if digest_of(array) != digests[name]:
                 raise ValueError(f"{name} is not what was written: its sha256 differs")
+    if step != expected:
+        raise ValueError(f"it is of step {step}")
     return Checkpoint(step, arrays, state)
 
 

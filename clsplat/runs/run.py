@@ -199,10 +199,7 @@ class Run:
         checkpoint: Checkpoint | None = None
         for step, path in reversed(checkpoints):
             try:
-                checkpoint = read_checkpoint(path)
-                if checkpoint.step != step:
-                    found_step, checkpoint = checkpoint.step, None
-                    raise ValueError(f"it is of step {found_step}")
+                checkpoint = read_checkpoint(path, step)
                 break
             except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly anything for a flipped bit
                 why = str(error) or type(error).__name__

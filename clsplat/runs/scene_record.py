@@ -103,32 +103,30 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """Differences between a scene and the one that a run has begun with, in few words each. With another --resolution
     sizes may differ, and files of another size stand in."""
     was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
-    changes = [
-        _listed("not there any more", [name for name in was if name not in new]),
-        _listed("new", [name for name in new if name not in was]),
-    ]
-    both = [name for name in was if name in new]
     held_out = "held out in one and not in the other"
-    other: dict[str, list[str]] = {
-        what: [] for what in ("another photograph", "another camera", "another size", held_out)
+    changed: dict[str, list[str]] = {
+        "not there any more": [name for name in was if name not in new],
+        "new": [name for name in new if name not in was],
+        **{what: [] for what in ("another photograph", "another camera", "another size", held_out)},
     }
+    both = [name for name in was if name in new]
     for name in both:
         a, b = was[name], new[name]
         same_file = (a["file"], a["folder"]) == (b["file"], b["folder"])
         turned = not (_close(a["pose"][:9], b["pose"][:9]) and _close(a["pose"][9:], b["pose"][9:]))
         if turned or (a["size"] == b["size"] and not _close(a["lens"], b["lens"])):
-            other["another camera"].append(name)
+            changed["another camera"].append(name)
         elif a["size"] != b["size"] and not resized:
-            other["another size"].append(name)
+            changed["another size"].append(name)
         if a["blake2b"] != b["blake2b"] and (same_file or not resized):
-            other["another photograph"].append(name)
+            changed["another photograph"].append(name)
         if a["split"] != b["split"]:
-            other[held_out].append(name)
-    changes += [_listed(what, names) for what, names in other.items()]
-    if earlier["points"] != now["points"] and not any(changes):
+            changed[held_out].append(name)
+    changes = [_listed(what, names) for what, names in changed.items() if names]
+    if earlier["points"] != now["points"] and not changes:
         counts = f"{earlier['points']['count']:,} then, {now['points']['count']:,} now"
         changes.append(f"other points ({counts})")
-    return [change for change in changes if change]
+    return changes
 
 
 def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool = False) -> bool:
@@ -207,7 +205,5 @@ def _close(a: list[float], b: list[float]) -> bool:
 
 
 def _listed(what: str, names: list[str]) -> str:
-    """Such as "3 views not there any more (a.png, b.png, c.png)"; empty where there are none."""
-    if not names:
-        return ""
+    """Such as "3 views not there any more (a.png, b.png, c.png)"."""
     return f"{len(names):,} {'view' if len(names) == 1 else 'views'} {what} ({examples(names)})"

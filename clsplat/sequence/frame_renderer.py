@@ -11,7 +11,7 @@ from typing import Any
 from clsplat.camera import Camera
 from clsplat.config.channels import light_and_rest
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device.context import Device, open_device, select
+from clsplat.device.context import open_device
 from clsplat.errors import DriverError
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes
@@ -45,11 +45,10 @@ RenderFrame = Callable[[Task], RenderedFrame]
 class FrameRenderer:
     """Renders frames of one model on one device. A frame that is too large to be held is written as well."""
 
-    def __init__(self, renderer: Any, gaussians: Gaussians, options: RenderOptions, *, profile: bool = False) -> None:
-        """renderer: a `Renderer`; profile: note what its device is busy with. Raises InputError for settings and colour
-        spaces that make no sense."""
+    def __init__(self, renderer: Any, gaussians: Gaussians, options: RenderOptions) -> None:
+        """renderer: a `Renderer`. Raises InputError for settings and colour spaces that make no sense."""
         self.options = options
-        self._renderer, self._gaussians, self._profile = renderer, gaussians, profile
+        self._renderer, self._gaussians = renderer, gaussians
         self._rays_tested = False
         self._pipeline = FramePipeline(
             renderer, gaussians, options.pictures, background=options.background, recorded=options.recorded
@@ -65,9 +64,9 @@ class FrameRenderer:
 
     def __call__(self, task: Task) -> RenderedFrame:
         """The frame. Raises ClsplatError where it cannot be rendered, or, if it is written here, not be written."""
-        if not self._profile:
-            return self._frame(task)
         device = self._renderer.device
+        if not device.profile:
+            return self._frame(task)
         with device.recorder.recording(wait=False) as stages:
             frame = self._frame(task)
         times = [(name, taken) for record in stages.values() for name, taken in record.kernels.items()]
@@ -127,12 +126,9 @@ def open_frame_renderer(
     memory_limit: int | None = None,
     profile: bool = False,
 ) -> FrameRenderer:
-    """A renderer of frames of the model on the device that `device` names. Raises DeviceError."""
-    if profile:
-        opened = Device(select(device), profile=True)
-        opened.memory.limit = memory_limit
-    else:
-        opened = open_device(device, memory_limit)
+    """A renderer of frames of the model on the device that `device` names. profile: each frame's record has what the
+    device was busy with. Raises DeviceError."""
+    opened = open_device(device, memory_limit, profile=profile)
     kernels = DEEP if options.deep is not None else CHANNELS if light_and_rest(options.channels)[1] else ()
     opened = require(opened, (*FORWARD, *kernels))
-    return FrameRenderer(Renderer(opened, config=rasterizer), gaussians, options, profile=profile)
+    return FrameRenderer(Renderer(opened, config=rasterizer), gaussians, options)

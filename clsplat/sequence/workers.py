@@ -13,7 +13,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -96,69 +96,47 @@ def run_tasks(
     if not tasks:
         return
     writers, held = frames_ahead(tasks, options, len(renderers))
-    frames = _FrameQueue(tasks, options, held, is_video=video is not None)
-    pool = ThreadPoolExecutor(writers, "clsplat-write")
-    threads = [
-        threading.Thread(target=frames.render, args=(render, pool), name="clsplat-render") for render in renderers
-    ]
+    room, stop, turn, left = threading.Semaphore(held), threading.Event(), threading.Lock(), iter(tasks)
+    finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
+    encoders = ThreadPoolExecutor(writers, "clsplat-write")
+    devices = ThreadPoolExecutor(len(renderers), "clsplat-render")
+
+    def render(renderer: RenderFrame) -> None:
+        while True:  # until there are no more frames
+            room.acquire()
+            with turn:
+                task = None if stop.is_set() else next(left, None)
+            if task is None:
+                return
+            encoders.submit(encode, task, renderer(task)).add_done_callback(finished.put)
+
+    def encode(task: Task, frame: RenderedFrame) -> Result | None:
+        try:
+            return None if stop.is_set() else encode_frame(task, frame, options)
+        finally:
+            if video is None:
+                room.release()
+
+    def tell_failure(rendering: Future[None]) -> None:
+        if rendering.exception() is not None:
+            finished.put(rendering)
+
     try:
-        for thread in threads:
-            thread.start()
-        for record in encoded(tasks, frames.results(), video):
+        for renderer in renderers:
+            devices.submit(render, renderer).add_done_callback(tell_failure)
+        for record in encoded(tasks, (finished.get().result() for _ in tasks), video):
             if video is not None:
-                frames.room.release()  # frames are handed out in order, so that the next one always has room
+                room.release()  # frames are handed out in order, so that the next one always has room
             on_done(record)
     except KeyboardInterrupt:
         abandon()  # a thread may wait for a driver that hangs
         raise
     finally:
-        frames.stop.set()
-        for _ in threads:
-            frames.room.release()
-        for thread in threads:
-            thread.join()
-        pool.shutdown()
-
-
-class _FrameQueue:
-    """State that the threads of a job share. room: for `held` frames at once; stop: nothing more is to be done."""
-
-    def __init__(self, tasks: Sequence[Task], options: RenderOptions, held: int, *, is_video: bool) -> None:
-        self.room, self.stop = threading.Semaphore(held), threading.Event()
-        self._tasks, self._options, self._is_video = tasks, options, is_video
-        self._todo, self._turn = iter(tasks), threading.Lock()
-        self._finished: queue.SimpleQueue[Result | BaseException] = queue.SimpleQueue()
-
-    def render(self, renderer: RenderFrame, pool: ThreadPoolExecutor) -> None:
-        """Render frames until there are no more."""
-        try:
-            while True:
-                self.room.acquire()
-                with self._turn:
-                    task = None if self.stop.is_set() else next(self._todo, None)
-                if task is None:
-                    return
-                pool.submit(self._encode, task, renderer(task))
-        except BaseException as error:  # noqa: BLE001  # raised again in the thread that waits for the frames
-            self._finished.put(error)
-
-    def _encode(self, task: Task, frame: RenderedFrame) -> None:
-        try:
-            if not self.stop.is_set():
-                self._finished.put(encode_frame(task, frame, self._options))
-        except BaseException as error:  # noqa: BLE001  # as above
-            self._finished.put(error)
-        finally:
-            if not self._is_video:
-                self.room.release()
-
-    def results(self) -> Iterator[Result]:
-        """Result of every frame when it is done. Raises what ended a thread."""
-        for _ in self._tasks:
-            item = self._finished.get()
-            if isinstance(item, BaseException):
-                raise item
-            yield item
+        stop.set()
+        for _ in renderers:
+            room.release()
+        devices.shutdown()
+        encoders.shutdown()
 
 
 def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter | None) -> Iterator[Record]:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 import time
 import warnings
 from collections import Counter
@@ -65,7 +64,7 @@ class StepReport:
 def _interruption() -> Iterator[Callable[[], int]]:
     """Inside, the first Ctrl-C or other signal to end is noted, and the loop stops between two steps: the function
     gives its number then, and 0 before. After it a Ctrl-C is Python's own, and the other signals do what they did."""
-    numbers, first = (signal.SIGINT, *endings()), 0
+    first = 0
 
     def ask(number: int, _frame: FrameType | None) -> None:
         nonlocal first
@@ -73,13 +72,13 @@ def _interruption() -> Iterator[Callable[[], int]]:
         noting.close()
 
     def asked() -> int:
-        if not first and threading.current_thread() is threading.main_thread():
-            for number in numbers:  # again, as compilers of kernels install handlers of their own
+        if not first:
+            for number in before:  # again, as compilers of kernels install handlers of their own
                 signal.signal(number, ask)
         return first
 
     with handled([signal.SIGINT], signal.default_int_handler), ExitStack() as noting:
-        noting.enter_context(handled(numbers, ask))
+        before = noting.enter_context(handled((signal.SIGINT, *endings()), ask))
         yield asked
 
 

@@ -122,7 +122,7 @@ def test_a_signal_waits_where_nobody_may_be_disturbed() -> None:
     done = []
     with process.terminable(), pytest.raises(process.Interrupted) as caught:
         with process.undisturbed():
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)  # to this thread: another one would not have it blocked
             signal.signal(signal.SIGTERM, lambda *_: done.append("the library's"))
             done.append("the work")
         done.append("what follows")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clsplat.cli.main import main
-from clsplat.config.memory import parse_bytes
+from clsplat.config.checks import parse_bytes
 from clsplat.device.buffers import Workspace, allocate
 from clsplat.device.context import Device, open_device
 from clsplat.errors import CapacityError, InputError

@@ -89,7 +89,7 @@ LATE = {
     "clsplat.gaussians": {"clsplat.models.formats"},  # Gaussians.load and save
     # a verb imports its own work when it is called
     "clsplat.cli.render": {"clsplat.cli.render_request", "clsplat.cli.render_plan"},
-    "clsplat.cli.convert": {"clsplat.cli.convert_edits"},
+    "clsplat.cli.convert": {"clsplat.cli.convert_work"},
 }
 """Imports that a function makes on purpose, against the order of the modules."""
 

@@ -3,8 +3,11 @@
 
 import io
 import json
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from typing import Any
+
+import pytest
 
 from clsplat.progress import FrameProgress, StageProgress, TrainProgress, duration
 from clsplat.sequence.task import Record
@@ -24,9 +27,17 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_plain_lines_now_and_then() -> None:
-    stream, now = io.StringIO(), [0.0]
-    with TrainProgress(100, stream, lambda: now[0]) as progress:
+@pytest.fixture
+def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time that the clock shows."""
+    now = [0.0]
+    monkeypatch.setattr("clsplat.progress.time.monotonic", lambda: now[0])
+    return now
+
+
+def test_plain_lines_now_and_then(now: list[float]) -> None:
+    stream = io.StringIO()
+    with redirect_stderr(stream), TrainProgress(100) as progress:
         for step in range(1, 51):
             now[0] += 0.5
             progress(Report(step, seconds=now[0]))
@@ -36,7 +47,7 @@ def test_plain_lines_now_and_then() -> None:
 
 
 def test_rate_counts_from_where_a_resumed_run_began() -> None:
-    progress = TrainProgress(2000, io.StringIO(), lambda: 0.0)
+    progress = TrainProgress(2000)
     assert progress.rate() == 0
     progress(Report(1001, seconds=500))
     progress(Report(1011, seconds=505))
@@ -45,7 +56,7 @@ def test_rate_counts_from_where_a_resumed_run_began() -> None:
 
 def test_a_bar_on_a_terminal() -> None:
     stream = Terminal()
-    with TrainProgress(10, stream) as progress:
+    with redirect_stderr(stream), TrainProgress(10) as progress:
         progress(Report(10))
     assert "step 10/10" in stream.getvalue()
     assert "PSNR 20.00" in stream.getvalue()
@@ -56,7 +67,7 @@ def frames() -> list[Record]:
 
 
 def shown(style: Any, *, stream: io.StringIO, lines: io.StringIO | None) -> str:
-    with FrameProgress(2, style, lines=lines, stream=stream) as progress:
+    with redirect_stderr(stream), FrameProgress(2, style, lines=lines) as progress:
         for record in frames():
             progress(record)
     return "" if lines is None else lines.getvalue()
@@ -95,24 +106,22 @@ def test_frames_elsewhere_are_lines() -> None:
     assert plain.getvalue() == ""
 
 
-def test_stages_are_told_apart() -> None:
-    stream, now = io.StringIO(), [0.0]
-    progress = StageProgress(stream, lambda: now[0])
+def test_stages_are_told_apart(now: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    progress = StageProgress()
     for stage, fraction in [("features", None), ("features", 0.5), ("matching", 0.0), ("matching", 1.0)]:
         progress(stage, fraction)
     now[0] = 11
     progress("matching", 0.25)
-    assert stream.getvalue().splitlines() == ["features", "matching 0 %", "matching 100 %", "matching 25 %"]
+    assert capsys.readouterr().err.splitlines() == ["features", "matching 0 %", "matching 100 %", "matching 25 %"]
 
 
 def test_durations() -> None:
     assert [duration(s) for s in (0, 59.6, 61, 3600, 36061)] == ["0:00", "1:00", "1:01", "1:00:00", "10:01:01"]
 
 
-def test_what_is_quick_is_not_told() -> None:
-    stream, now = io.StringIO(), [0.0]
-    progress = StageProgress(stream, lambda: now[0], after=2.0)
+def test_what_is_quick_is_not_told(now: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    progress = StageProgress(after=2.0)
     for time, part in ((0.0, 0.0), (1.9, 0.4), (2.1, 0.5), (3.0, 0.6), (12.5, 0.9)):
         now[0] = time
         progress("palette", part)
-    assert stream.getvalue().splitlines() == ["palette 50 %", "palette 90 %"]
+    assert capsys.readouterr().err.splitlines() == ["palette 50 %", "palette 90 %"]

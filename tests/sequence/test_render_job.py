@@ -137,7 +137,7 @@ class FakeRenderer:
 
     def __init__(self) -> None:
         self.asked: list[Any] = []
-        self.device = SimpleNamespace(budget=1 << 30, max_allocation=1 << 30)
+        self.device = SimpleNamespace(budget=1 << 30, max_allocation=1 << 30, profile=False)
 
     def render(self, _: object, camera: Camera, background: object, **how: Any) -> Any:
         self.asked.append((background, how))

@@ -42,6 +42,7 @@ class FakeView:
 class FakeDevice:
     name: str = "processor"
     driver: str = "OpenCL 3.0 driver 1.0"
+    profile: bool = False
     budget: int = 1 << 30
     max_allocation: int = 1 << 28
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edits of `clsplat convert`, and its measurement on a scene."""
+"""Work of `clsplat convert`: the checks of a call, the edits, the measurement on a scene."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from math import isfinite
+from dataclasses import fields
+from math import inf, isclose, isfinite
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +15,100 @@ import numpy as np
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.cli.convert import Convert
-from clsplat.cli.session import Services, load_scene, warn
-from clsplat.errors import InputError
+from clsplat.cli.session import Services, load_scene
+from clsplat.config.checks import Rule, check_rules
+from clsplat.errors import InputError, warn
 from clsplat.evaluation.metrics import psnr
-from clsplat.files import is_file, read_document
-from clsplat.gaussians import Gaussians
+from clsplat.files import check_new, is_file, read_document
+from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images import colour
 from clsplat.images.alpha import background_colour, composite
-from clsplat.models import edit
+from clsplat.models import difference, edit
+from clsplat.models.formats import Format, format_of, format_of_name, load, save
+from clsplat.models.info import size
+from clsplat.progress import StageProgress
 from clsplat.rendering.contributions import largest_contributions
+from clsplat.runs.run import model_file
 from clsplat.selftest.result import FORWARD
 from clsplat.shots import choose_shot
 
+QUICK = 2.0
+"""Seconds that writing a file may take without a word."""
+NEAR_SLACK = 0.05
+"""A part of a near plane: where a file has none it follows from positions, which a format may have rounded."""
 MAX_MATRIX = 1 << 16
 """Bytes of a file with a matrix."""
 NamedModel = tuple[Path, Gaussians]
 
 
-def edited(
+def convert(verb: Convert, services: Services) -> int:
+    """Read, edit, write, read back. What is wrong with the call is found before anything is written."""
+    source, merged = model_file(verb.source), [model_file(path) for path in verb.merge]
+    _check(verb)
+    matrix = _similarity(verb)
+    target_format = format_of_name(verb.target, writable=True)
+    check_new(verb.target, overwrite=verb.overwrite, sources=[source, *merged])
+    for companion in target_format.side_files(verb.target):
+        check_new(companion, overwrite=verb.overwrite)
+    original, space = load(source), colour.recorded_space(source)
+    edited = _edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
+    comments = () if space == colour.SRGB else (colour.comment(space),)
+    save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK))
+    if space != colour.recorded_space(verb.target):
+        warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
+    read = load(verb.target)
+    if not isclose(read.near, edited.near, rel_tol=NEAR_SLACK):
+        warn(
+            f"{verb.target}: {target_format.name} has no place for the near plane, which is {edited.near:.4g}; readers "
+            f"will take {read.near:.4g}"
+        )
+    written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
+    result: dict[str, Any] = {
+        "source": _described(source, format_of(source), original),
+        "target": _described(verb.target, target_format, read),
+        "errors": difference.errors(written, read),
+    }
+    if verb.scene is not None:
+        result["scene"] = _measured(verb, services, original, read, matrix)
+    if verb.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    for model in (result["source"], result["target"]):
+        gaussians = f"{model['gaussians']:,} Gaussians of SH degree {model['sh_degree']}"
+        print(f"{model['path']}: {model['format']}, {gaussians}, {model['bytes']:,} bytes")
+    print(difference.table(result["errors"]))
+    if verb.scene is not None:
+        scene = result["scene"]
+        print(f"{len(scene['views'])} views  PSNR {scene['before']:.2f} dB before, {scene['after']:.2f} after; the "
+              f"renders against each other {scene['between']:.2f}, at least {scene['least_between']:.2f}")  # fmt: skip
+    return 0
+
+
+def _check(verb: Convert) -> None:
+    """Raise InputError for a number out of its range, and for flags that lack their companion."""
+    rules: tuple[Rule, ...] = (
+        (("scale",), lambda value: value is None or 0 < value < inf, "a number over 0"),
+        (("prune_opacity",), lambda value: value is None or 0 <= value <= 1, "0 to 1"),
+        (("prune_contribution",), lambda value: value is None or 0 < value < inf, "pixels, a number over 0"),
+        (("drop_sh",), lambda value: value is None or 0 <= value <= MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
+        (("test_every", "resolution"), lambda value: value >= 0, "at least 0"),
+    )
+    check_rules(verb, "--", rules)
+    if (verb.prune_contribution is None) != (verb.cameras is None):
+        raise InputError("--prune-contribution and --cameras go together: contributions are to these cameras")
+    defaults = {field.name: field.default for field in fields(verb)}
+    names = [name for name in ("test_every", "resolution", "background") if getattr(verb, name) != defaults[name]]
+    if verb.scene is None and names:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+        raise InputError(f"{flags}: of measuring on a scene, expected --scene with it")
+
+
+def _described(path: Path, form: Format, gaussians: Gaussians) -> dict[str, Any]:
+    file = {"path": str(path), "format": form.name, "bytes": size(path, form)}
+    return file | {"gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}
+
+
+def _edited(
     verb: Convert, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
 ) -> Gaussians:
     """The source's Gaussians after all edits, in the order that --help names. Raises InputError where none is left."""
@@ -62,7 +140,7 @@ def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
         )
 
 
-def similarity(verb: Convert) -> Float64 | None:
+def _similarity(verb: Convert) -> Float64 | None:
     """--transform, then --scale, as one (4, 4); None without them. Raises InputError."""
     if verb.transform is None and verb.scale is None:
         return None
@@ -117,7 +195,7 @@ def _thinned(verb: Convert, services: Services, gaussians: Gaussians) -> Gaussia
     return gaussians
 
 
-def measured(
+def _measured(
     verb: Convert, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
 ) -> dict[str, Any]:
     """PSNR in dB of the model as it was read and of the one that was written, against the photographs and against each
