@@ -6,16 +6,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import nullcontext
 
+from clsplat.config.memory import parse_bytes
 from clsplat.config.training import TrainConfig
-from clsplat.device.context import Device
+from clsplat.device.context import Device, open_device
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.memory_plan import Plan
 from clsplat.report.page import write_last
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
-from clsplat.training import loop
-from clsplat.training.loop import Between, StepReport
+from clsplat.training.loop import Between, Session, StepReport, begin, checked
+from clsplat.training.trainer import Trainer
 
 
 def train(
@@ -44,19 +45,18 @@ def train(
     values that could be repaired give a warning. Raises Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP,
     after a checkpoint has been written.
     """
-    config = loop.checked(scene, config, run, resume=resume)
+    config = checked(scene, config, run, resume=resume)
     with nullcontext() if run is None else locked(run.path, "train"):
-        model = loop.train(
-            scene,
-            config,
-            device=device,
-            max_device_mem=max_device_mem,
-            run=run,
-            resume=resume,
-            on_step=on_step,
-            on_plan=on_plan,
-            between=between,
-        )
+        limit = parse_bytes(max_device_mem)
+        if not isinstance(device, Device):
+            device = open_device(device, limit)
+        elif limit is not None:
+            device = device.with_memory_limit(limit)
+        trainer = Trainer(begin(scene, config, run, resume=resume), config, device)
+        session = Session(trainer, run, on_step, on_plan)
+        if resume:
+            session.resume()
+        model = session.train(between)
         if run is not None and config.report:
             write_last(run, scene, model)
     return model

@@ -86,39 +86,42 @@ def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> N
 
 
 @contextmanager
-def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[BinaryIO]:
-    """Open a binary file that takes the place of `path` when the block ends well, and never exists otherwise.
+def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[Path]:
+    """A name for a file that takes the place of `path` when the block ends well, and never exists otherwise.
 
-    The data goes to a temporary name in the same folder (a rename is atomic only within a file system), is flushed
-    to the disk and renamed. A link at `path` is followed. The folder must exist. needs: bytes that the file will have,
-    for the message of a full disk, where they are known. Raises WriteError where the system refuses, with the name
-    `path`; the temporary file is removed on any exception, KeyboardInterrupt included.
+    It is a temporary one in the same folder (a rename is atomic only within a file system). A link at `path` is
+    followed. The folder must exist. needs: bytes that the file will have, for the message of a full disk, where they
+    are known. Raises WriteError where the system refuses, with the name `path`; the temporary file is removed on any
+    exception, KeyboardInterrupt included.
     """
     target = Path(os.path.realpath(path))
     temporary = temporary_name(target)
-    written = 0
     try:
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        # "x" and no mkstemp: the file gets the permissions that the user's umask gives any new file.
-        with open(temporary, "xb") as file:
-            try:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            finally:
-                with suppress(OSError, ValueError):
-                    written = file.tell()
+        yield temporary
         replace(temporary, target)
     except BaseException as error:
+        written = 0
         with suppress(OSError):
-            temporary.unlink()
+            written = temporary.stat().st_size
+            temporary.unlink()  # first, so that the message has what is free without it
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
             # A full disk is found by `write`, which does not know the name; and the temporary one is unknown to users.
             raise write_error(path, error, written, needs) from None
         raise
-    _sync_folder(target.parent)
+
+
+@contextmanager
+def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[BinaryIO]:
+    """Open a binary file of an `atomic_name`, which is flushed to the disk before it takes its place."""
+    # "x" and no mkstemp: the file gets the permissions that the user's umask gives any new file.
+    with atomic_name(path, needs) as temporary, open(temporary, "xb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+    _sync_folder(Path(os.path.realpath(path)).parent)
 
 
 def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, needs: int | None = None) -> WriteError:

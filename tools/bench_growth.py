@@ -24,7 +24,6 @@ from measuring import Result, machine, number, options_parser, reporting, requir
 from plotting import Panel, plot_growth
 
 from clsplat.bench.plots import check_plot
-from clsplat.bench.stages import wall_ms
 from clsplat.bench.subject import synthetic
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
@@ -58,7 +57,7 @@ def measure(device: Device, count: int, width: int, height: int, repeat: int) ->
         return rasterizer.forward(gaussians, subject.camera, background, backward=False)
 
     frames = [draw() for _ in range(2)]  # kernels are built in the first, and the memory has grown after it
-    ms = statistics.median(wall_ms(device, draw) for _ in range(repeat))
+    ms = statistics.median(device.timed(draw)[1] for _ in range(repeat))
     pairs = frames[-1].part.pairs.tile_keys.shape[0]
     return {"gaussians": count, "width": width, "height": height, "pairs": pairs, "ms": ms}
 

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from plotting import Panel, plot_growth
 
 from clsplat.bench.plots import check_plot
-from clsplat.bench.stages import wall_ms
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device, open_device
 from clsplat.errors import ClsplatError
@@ -115,7 +114,7 @@ def measure(device: Device, name: str, n: int, repeat: int) -> Result:
         raise ClsplatError(f"{name}: {n} of them come out in another order than NumPy's")
     times, numpy_times = [], []
     for _ in range(repeat):  # in turn, so that other load meets both
-        times.append(wall_ms(device, work))
+        times.append(device.timed(work)[1])
         start = time.perf_counter()
         by_numpy()
         numpy_times.append(1e3 * (time.perf_counter() - start))

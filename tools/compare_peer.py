@@ -31,7 +31,6 @@ from pathlib import Path
 
 from measuring import Result, machine, reporting, require, show
 
-from clsplat.bench.stages import wall_ms
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
@@ -84,7 +83,7 @@ def step_ms(scene: Scene, device: Device) -> float:
     trainer = Trainer(scene, TrainConfig(warmup=()), device)
     for index in range(len(trainer.views)):
         trainer.photographs.load(index, 1)
-    times = [wall_ms(device, trainer.train_step) for _ in range(LAST)]
+    times = [device.timed(trainer.train_step)[1] for _ in range(LAST)]
     return statistics.median(times[FIRST - 1 :])
 
 

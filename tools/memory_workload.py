@@ -32,7 +32,7 @@ from clsplat.device.shapes import Shape
 from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.lens import Lens
+from clsplat.scenes.data_set import Lens
 from clsplat.scenes.scene import Scene
 from clsplat.stages.blend import count_pairs, tile_items
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians

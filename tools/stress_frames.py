@@ -19,7 +19,6 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference import render as reference
 from clsplat.reference.blend import blend
 from clsplat.reference.render import parameters
-from clsplat.reference.sort import depth_order
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
 
@@ -215,14 +214,13 @@ def compare_8k(device: Device, rng: np.random.Generator, *, count: int = 2000, c
     scene = _made(cloud)
     _, _, _, image = frame_of(device, scene)
     projected = reference.project(**parameters(scene[0]), camera=scene[1], sh_degree=DEGREE)
-    order = depth_order(projected.depths, projected.visible)
     worst = flips = 0.0
     band = 0
     scale = max(1.0, float(projected.colors.max()))
     for _ in range(crops):
         x, y = (int(rng.choice([0, size - side, rng.integers(0, size - side)])) for size in (width, height))
         moved = replace(projected, means2d=projected.means2d - (x, y))
-        blended = blend(moved, order, side, side, BACKGROUND)
+        blended = blend(moved, side, side, BACKGROUND)
         assert blended.margin is not None
         near = blended.margin < BAND
         error = np.abs(image[y : y + side, x : x + side] - blended.image).max(axis=2) / scale

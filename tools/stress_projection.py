@@ -16,7 +16,6 @@ from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import PLAIN_SLOTS, SPLAT
 from clsplat.gaussians import Gaussians
-from clsplat.reference.blend import footprint
 from clsplat.reference.project import ALPHA_MIN, Projected, project, project_grad, view_directions
 from clsplat.reference.render import parameters
 from clsplat.spherical_harmonics import sh_basis
@@ -164,7 +163,7 @@ def compare(device: Device, cases: Cases, rng: np.random.Generator, *, finite_on
     reaches = wanted.visible & (least_exponent(wanted, camera) < budget - 0.04)
     missing = reaches & ~shown & ~skipped & ~limits_of_kernels(arrays, wanted)
     for i in np.flatnonzero(missing):  # an ellipse may pass between pixel centres
-        found = footprint(wanted, int(i), camera.width, camera.height)
+        found = wanted.footprint(int(i), camera.width, camera.height)
         missing[i] = found is not None and bool((found.raw >= ALPHA_MIN * 1.02).any())
     broken = {
         "not finite": not_finite,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.bench.stages import held_kind, picture_of, trainer_of, wall_ms
+from clsplat.bench.stages import held_kind, picture_of, trainer_of
 from clsplat.bench.subject import Subject
 from clsplat.camera import Camera
 from clsplat.config.presets import PRESETS
@@ -26,7 +26,6 @@ from clsplat.progress import Progress, aligned, no_progress
 from clsplat.reference.blend import blend
 from clsplat.reference.project import project
 from clsplat.reference.render import parameters
-from clsplat.reference.sort import depth_order
 from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.rendering.renderer import held_sh
@@ -136,8 +135,9 @@ def compare(
     for done in range(repeat):
         say("times", done / repeat)
         for name, rasterizer in rasterizers.items():
-            both = wall_ms(device, partial(draw, rasterizer)), wall_ms(device, partial(step, rasterizer))
-            times[name].append(both)
+            _, frame_ms = device.timed(partial(draw, rasterizer))
+            _, step_ms = device.timed(partial(step, rasterizer))
+            times[name].append((frame_ms, step_ms))
     whole = (width, height) == (camera.width, camera.height)
     points: dict[str, dict[str, Any]] = {}
     for name, config in tried.items():
@@ -182,8 +182,7 @@ def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, i
     means = projected.means2d - (x, y)
     reach = 1.1 * projected.half_extents + 1.0
     near = (means > -reach).all(axis=1) & (means < np.array([width, height]) + reach).all(axis=1)
-    order = depth_order(projected.depths, projected.visible & near)
-    image: Float64 = blend(replace(projected, means2d=means), order, width, height).image
+    image: Float64 = blend(replace(projected, means2d=means, visible=projected.visible & near), width, height).image
     return image
 
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from clsplat.bench.stages import wall_ms
 from clsplat.bench.subject import synthetic
 from clsplat.device import cl
 from clsplat.device.buffers import upload
@@ -90,7 +89,7 @@ def measure(device: Device, workload: tuple[int, int, int] = WORKLOAD, repeat: i
         frame = rasterizer.forward(gaussians, subject.camera, background)
         rasterizer.backward(gaussians, frame, frame.blended.image, gradients)
 
-    times = [wall_ms(device, draw) for _ in range(repeat + 2)]
+    times = [device.timed(draw)[1] for _ in range(repeat + 2)]
     return statistics.median(times[2:])
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from clsplat.gaussians import GROUPS, floats_of
 from clsplat.progress import Progress, aligned, no_progress
 from clsplat.rendering.rasterizer import Frame
 from clsplat.rendering.renderer import Renderer, held_sh
-from clsplat.scenes.lens import Lens
+from clsplat.scenes.data_set import Lens
 from clsplat.scenes.scene import Scene, View
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.device_gaussians import upload_gaussians
@@ -119,7 +118,7 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> tuple[f
     by_events: list[dict[str, StageRecord]] = []
     by_waiting: list[dict[str, StageRecord]] = []
     for _ in range(repeat):
-        walls.append(wall_ms(device, work))
+        walls.append(device.timed(work)[1])
         for records, wait in ((by_events, False), (by_waiting, True)):
             with device.recorder.recording(wait=wait) as stages:
                 work()
@@ -133,15 +132,6 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> tuple[f
         total = statistics.median(waits if by_wall else [sum(run.values()) for run in times])
         medians[name] = replace(record, kernels=kernels, ms=total, wall_ms=statistics.median(waits))
     return statistics.median(walls), medians, by_wall
-
-
-def wall_ms(device: Device, work: Callable[[], object]) -> float:
-    """Milliseconds of `work`, from an idle device to an idle device."""
-    device.finish()
-    start = time.perf_counter()
-    work()
-    device.finish()
-    return 1e3 * (time.perf_counter() - start)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,8 @@ from clsplat.files import check_new, digest
 from clsplat.frame.samples import finer
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
-from clsplat.images.channels import VIDEO, check_format, parse_channels
 from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
+from clsplat.images.frame_files import VIDEO, check_format, parse_channels
 from clsplat.runs.run import model_file
 from clsplat.sequence import existing
 from clsplat.sequence.task import RenderOptions, Task, digest_of, make_tasks, picture_camera

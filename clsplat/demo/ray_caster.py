@@ -71,7 +71,7 @@ def smooth_square(phase: Float32, softness: float) -> Float32:
 def palette_colour(value: Float32, colours: Palette) -> Float32:
     """Linear interpolation through equally spaced colours; value (n,) in [0, 1], result (n, 3)."""
     stops = np.linspace(0.0, 1.0, len(colours))
-    channels = [np.interp(value, stops, [colour[c] for colour in colours]) for c in range(3)]
+    channels = [np.interp(value, stops, levels) for levels in zip(*colours, strict=True)]
     return np.stack(channels, axis=-1).astype(np.float32)
 
 
@@ -322,10 +322,7 @@ def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], n
     lit = np.zeros(len(start), np.float32)
     for sun in suns:
         direction = np.broadcast_to(sun, start.shape)
-        free = np.ones(len(start), bool)
-        for blocker in blockers:
-            free &= ~np.isfinite(blocker.distance(start, direction))
-        lit += free
+        lit += ~np.any([np.isfinite(blocker.distance(start, direction)) for blocker in blockers], axis=0)
     sunlit = ndimage.zoom((lit / SHADOW_RAYS).reshape(rows, columns), 4, order=1, grid_mode=True, mode="nearest")
     sun_term = np.maximum(dot(normals, SUN), 0) * sunlit.ravel()
     sky_term = 0.55 + 0.45 * normals[:, 2]
@@ -364,12 +361,9 @@ def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32
     direction = (local @ camera.rotation).astype(np.float32)
     origin = camera.position.astype(np.float32)
 
-    nearest = np.full(len(direction), np.inf, np.float32)
-    hit_index = np.full(len(direction), -1, np.int8)
-    for index, surface in enumerate(surfaces):
-        distance = surface.distance(origin, direction)
-        closer = distance < nearest
-        nearest[closer], hit_index[closer] = distance[closer], index
+    distances = np.stack([surface.distance(origin, direction) for surface in surfaces])
+    nearest = distances.min(axis=0)
+    hit_index = np.where(np.isfinite(nearest), distances.argmin(axis=0), -1)
     colour = np.zeros_like(direction)  # no ray misses the wall
     for index, surface in enumerate(surfaces):
         rays = np.flatnonzero(hit_index == index)
@@ -405,16 +399,15 @@ def write_photos(
     width: int = 320,
     height: int = 240,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> None:
     """Write `count` photos `photo_000.jpg` ... into folder (made if missing). The same seed gives the same photos.
 
     width, height: pixels. progress(text, fraction) is called as the work goes on. Raises ClsplatError where a
     photo cannot be written. Poses are neither returned nor written: recovering them is the point of the demo.
     """
-    report = progress or no_progress
     folder.mkdir(parents=True, exist_ok=True)
-    report("painting the scene", 0.0)
+    progress("painting the scene", 0.0)
     surfaces = still_life()
     bake(surfaces, seed)
     views = cameras(count, width, height, seed)
@@ -422,4 +415,4 @@ def write_photos(
     with ThreadPoolExecutor(2) as pool:
         for index, image in enumerate(pool.map(partial(render, surfaces), views)):
             write_jpeg(folder / f"photo_{index:03d}.jpg", image)
-            report("taking photos", (index + 1) / count)
+            progress("taking photos", (index + 1) / count)

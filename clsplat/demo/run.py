@@ -18,7 +18,7 @@ from clsplat.errors import InputError, examples
 from clsplat.files import atomic_write, is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
-from clsplat.progress import Progress, StageProgress, TrainProgress
+from clsplat.progress import Progress, StageProgress, TrainProgress, no_progress
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
@@ -85,7 +85,7 @@ def claim(output: Path) -> None:
     atomic_write(output / MARK, b"What is beside this file was made by clsplat demo, which may replace it.\n")
 
 
-def make_scene(output: Path, progress: Progress | None = None) -> Path:
+def make_scene(output: Path, progress: Progress = no_progress) -> Path:
     """Photos in output/photos and the scene recovered from them in output/scene, whose path is returned.
 
     Both are used again where they are complete. Raises InputError where output/photos holds other files.

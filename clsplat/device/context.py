@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyopencl as cl
@@ -24,6 +25,8 @@ from clsplat.device.rehearsal import Rehearsal
 from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError, DriverError
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -192,6 +195,14 @@ class Device:
     def finish(self) -> None:
         """Wait until the device has nothing to do."""
         self.queue.finish()
+
+    def timed(self, work: Callable[[], T]) -> tuple[T, float]:
+        """The result of `work` and its milliseconds, from an idle device to an idle device."""
+        self.finish()
+        start = time.perf_counter()
+        result = work()
+        self.finish()
+        return result, 1e3 * (time.perf_counter() - start)
 
     def _probe_fma(self) -> dict[str, object]:
         """The define FMA_BY_CONTRACTION if the compiler fuses a lone a*b + c in vectors: then that is the fast way to

@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import cached_property
 from typing import Any
 
@@ -123,7 +124,7 @@ class Rehearsal:
             self._begin(f"{variant.stem}.cl", variant.digest)
             return variant
         if variant.digest not in self._known:
-            self._ask({"build": _text(variant)}, variant, "", variant.digest)
+            self._ask({"build": asdict(variant)}, variant, "", variant.digest)
         return variant.anew(self._known[variant.digest])
 
     def launch(
@@ -142,7 +143,7 @@ class Rehearsal:
             given = [_described(argument) for argument in arguments]
             if sum(value for kind, value in given if kind == "buffer") <= MOST_BYTES:
                 launch = {"kernel": kernel.name, "size": _few(size, local), "local": local, "arguments": given}
-                text = _text(kernel.variant.anew(self._known.get(kernel.variant.digest, "")))
+                text = asdict(kernel.variant.anew(self._known.get(kernel.variant.digest, "")))
                 self._ask({"build": text, "launch": launch}, kernel.variant, kernel.name, name)
 
     def built(self, variant: Variant, salt: str) -> None:
@@ -205,17 +206,13 @@ def again(index: int, trial: Mapping[str, Any]) -> str:
     Raises whatever a trial raises that clsplat did not write."""
     given = trial["build"]
     variant = Variant(given["stem"], text_of(given["stem"]), tuple(given["options"]))
-    message = {"build": _text(variant), **{key: trial[key] for key in ("launch",) if key in trial}}
+    message = {"build": asdict(variant), **{key: trial[key] for key in ("launch",) if key in trial}}
     answer, ending, _ = _process(index).ask(message)
     return "not enough memory to try it" if answer.get("memory") else _trouble(answer, ending)
 
 
 def _trouble(answer: Mapping[str, Any], ending: str) -> str:
     return f"the process that tried it {ending}" if ending else str(answer.get("trouble", ""))
-
-
-def _text(variant: Variant) -> dict[str, Any]:
-    return {"stem": variant.stem, "source": variant.source, "options": variant.options}
 
 
 def _few(size: tuple[int, ...], local: tuple[int, ...] | None) -> list[int]:

@@ -88,14 +88,10 @@ def asked_shape() -> str:
 def wanted_shape(device: cl.Device) -> Shape:
     """The shape that CLSPLAT_SHAPE asks for, or that was tuned, or the default. Raises DeviceError for a CLSPLAT_SHAPE
     that makes no sense, or that the device has no room for."""
-    default = default_shape(device)
-    text = asked_shape()
-    if not text:
-        text = saved_shapes().get(known.device_key(device), "")
-        shape = _parsed(text, default)
-        return default if shape is None or shape.items > most_items(device) else shape
-    shape = _parsed(text, default)
-    assert shape is not None, "it has been looked at"
+    default, text = default_shape(device), asked_shape()
+    shape = _parsed(text or saved_shapes().get(known.device_key(device), ""), default)
+    if shape is None or (not text and shape.items > most_items(device)):
+        return default
     name, most = device.name.strip(), device.max_work_group_size
     if shape.items > most:
         raise DeviceError(f"CLSPLAT_SHAPE={text}: {name} has at most {most} items in a work-group")

@@ -54,8 +54,7 @@ def evaluate(
             }
         except (InputError, ValueError) as error:
             raise InputError(f"{view.name}: {error}") from None
-        perceptual = metrics.lpips(image, truth)
-        if perceptual is not None:
+        if (perceptual := metrics.lpips(image, truth)) is not None:
             record["lpips"] = perceptual
         records.append(record)
         if save_dir is not None:

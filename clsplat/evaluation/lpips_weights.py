@@ -50,41 +50,39 @@ def fetch() -> None:
     advice = f"curl --create-dirs -o {path} {URL}"
     if seconds == 0:
         raise ClsplatError(f"VGG-16's weights are not there: {advice}")
-    transfer = _Transfer(path)
-    thread = threading.Thread(target=transfer.run, daemon=True)  # a name that is looked up knows no limit
+    transfer = _Transfer(daemon=True)  # a name that is looked up knows no limit
     progress = StageProgress()
-    thread.start()
+    transfer.start()
     until = time.monotonic() + seconds
-    while thread.is_alive() and time.monotonic() < until:
-        thread.join(min(0.5, max(until - time.monotonic(), 0.0)))
+    while transfer.is_alive() and time.monotonic() < until:
+        transfer.join(min(0.5, max(until - time.monotonic(), 0.0)))
         progress(f"fetching VGG-16's weights for LPIPS, for {seconds:g} s at most ({VARIABLE})", transfer.fraction)
     transfer.cancelled = True
-    if thread.is_alive():
+    if transfer.is_alive():
         raise ClsplatError(f"VGG-16's weights did not come within {seconds:g} s ({VARIABLE}): {advice}")
     if transfer.trouble is not None:
         raise ClsplatError(f"VGG-16's weights could not be fetched ({transfer.trouble}): {advice}")
 
 
-class _Transfer:
-    """The download that the thread does, and its progress."""
+class _Transfer(threading.Thread):
+    """The download, and its progress."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.cancelled = path, False
-        self.fraction: float | None = None
-        self.trouble: str | None = None
+    cancelled = False
+    fraction: float | None = None
+    trouble: str | None = None
 
     def run(self) -> None:
         try:
-            self._run()
+            self._fetch(place())
         except Exception as error:  # noqa: BLE001  # of any kind: it is reported, and evaluation goes on
             self.trouble = " ".join(str(error).split())[:100] or type(error).__name__
 
-    def _run(self) -> None:
+    def _fetch(self, path: Path) -> None:
         digest = hashlib.sha256()
         with urllib.request.urlopen(URL, timeout=SILENCE) as answer:
             total, done = int(answer.headers.get("Content-Length") or 0), 0
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_writer(self.path) as file:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_writer(path) as file:
                 while block := answer.read(1 << 16):
                     if self.cancelled:
                         raise ClsplatError("it took too long")

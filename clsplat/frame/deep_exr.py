@@ -27,9 +27,8 @@ from clsplat.errors import InputError
 from clsplat.frame.draw import on_tiles
 from clsplat.frame.strips import strips
 from clsplat.gaussians import Gaussians
-from clsplat.images.channels import HALF_MAX, deep_spec
 from clsplat.images.colour import Colours
-from clsplat.images.exr_header import Header
+from clsplat.images.frame_files import HALF_MAX, Header, deep_spec
 from clsplat.images.writing import write_rows
 from clsplat.rendering.memory_needs import frame_pixels
 from clsplat.rendering.renderer import Renderer
@@ -93,7 +92,7 @@ def write_deep(
 
     Channels R G B A Z ZBack; a pixel has a sample for each slice that it has something in, with the depths of the first
     and the last Gaussian that it takes there. Colours are half or float as the encoding says, depths are float. Raises
-    InputError and ClsplatError as `images.channels.write_channels`.
+    InputError and ClsplatError as `images.frame_files.write_channels`.
     """
     config = config or DeepConfig()
     encoding, header, colours = encoding or Encoding(), header or Header(), colours or Colours()

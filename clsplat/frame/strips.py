@@ -16,8 +16,7 @@ from clsplat.device.layout import TILE
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, feature_floats
 from clsplat.frame.window import crop
-from clsplat.images.channels import check_target, encoded
-from clsplat.images.exr_header import Header
+from clsplat.images.frame_files import Header, check_target, encoded
 from clsplat.images.writing import write_rows
 from clsplat.rendering.memory_needs import frame_pixels
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import errno
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from clsplat.config.pictures import FPS, VideoConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import FULL, native_name, replace, temporary_name, write_error
-from clsplat.images.channels import VIDEO
+from clsplat.files import FULL, atomic_name, native_name
+from clsplat.images.frame_files import VIDEO
 
 _LUMA = (0.2126, 0.7152, 0.0722)
 _BLUE, _RED = np.float32(2 * (1 - 0.0722)), np.float32(2 * (1 - 0.2126))
@@ -95,50 +95,58 @@ def rate_of(fps: float) -> Fraction:
     return Fraction(fps).limit_denominator(1001)
 
 
+@contextmanager
+def video_writer(path: Path, config: VideoConfig | None = None) -> Iterator[VideoWriter]:
+    """A video that takes the place of `path` when the block ends well; on any exception nothing is left there.
+
+    Raises InputError for another extension, a folder that does not exist, no frames, and where PyAV is not installed.
+    """
+    config = config or VideoConfig()
+    config.check()
+    check_video(path)
+    with atomic_name(path) as temporary:
+        video = VideoWriter(path, temporary, config)
+        try:
+            yield video
+            video.finish()
+        finally:
+            video.close()
+
+
 class VideoWriter:
-    """A video that is written frame by frame, in order, and takes the place of `path` when the block ends well.
+    """A video that is written frame by frame, in order.
 
     Frames are 8-bit 4:2:0 in Rec.709's limited range, which halves the colour's resolution; where a size is odd the
-    last column or row is repeated, as the format has none. On any exception nothing is left at `path`.
+    last column or row is repeated, as the format has none.
     """
 
-    def __init__(self, path: Path, config: VideoConfig | None = None) -> None:
-        """Raises InputError for another extension, a folder that does not exist, and where PyAV is not installed."""
-        self._config = config or VideoConfig()
-        self._config.check()
-        check_video(path)
-        self._path = path
-        self._target = Path(os.path.realpath(path))
-        self._temporary = temporary_name(self._target)
+    def __init__(self, path: Path, temporary: Path, config: VideoConfig) -> None:
+        """temporary: the file's name as long as it is written."""
+        self._path, self._temporary, self._config = path, temporary, config
         self._container: Any = None
         self._stream: Any = None
         self._size = (0, 0)
         self.frames = 0
-
-    def __enter__(self) -> VideoWriter:  # noqa: PYI034  # Self came with 3.11
-        return self
 
     def add(self, planes: NDArray[np.uint8]) -> None:
         """Append a frame as `frame_planes` gives it; all of one size.
 
         Raises ClsplatError if writing fails, ValueError for a frame of another size.
         """
+        import av
+
         size = planes.shape[0] * 2 // 3, planes.shape[1]
         if self.frames and size != self._size:
             raise ValueError(f"frame {size}: expected {self._size}, the size of the first")
         self._size = size
-        self._taken(lambda: self._encode(planes))
+        with self._refusals():
+            if self._container is None:
+                self._open(size[1], size[0])
+            frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
+            frame.pts = self.frames
+            frame.time_base = self._stream.codec_context.time_base
+            self._container.mux(self._stream.encode(frame))
         self.frames += 1
-
-    def _encode(self, planes: NDArray[np.uint8]) -> None:
-        import av
-
-        if self._container is None:
-            self._open(planes.shape[1], planes.shape[0] * 2 // 3)
-        frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
-        frame.pts = self.frames
-        frame.time_base = self._stream.codec_context.time_base
-        self._container.mux(self._stream.encode(frame))
 
     def _open(self, width: int, height: int) -> None:
         import av
@@ -158,36 +166,31 @@ class VideoWriter:
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = 1
 
-    def _taken(self, work: Any) -> None:
+    @contextmanager
+    def _refusals(self) -> Iterator[None]:
+        """Turn what FFmpeg raises into errors of the system, or of ours."""
         import av
 
         try:
-            work()
+            yield
         except (av.error.FFmpegError, OSError) as error:
             if error.errno in FULL or error.errno == errno.EFBIG:
-                written = self._temporary.stat().st_size if self._temporary.is_file() else 0
-                raise write_error(self._path, OSError(error.errno, os.strerror(error.errno)), written) from None
+                raise OSError(error.errno, os.strerror(error.errno)) from None
             reason = error.strerror or str(error)
             raise ClsplatError(f"{self._path}: cannot be written: {reason}") from None
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            if kind is None and self.frames == 0:
-                raise InputError(f"{self._path}: a video of no frames, expected at least one")
-            if kind is None:
-                self._taken(self._finish)
-        finally:
-            if self._container is not None:
-                with suppress(Exception):  # it is closed if all went well; else what it says is not the reason
-                    self._container.close()
-            with suppress(OSError):
-                self._temporary.unlink()
+    def finish(self) -> None:
+        """Write what the encoder still holds, to the disk. Raises InputError for a video of no frames."""
+        if self.frames == 0:
+            raise InputError(f"{self._path}: a video of no frames, expected at least one")
+        with self._refusals():
+            self._container.mux(self._stream.encode(None))
+            self._container.close()
+            with open(self._temporary, "r+b") as file:  # Windows flushes only what may be written to
+                os.fsync(file.fileno())
 
-    def _finish(self) -> None:
-        self._container.mux(self._stream.encode(None))
-        self._container.close()
-        with open(self._temporary, "r+b") as file:  # Windows flushes only what may be written to
-            os.fsync(file.fileno())
-        replace(self._temporary, self._target)
+    def close(self) -> None:
+        """Close the file, whatever is in it."""
+        if self._container is not None:
+            with suppress(Exception):  # it is closed if all went well; else what it says is not the reason
+                self._container.close()

@@ -3,20 +3,16 @@
 
 from __future__ import annotations
 
-import errno
-import os
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from clsplat.errors import ClsplatError, InputError, WriteError, plain
-from clsplat.files import is_file, native_name, replace, require_room, room_error, temporary_name, write_error
+from clsplat.errors import ClsplatError, InputError, plain
+from clsplat.files import atomic_name, native_name, require_room, room_error
 from clsplat.images.alpha import associate
 from clsplat.images.reading import decodes, one_line, opened, png_is_whole
 
@@ -76,22 +72,50 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
     """Write a file of one part or several, (H, W, C) each with its OpenImageIO specification, atomically.
 
     Raises ClsplatError if writing fails."""
-    with atomic_output(path, specs, kind) as output:
+
+    def steps(file: Any, name: str) -> Iterator[bool]:
         for index, pixels in enumerate(parts):
-            if index > 0:
-                output.take(output.file.open(output.name, specs[index], "AppendSubimage"))
-            output.take(output.file.write_image(pixels))
+            yield index == 0 or file.open(name, specs[index], "AppendSubimage")
+            yield file.write_image(pixels)
+
+    _write(path, specs, kind, steps)
 
 
 def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int]]) -> None:
     """Write a file of one part from the top as its rows come, atomically. pieces: pixels, or OpenImageIO's deep data,
     and how many rows they are. Raises ClsplatError if writing fails."""
-    with atomic_output(path, [spec], kind) as output:
-        write = output.file.write_deep_scanlines if spec.deep else output.file.write_scanlines
-        row = spec.y
+
+    def steps(file: Any, _: str) -> Iterator[bool]:
+        write, row = file.write_deep_scanlines if spec.deep else file.write_scanlines, spec.y
         for pixels, count in pieces:
-            output.take(write(row, row + count, 0, pixels))
+            yield write(row, row + count, 0, pixels)
             row += count
+
+    _write(path, [spec], kind, steps)
+
+
+def _write(path: Path, specs: Sequence[Any], kind: str, steps: Callable[[Any, str], Iterable[bool]]) -> None:
+    """Write a file of these parts. steps: go on writing OpenImageIO's file, which is open under a name, and say of each
+    call whether it went well."""
+    # libjpeg ends the process when it cannot write
+    most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
+    with atomic_name(path) as temporary:
+        file: Any = oiio.ImageOutput.create(kind)
+        name = native_name(temporary)
+        try:
+            with require_room(path, most):
+                # several parts have to be announced together
+                opens = file.open(name, specs[0] if len(specs) == 1 else tuple(specs))
+                written = opens and all(steps(file, name)) and file.close()
+            # the last bytes of a full disk are lost without a word
+            if written and _is_whole(temporary, kind, len(specs)):
+                return
+            reason = "the file is not whole" if written else file.geterror()
+            if error := room_error(temporary.parent):  # OpenImageIO seldom says that the system refuses to write
+                raise OSError(error.errno, error.strerror)
+            raise ClsplatError(f"{path}: cannot be written: {plain(one_line(reason))}")
+        finally:
+            file.close()
 
 
 def _is_whole(path: Path, kind: str, parts: int) -> bool:
@@ -107,64 +131,3 @@ def _is_whole(path: Path, kind: str, parts: int) -> bool:
 def jpeg_room(spec: Any) -> int:
     """More bytes than a JPEG of that size has."""
     return int(spec.width * spec.height * spec.nchannels * 5 // 4) + (1 << 16)
-
-
-@dataclass(frozen=True, eq=False)
-class Output:
-    """file: OpenImageIO's, open under the temporary name `temporary`."""
-
-    file: Any
-    temporary: Path
-    path: Path
-
-    @property
-    def name(self) -> str:
-        """The temporary name as OpenImageIO takes it."""
-        return native_name(self.temporary)
-
-    def take(self, done: bool) -> None:
-        """Take what the file's methods return. Raises WriteError or ClsplatError where that is failure."""
-        if not done:
-            self.fail(self.file.geterror())
-
-    def fail(self, reason: str) -> NoReturn:
-        """Raise WriteError where the system refuses to write, else ClsplatError: OpenImageIO seldom says which."""
-        written = self.temporary.stat().st_size if is_file(self.temporary) else 0
-        if error := room_error(self.temporary.parent):
-            self.file.close()
-            with suppress(OSError):  # so that the message has what is free without it
-                self.temporary.unlink()
-            raise write_error(self.path, error, written) from None
-        raise ClsplatError(f"{self.path}: cannot be written: {plain(one_line(reason))}")
-
-
-@contextmanager
-def atomic_output(path: Path, specs: Sequence[Any], kind: str) -> Iterator[Output]:
-    """A file to write that takes the place of `path` when the block ends well, and never exists otherwise.
-
-    specs: of its parts; raises ClsplatError if writing fails."""
-    # Not through files.atomic_writer: OpenImageIO writes to a name, not to an open file.
-    target = Path(os.path.realpath(path))
-    temporary = temporary_name(target)
-    output = Output(oiio.ImageOutput.create(kind), temporary, path)
-    # libjpeg ends the process when it cannot write
-    most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
-    try:
-        if target.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        with require_room(path, most):
-            # several parts have to be announced together
-            output.take(output.file.open(output.name, specs[0] if len(specs) == 1 else tuple(specs)))
-            yield output
-            output.take(output.file.close())
-        if not _is_whole(temporary, kind, len(specs)):  # the last bytes of a full disk are lost without a word
-            output.fail("the file is not whole")
-        replace(temporary, target)
-    except WriteError:
-        raise
-    except OSError as error:
-        raise write_error(path, error) from None
-    finally:
-        output.file.close()
-        with suppress(OSError):  # it is gone if all went well
-            temporary.unlink()

@@ -21,7 +21,6 @@ UNITS = {
     "colour": "of 1",
     "sh": "in a coefficient beyond degree 0",
 }
-_BLOCK = 1 << 16
 
 
 def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
@@ -38,8 +37,7 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
     extent = float(np.linalg.norm(high - low))
     shift = read.origin - original.origin
     blocks = []
-    for start in range(0, len(original), _BLOCK):
-        rows = slice(start, start + _BLOCK)
+    for rows in packing.row_blocks(len(original)):
         distance = np.linalg.norm(read.means[rows].astype(np.float64) - original.means[rows] + shift, axis=1)
         opacities = [packing.opacities(model.opacity_logits[rows]) for model in (original, read)]
         colours = [packing.colours(model.sh[rows, 0]) for model in (original, read)]
@@ -76,10 +74,8 @@ def _angles(a: NDArray[Any], b: NDArray[Any]) -> Float64:
 
 def _sh_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
     width = max(a.shape[1], b.shape[1])
-    if width == 0:
-        return np.zeros(len(a))
     p, q = (np.pad(sh.astype(np.float64), ((0, 0), (0, width - sh.shape[1]), (0, 0))) for sh in (a, b))
-    return np.asarray(np.abs(p - q).max(axis=(1, 2)))
+    return np.asarray(np.abs(p - q).max(axis=(1, 2), initial=0))
 
 
 def table(losses: dict[str, dict[str, float]]) -> str:

@@ -17,11 +17,9 @@ from clsplat.files import is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import recorded_space
 from clsplat.models.codec import values as packing
-from clsplat.models.edit import take
 from clsplat.models.formats import Format, resolve
 
 PERCENTILES = (0, 1, 50, 99, 100)
-_BLOCK = 1 << 16
 
 
 def model_info(path: Path) -> dict[str, Any]:
@@ -29,12 +27,12 @@ def model_info(path: Path) -> dict[str, Any]:
     path, form = resolve(path)
     result: dict[str, Any] = {"path": str(path), "format": form.name, "bytes": size(path, form)}
     if form.blocks:
-        origin, blocks = form.blocks(path)
+        blocks = form.blocks(path)
     else:
         model = form.read(path)
-        origin, blocks = model.origin, _blocks(model)
+        blocks = iter([replace(model, means=packing.world_means(model).astype(np.float32))])
     result |= form.describe(path)
-    result |= _summary(blocks, origin)
+    result |= _summary(blocks)
     result["colorspace"] = recorded_space(path)
     result["loses"] = form.loses
     return result
@@ -45,32 +43,18 @@ def size(path: Path, form: Format) -> int:
     return sum(file.stat().st_size for file in (path, *form.side_files(path)) if is_file(file))
 
 
-def _blocks(model: Gaussians) -> Iterator[Gaussians]:
-    """Blocks of a whole model, in the world."""
-    for start in range(0, len(model), _BLOCK):
-        rows = slice(start, start + _BLOCK)
-        yield replace(take(model, rows), means=packing.world_means(model, rows).astype(np.float32))
-
-
-def _summary(blocks: Iterator[Gaussians], origin: NDArray[np.float64]) -> dict[str, Any]:
+def _summary(blocks: Iterator[Gaussians]) -> dict[str, Any]:
     """Everything but SH is held for the percentiles, 28 bytes a Gaussian."""
-    means: list[Float32] = []
-    scales: list[Float32] = []
-    logits: list[Float32] = []
+    parts: list[list[Float32]] = []
     not_finite = degree = used = 0
     for block in blocks:
-        degree = block.sh_degree
-        arrays = (block.means, block.quaternions, block.log_scales, block.opacity_logits[:, None])
-        bad = ~np.isfinite(block.sh).all(axis=(1, 2))
-        for array in arrays:
-            bad |= ~np.isfinite(array).all(axis=1)
-        not_finite += int(bad.sum())
-        good = ~bad
+        degree, origin = block.sh_degree, block.origin
+        finite = [np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in block.arrays().values()]
+        good = np.logical_and.reduce(finite)
+        not_finite += int((~good).sum())
         used = max([used, *(band for band in range(1, degree + 1) if block.sh[:, band**2 : (band + 1) ** 2].any())])
-        means.append(block.means[good])
-        scales.append(block.log_scales[good])
-        logits.append(block.opacity_logits[good])
-    m, s, o = np.concatenate(means), np.concatenate(scales), np.concatenate(logits)
+        parts.append([array[good] for array in (block.means, block.log_scales, block.opacity_logits)])
+    m, s, o = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     result: dict[str, Any] = {"gaussians": len(m) + not_finite, "not_finite": not_finite}
     result |= {"sh_degree": degree, "sh_degree_used": used}
     if len(m):

@@ -13,16 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64, Int64
-from clsplat.reference.project import ALPHA_MIN, Projected
+from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Projected, Seen
 
 ALPHA_MAX = float(np.float32(0.99))
 TRANSMITTANCE_MIN = float(np.float32(1e-4))
 """The kernels' constants to the bit: two layers at the cap leave (1 - 0.99)^2, in decimals the limit itself."""
-
-
-BOX_SLACK = 0.1
-"""Added to the reach q <= 2 ln(255 o) of a Gaussian's box, so that alphas down to 5 % under 1/255 are looked at
-and margins up to that are true."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,38 +49,6 @@ class BlendGradients:
 
 
 @dataclass(frozen=True, eq=False)
-class Footprint:
-    """One Gaussian on the pixels of its box: rows, columns of the image; dx (1, w), dy (h, 1), pixel centre minus
-    mean; falloff (h, w) = exp(-q / 2); raw (h, w) = opacity times falloff, not yet clamped."""
-
-    rows: slice
-    columns: slice
-    dx: Float64
-    dy: Float64
-    falloff: Float64
-    raw: Float64
-
-
-def footprint(projected: Projected, gaussian: int, width: int, height: int) -> Footprint | None:
-    """Eqs. (9), (14) on the box that alpha >= 1/255 can reach, None where that misses the image."""
-    opacity = projected.opacities[gaussian]
-    reach = 2 * np.log(opacity / ALPHA_MIN) + BOX_SLACK
-    half = np.sqrt(reach * projected.covariances[gaussian, [0, 2]])
-    mean = projected.means2d[gaussian]
-    size = np.array([width, height])
-    # clipped as floats: a mean far off the image need not fit an integer
-    first = np.clip(np.ceil(mean - half - 0.5), 0, size).astype(np.int64)
-    stop = np.clip(np.floor(mean + half - 0.5) + 1, 0, size).astype(np.int64)
-    if (first >= stop).any():
-        return None
-    dx = np.arange(first[0], stop[0])[None, :] + 0.5 - mean[0]
-    dy = np.arange(first[1], stop[1])[:, None] + 0.5 - mean[1]
-    a, b, c = projected.conics[gaussian]
-    falloff = np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
-    return Footprint(slice(first[1], stop[1]), slice(first[0], stop[0]), dx, dy, falloff, opacity * falloff)
-
-
-@dataclass(frozen=True, eq=False)
 class Layer:
     """One Gaussian, `position` in the order, on the pixels of its box: alpha; before, after: transmittance in front of
     it and behind; added: where it is in the picture; margin: as of `Blended`, infinite where nothing is decided."""
@@ -100,12 +63,12 @@ class Layer:
     margin: Float64
 
 
-def layers(projected: Projected, order: Int64, width: int, height: int) -> Iterator[Layer]:
-    """Eqs. (14) to (16): the Gaussians that `order` (M,) lists, rows of `projected`, front to back."""
+def layers(projected: Seen, width: int, height: int) -> Iterator[Layer]:
+    """Eqs. (14) to (16): the visible Gaussians front to back."""
     transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
-    for position, gaussian in enumerate(order):
-        splat = footprint(projected, int(gaussian), width, height)
-        if splat is None or not alive[box := (splat.rows, splat.columns)].any():
+    for position, gaussian in enumerate(projected.order):
+        splat = projected.footprint(int(gaussian), width, height)
+        if splat is None or not alive[box := splat.box].any():
             continue
         alpha = np.minimum(ALPHA_MAX, splat.raw)
         before, seen = transmittance[box].copy(), alive[box] & (alpha >= ALPHA_MIN)
@@ -120,8 +83,7 @@ def layers(projected: Projected, order: Int64, width: int, height: int) -> Itera
 
 
 def blend(
-    projected: Projected,
-    order: Int64,
+    projected: Seen,
     width: int,
     height: int,
     background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
@@ -132,7 +94,7 @@ def blend(
     last = np.full((height, width), -1, np.int64)
     count = np.zeros((height, width), np.int64)
     margin = np.full((height, width), BOX_SLACK / 2)
-    for layer in layers(projected, order, width, height):
+    for layer in layers(projected, width, height):
         box, added = layer.box, layer.added
         margin[box] = np.minimum(margin[box], layer.margin)
         weight = np.where(added, layer.before * layer.alpha, 0.0)
@@ -146,14 +108,13 @@ def blend(
 
 def blend_grad(
     projected: Projected,
-    order: Int64,
     width: int,
     height: int,
     background: Sequence[float] | Float64,
     d_image: Float64,
 ) -> BlendGradients:
     """Eqs. (22) to (29) and (55), back to front: d_image (H, W, 3) is dL/dC."""
-    forward = blend(projected, order, width, height, background)
+    forward, order = blend(projected, width, height, background), projected.order
     transmittance = forward.transmittance.copy()
     behind = np.broadcast_to(np.asarray(background, np.float64), (height, width, 3)).copy()
     number = len(projected.depths)
@@ -167,10 +128,10 @@ def blend_grad(
     )
     for position in range(len(order) - 1, -1, -1):
         gaussian = int(order[position])
-        splat = footprint(projected, gaussian, width, height)
+        splat = projected.footprint(gaussian, width, height)
         if splat is None:
             continue
-        box = (splat.rows, splat.columns)
+        box = splat.box
         alpha = np.minimum(ALPHA_MAX, splat.raw)
         added = (alpha >= ALPHA_MIN) & (position <= forward.last[box])
         if not added.any():

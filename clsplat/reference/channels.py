@@ -10,9 +10,11 @@ import numpy as np
 
 from clsplat.arrays import Float64, Int64
 from clsplat.camera import Camera
+from clsplat.gaussians import Gaussians
 from clsplat.reference.blend import layers
 from clsplat.reference.cameras import period, pixel_from_world, wrapped
-from clsplat.reference.project import Projected, rotation_matrices, view_directions
+from clsplat.reference.project import Seen, rotation_matrices, view_directions
+from clsplat.reference.render import parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,32 +54,27 @@ def motions(means: Float64, camera: Camera, after: Camera) -> Float64:
     return np.where(moved[:, None], there - here, 0.0)
 
 
-def channels(
-    projected: Projected,
-    order: Int64,
-    camera: Camera,
-    after: Camera,
-    *,
-    means: Float64,
-    quaternions: Float64,
-    log_scales: Float64,
-) -> Channels:
-    """Blend front to back: `order` (M,) lists the rows of `projected`."""
+def features(projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera) -> dict[str, Float64]:
+    """Features of each Gaussian, (N, 1 to 3), by the name of the channel that they are blended to."""
+    arrays = parameters(gaussians)
+    means = arrays["means"]
+    return {
+        "depth": projected.depths[:, None],
+        "normal": normals(means, arrays["quaternions"], arrays["log_scales"], camera),
+        "position": means,
+        "motion": motions(means, camera, after),
+    }
+
+
+def channels(projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera) -> Channels:
+    """Blend front to back."""
     width, height = camera.width, camera.height
-    rows = np.concatenate(
-        [
-            projected.depths[:, None],
-            normals(means, quaternions, log_scales, camera),
-            means,
-            motions(means, camera, after),
-        ],
-        axis=1,
-    )
+    rows = np.concatenate(list(features(projected, gaussians, camera, after).values()), axis=1)
     sums, total = np.zeros((height, width, rows.shape[1])), np.zeros((height, width))
     median, first, largest, second = (np.zeros((height, width)) for _ in range(4))
     count, index = np.zeros((height, width), np.int64), np.full((height, width), -1, np.int64)
     doubt = np.full((height, width), np.inf)
-    for layer in layers(projected, order, width, height):
+    for layer in layers(projected, width, height):
         box, added, before, after_it = layer.box, layer.added, layer.before, layer.after
         weight = np.where(added, before * layer.alpha, 0.0)
         depth = projected.depths[layer.gaussian]

@@ -11,14 +11,12 @@ from clsplat.reference.blend import layers
 from clsplat.reference.project import Projected
 
 
-def deep(
-    projected: Projected, order: NDArray[np.int64], width: int, height: int, bounds: NDArray[np.float32]
-) -> Float64:
+def deep(projected: Projected, width: int, height: int, bounds: NDArray[np.float32]) -> Float64:
     """(bins, H, W, 6) by (70) to (73): red, green, blue, alpha, least and largest depth; bounds (bins - 1,): the depths
     at which the next bin begins, float32 as the kernel compares them."""
     slices = np.zeros((len(bounds) + 1, height, width, 6))
     left = np.ones((len(bounds) + 1, height, width))
-    for layer in layers(projected, order, width, height):
+    for layer in layers(projected, width, height):
         box, alpha, added, depth = layer.box, layer.alpha, layer.added, projected.depths[layer.gaussian]
         index = int(np.searchsorted(bounds, np.float32(depth), side="right"))
         here, u = slices[index][box], left[index][box]

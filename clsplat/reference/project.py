@@ -7,14 +7,16 @@ np.longdouble the twin's own rounding can be held against more digits.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float64
+from clsplat.arrays import Float64, Int64
 from clsplat.camera import Camera, Window
 from clsplat.reference.sh import sh_basis_grad
+from clsplat.reference.sort import depth_order
 from clsplat.spherical_harmonics import sh_basis
 
 Bool = NDArray[np.bool_]
@@ -22,16 +24,52 @@ Bool = NDArray[np.bool_]
 ALPHA_MIN = 1.0 / 255.0
 LOW_PASS = 0.3
 COLOUR_LIMIT = 1e9
+BOX_SLACK = 0.1
+"""Added to the reach q <= 2 ln(255 o) of a Gaussian's box, so that alphas down to 5 % under 1/255 are looked at
+and margins up to that are true."""
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
+class Footprint:
+    """One Gaussian on the pixels of a box that has all that show it: dx, dy to (h, w), pixel centre minus mean, or of
+    rays the same on the tangent plane; falloff (h, w) = exp(-q / 2); raw (h, w) = opacity times falloff, not yet
+    clamped."""
+
+    box: tuple[slice, slice]
+    dx: Float64
+    dy: Float64
+    falloff: Float64
+    raw: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Seen(ABC):
+    """N Gaussians as a camera of any projection sees them. depths (N,): z in the camera, or the distance; opacities
+    (N,): 0 to 1; colors (N, 3); visible (N,)."""
+
+    depths: Float64
+    opacities: Float64
+    colors: Float64
+    visible: Bool
+
+    @property
+    def order(self) -> Int64:
+        """Rows of the visible ones, front to back."""
+        return depth_order(self.depths, self.visible)
+
+    @abstractmethod
+    def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:
+        """One of them on the image; None where it misses that."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projected(Seen):
     """N Gaussians on the image plane; rows that are not visible are zero.
 
     means2d (N, 2): pixels; covariances (N, 3): sxx, sxy, syy in px^2; conics (N, 3): a, b, c of the inverse,
     q = a dx^2 + 2 b dx dy + c dy^2; whitening (N, 3): l11, l12, l22 of eq. (8); half_extents (N, 2): pixels, of
-    the box in which alpha reaches 1/255; depths (N,): z in the camera; opacities (N,): 0 to 1; colors (N, 3);
-    visible (N,): passed eq. (13). A visible Gaussian may still lie wholly off the image.
+    the box in which alpha reaches 1/255; visible: passed eq. (13). A visible Gaussian may still lie wholly off the
+    image.
     """
 
     means2d: Float64
@@ -39,10 +77,24 @@ class Projected:
     conics: Float64
     whitening: Float64
     half_extents: Float64
-    depths: Float64
-    opacities: Float64
-    colors: Float64
-    visible: Bool
+
+    def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:
+        """Eqs. (9), (14) on the box that alpha >= 1/255 can reach."""
+        opacity = self.opacities[gaussian]
+        reach = 2 * np.log(opacity / ALPHA_MIN) + BOX_SLACK
+        half = np.sqrt(reach * self.covariances[gaussian, [0, 2]])
+        mean = self.means2d[gaussian]
+        size = np.array([width, height])
+        # clipped as floats: a mean far off the image need not fit an integer
+        first = np.clip(np.ceil(mean - half - 0.5), 0, size).astype(np.int64)
+        stop = np.clip(np.floor(mean + half - 0.5) + 1, 0, size).astype(np.int64)
+        if (first >= stop).any():
+            return None
+        dx = np.arange(first[0], stop[0])[None, :] + 0.5 - mean[0]
+        dy = np.arange(first[1], stop[1])[:, None] + 0.5 - mean[1]
+        a, b, c = self.conics[gaussian]
+        falloff = np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+        return Footprint((slice(first[1], stop[1]), slice(first[0], stop[0])), dx, dy, falloff, opacity * falloff)
 
 
 @dataclass(frozen=True, eq=False)

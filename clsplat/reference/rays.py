@@ -7,29 +7,37 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
-from clsplat.reference.project import ALPHA_MIN, LOW_PASS, rotation_matrices, view_directions
+from clsplat.reference.cameras import cam_from_pixel, pixel_grid
+from clsplat.reference.project import ALPHA_MIN, LOW_PASS, Footprint, Seen, rotation_matrices, view_directions
 from clsplat.reference.render import parameters
 from clsplat.spherical_harmonics import sh_basis
 
 
 @dataclass(frozen=True, eq=False)
-class Tangents:
+class Tangents(Seen):
     """directions, right, down (N, 3): the mean's direction and the axes of the plane that touches there, in the camera;
-    covariances (N, 2, 2) on it, with the low-pass; depths (N,): distances; opacities (N,); colors (N, 3); visible."""
+    covariances (N, 2, 2) on it, with the low-pass; rays (P, 3): unit directions of the camera's pixels, 0 without."""
 
     directions: Float64
     right: Float64
     down: Float64
     covariances: Float64
-    depths: Float64
-    opacities: Float64
-    colors: Float64
-    visible: NDArray[np.bool_]
+    rays: Float64
+
+    def footprint(self, gaussian: int, width: int, height: int) -> Footprint:
+        """(14), at every pixel of the image."""
+        along = self.rays @ self.directions[gaussian]
+        ahead = along > 0
+        safe = np.where(ahead, along, 1.0)
+        at = np.stack([self.rays @ self.right[gaussian], self.rays @ self.down[gaussian]], axis=1) / safe[:, None]
+        q = np.einsum("ni,ij,nj->n", at, np.linalg.inv(self.covariances[gaussian]), at)
+        falloff = np.where(ahead, np.exp(-0.5 * q), 0.0).reshape(height, width)
+        dx, dy = at.T.reshape(2, height, width)
+        return Footprint((slice(height), slice(width)), dx, dy, falloff, self.opacities[gaussian] * falloff)
 
 
 def footprints(directions: Float64, camera: Camera) -> tuple[Float64, Float64, Float64]:
@@ -71,14 +79,5 @@ def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
     basis = sh_basis(view_directions(means, camera)[0], gaussians.sh_degree)
     colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, arrays["sh"][:, : basis.shape[1]]))
     visible = (depths > camera.near) & (opacities > ALPHA_MIN)
-    return Tangents(directions, right, down, covariances, depths, opacities, colors, visible)
-
-
-def ray_alphas(t: Tangents, gaussian: int, rays: Float64) -> Float64:
-    """(14): one Gaussian's opacity times its falloff along unit directions (P, 3) in the camera; 0 where all are 0."""
-    along = rays @ t.directions[gaussian]
-    ahead = along > 0
-    safe = np.where(ahead, along, 1.0)
-    at = np.stack([rays @ t.right[gaussian], rays @ t.down[gaussian]], axis=1) / safe[:, None]
-    q = np.einsum("ni,ij,nj->n", at, np.linalg.inv(t.covariances[gaussian]), at)
-    return np.where(ahead, t.opacities[gaussian] * np.exp(-0.5 * q), 0.0)
+    rays = np.nan_to_num(cam_from_pixel(camera, pixel_grid(camera))[1])
+    return Tangents(depths, opacities, colors, visible, directions, right, down, covariances, rays)

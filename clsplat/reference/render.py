@@ -14,17 +14,15 @@ from clsplat.camera import Camera
 from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.reference.blend import Blended, BlendGradients, blend, blend_grad
 from clsplat.reference.project import Projected, covariance_grad, project, project_grad
-from clsplat.reference.sort import depth_order
 
 BLACK = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Forward:
-    """Everything the forward pass made: `order` (M,) lists the visible rows front to back."""
+    """Everything the forward pass made."""
 
     projected: Projected
-    order: NDArray[np.int64]
     blended: Blended
 
 
@@ -52,8 +50,7 @@ def forward(
     """Project, sort, blend; sh_degree None uses all bands there are."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     projected = project(**parameters(gaussians), camera=camera, sh_degree=degree)
-    order = depth_order(projected.depths, projected.visible)
-    return Forward(projected, order, blend(projected, order, camera.width, camera.height, background))
+    return Forward(projected, blend(projected, camera.width, camera.height, background))
 
 
 def render(
@@ -78,8 +75,7 @@ def render_grad(
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     arrays = parameters(gaussians)
     projected = project(**arrays, camera=camera, sh_degree=degree)
-    order = depth_order(projected.depths, projected.visible)
-    screen = blend_grad(projected, order, camera.width, camera.height, background, d_image)
+    screen = blend_grad(projected, camera.width, camera.height, background, d_image)
     by_parameter = project_grad(
         **arrays,
         camera=camera,

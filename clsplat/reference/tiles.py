@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from clsplat.arrays import Int64
-from clsplat.reference.blend import ALPHA_MAX, footprint
+from clsplat.reference.blend import ALPHA_MAX
 from clsplat.reference.project import ALPHA_MIN, Projected
 
 
@@ -23,11 +23,12 @@ def touched_tiles(
     tiles_x = -(-width // tile)
     result = []
     for gaussian, visible in enumerate(projected.visible):
-        splat = footprint(projected, gaussian, width, height) if visible else None
+        splat = projected.footprint(gaussian, width, height) if visible else None
         if splat is None:
             result.append(np.zeros(0, np.int64))
             continue
         rows, columns = np.nonzero(np.minimum(ALPHA_MAX, splat.raw) >= threshold)
-        tiles = (rows + splat.rows.start) // tile * tiles_x + (columns + splat.columns.start) // tile
+        above, left = (side.start for side in splat.box)
+        tiles = (rows + above) // tile * tiles_x + (columns + left) // tile
         result.append(np.unique(tiles).astype(np.int64))
     return result

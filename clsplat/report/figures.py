@@ -260,17 +260,14 @@ def _add_contributions(figures: Figures, records: list[Record]) -> None:
         return
     edges, counts = _list(record.get("edges")), _list(record.get("counts"))
     sums = _list([record.get(name) for name in ("views", "of", "none")])
-    if edges is None or counts is None or sums is None:
-        return
-    if len(edges) == len(counts) + 1 > 1 and edges == sorted(edges):
+    if sums and len(edges) == len(counts) + 1 > 1 and edges == sorted(edges):
         views, total, none = map(int, sums)
         histogram = {"edges": edges, "counts": list(map(int, counts)), "views": views, "of": total, "none": none}
         figures.histograms["contribution"] = histogram
 
 
-def _list(value: object) -> list[float] | None:
-    """The value as a list of numbers, or None."""
-    if not isinstance(value, list):
-        return None
-    numbers = [known for item in value if (known := number(item)) is not None]
-    return numbers if len(numbers) == len(value) else None
+def _list(value: object) -> list[float]:
+    """The value as a list of numbers, empty if it is none."""
+    listed = value if isinstance(value, list) else []
+    numbers = [known for item in listed if (known := number(item)) is not None]
+    return numbers if len(numbers) == len(listed) else []

@@ -160,15 +160,13 @@ def stage_chart(figures: Figures) -> Markup:
         return Markup("")
     names = [name for name, *_ in stage_rows(figures)]
     named = names if len(names) <= NAMED_STAGES + 1 else names[:NAMED_STAGES]
-    steps = [float(record["step"]) for record in figures.stages]
-    tops, series = [0.0] * len(steps), []
     groups = [(name, [name]) for name in named]
     if rest := names[len(named) :]:
         groups.append((f"{len(rest)} smaller ones", rest))
+    series = []
     for color, (label, members) in enumerate(groups):
-        added = [sum(record["ms"].get(name, 0.0) for name in members) for record in figures.stages]
-        tops = [top + more for top, more in zip(tops, added, strict=True)]
-        series.append(Series(label, list(zip(steps, tops, strict=True)), "area", color))
+        times = [(float(record["step"]), sum(record["ms"].get(n, 0.0) for n in members)) for record in figures.stages]
+        series.append(Series(label, times, "area", color))
     return chart("Time per stage", series, "step", "ms of a step", note="waiting for the device after each stage")
 
 
@@ -237,11 +235,7 @@ def _data(figures: Figures) -> dict[str, Any]:
         "run": figures.name,
         "records": length,
         "curves": curves,
-        "stages": figures.stages,
-        "evaluation": figures.evaluation,
-        "evaluations": figures.evaluations,
-        "model": figures.model,
-        "histograms": figures.histograms,
+        **{name: getattr(figures, name) for name in ("stages", "evaluation", "evaluations", "model", "histograms")},
         "settings": dict(settings_of(figures.run.config)),
     }
 

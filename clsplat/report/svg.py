@@ -8,9 +8,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise
+from itertools import chain
 from typing import Any, Literal
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -20,13 +21,15 @@ MAX_POINTS = 400
 COLORS = 8
 """Classes c0 to c7 of the style sheet."""
 
+FILLED = ("area", "bars")
+
 Points = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Series:
-    """Points by x, and how they are drawn: line, faint (a line behind others), dots (a line with dots), area (points
-    are tops of a stack, the first series lowest), bars (x is a bin's lower edge; the last point ends the last bin)."""
+    """Points by x, and how they are drawn: line, faint (a line behind others), dots (a line with dots), area (stacked,
+    the first series lowest, all by the same x), bars (x is a bin's lower edge; the last point ends the last bin)."""
 
     name: str
     points: Points
@@ -61,21 +64,25 @@ def chart(
 ) -> Markup:
     """A figure with a legend: title, labels of both axes. log_y: a logarithmic axis, values that are not positive are
     left out; from_zero: y begins there; powers: x are powers of ten. "" where there are no points at all."""
-    drawn = [replace(curve, points=_kept(curve.points, log_y)) for curve in series]
+    drawn = [replace(curve, points=_kept(curve, log_y)) for curve in series]
     drawn = [curve for curve in drawn if curve.points]
     if not drawn:
         return Markup("")
-    xs = [point[0] for curve in drawn for point in curve.points]
-    ys = [_y(point[1], log_y) for curve in drawn for point in curve.points]
-    if from_zero or any(curve.kind in ("area", "bars") for curve in drawn):
+    heights = _heights(drawn, log_y)
+    xs, ys = [x for curve in drawn for x, _ in curve.points], list(chain(*heights))
+    if from_zero or any(curve.kind in FILLED for curve in drawn):
         ys.append(0.0)
     across, up = _axis(xs, LEFT, RIGHT, powers=powers), _axis(ys, BOTTOM, TOP, powers=log_y)
+    shapes = [
+        _shape(curve, [(across(x), up(y)) for (x, _), y in zip(curve.points, tops, strict=True)], up(0.0))
+        for curve, tops in zip(drawn, heights, strict=True)
+    ]
     html = (
         templates()
         .get_template("chart.html")
         .render(
             title=title,
-            drawn=drawn,
+            legend=shapes,
             across=across,
             up=up,
             x=x,
@@ -83,8 +90,8 @@ def chart(
             powers=powers,
             note=note,
             label=f"{title}: {y} by {x}. " + " ".join(_described(curve) for curve in drawn if curve.kind != "faint"),
-            shapes=[_shape(curve, drawn, across, up, log_y=log_y) for curve in _back_to_front(drawn)],
-            colors=COLORS,
+            # in front of others: means of what is faint, and what is lower in a stack
+            shapes=sorted(shapes[:: -1 if drawn[0].kind == "area" else 1], key=lambda shape: shape["kind"] != "faint"),
             width=WIDTH,
             height=HEIGHT,
         )
@@ -118,20 +125,24 @@ def thinned(points: Points, limit: int = MAX_POINTS) -> Points:
     if len(points) <= limit:
         return points
     stretch = math.ceil(2 * len(points) / limit)
-    kept = [points[0]]
+    kept = {0, len(points) - 1}
     for start in range(0, len(points), stretch):
         part = range(start, min(start + stretch, len(points)))
-        ends = {min(part, key=lambda index: points[index][1]), max(part, key=lambda index: points[index][1])}
-        kept += [points[index] for index in sorted(ends)]
-    return [*kept, points[-1]]
+        kept |= {pick(part, key=lambda index: points[index][1]) for pick in (min, max)}
+    return [points[index] for index in sorted(kept)]
 
 
-def _kept(points: Points, log_y: bool) -> Points:
-    return [point for point in points if all(map(math.isfinite, point)) and (not log_y or point[1] > 0)]
+def _kept(curve: Series, log_y: bool) -> Points:
+    """The points that can be drawn, of a line no more than can be seen."""
+    points = [point for point in curve.points if all(map(math.isfinite, point)) and (not log_y or point[1] > 0)]
+    return points if curve.kind in FILLED else thinned(points)
 
 
-def _y(value: float, log_y: bool) -> float:
-    return math.log10(value) if log_y else value
+def _heights(drawn: Sequence[Series], log_y: bool) -> list[list[float]]:
+    """Where on the axis the points of each series are: areas are stacked."""
+    heights = [[math.log10(y) if log_y else y for _, y in curve.points] for curve in drawn]
+    stacked: list[list[float]] = np.cumsum(heights, axis=0).tolist() if drawn[0].kind == "area" else heights
+    return stacked
 
 
 def _axis(values: Sequence[float], start: float, end: float, *, powers: bool) -> Axis:
@@ -160,41 +171,21 @@ def _step(span: float, count: int) -> float:
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * 0.999)
 
 
-def _back_to_front(drawn: Sequence[Series]) -> list[Series]:
-    """Areas from the highest, faint lines, then the others in their order."""
-    areas = [curve for curve in drawn if curve.kind == "area"]
-    return [*reversed(areas), *sorted((c for c in drawn if c.kind != "area"), key=lambda curve: curve.kind != "faint")]
-
-
-def _shape(curve: Series, drawn: Sequence[Series], across: Axis, up: Axis, *, log_y: bool) -> dict[str, Any]:
-    """A series in pixels, for the template; shown: the values that the page's script shows, at these places."""
-    points = curve.points if curve.kind in ("area", "bars") else thinned(curve.points)
-    pixels = [(across(x), up(_y(y, log_y))) for x, y in points]
-    values, path = points, _line(pixels)
-    if curve.kind == "area":
-        areas = [other for other in drawn if other.kind == "area"]
-        index = areas.index(curve)
-        below = [y for _, y in areas[index - 1].points] if index else [0.0] * len(points)
-        values = [(x, y - low) for (x, y), low in zip(points, below, strict=True)]
-        lower = [(across(x), up(low)) for (x, _), low in zip(points, below, strict=True)]
-        path = _line([*pixels, *reversed(lower)]) + "Z"
-    elif curve.kind == "bars":
-        floor = f"{up(0.0):.1f}"
-        tops = [f"V{y:.1f}H{end:.1f}" for (_, y), (end, _) in pairwise(pixels)]
-        path = f"M{pixels[0][0]:.1f} {floor}{''.join(tops)}V{floor}Z"
+def _shape(curve: Series, pixels: Points, floor: float) -> dict[str, Any]:
+    """A series for the template; shown: the values that the page's script shows, at these places."""
+    step = "H{:.1f}V{:.1f}" if curve.kind == "bars" else "L{:.1f} {:.1f}"
+    path = "M{:.1f} {:.1f}".format(*pixels[0]) + "".join(step.format(*pixel) for pixel in pixels[1:])
+    if curve.kind in FILLED:
+        path += f"V{floor:.1f}H{pixels[0][0]:.1f}Z"
     return {
         "name": curve.name,
         "kind": curve.kind,
         "color": curve.color % COLORS,
         "path": path,
-        "shown": " ".join(f"{x:.7g} {y:.7g}" for x, y in values),
+        "shown": " ".join(f"{x:.7g} {y:.7g}" for x, y in curve.points),
         "places": " ".join(f"{x:.1f}" for x, _ in pixels),
         "dots": pixels if curve.kind == "dots" or len(pixels) == 1 else [],
     }
-
-
-def _line(pixels: Sequence[tuple[float, float]]) -> str:
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in pixels)
 
 
 def _described(curve: Series) -> str:

@@ -78,7 +78,7 @@ def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
     if len(scores) <= limit:
         return list(range(len(scores)))
     order = sorted(range(len(scores)), key=lambda index: (scores[index] is None, scores[index] or 0.0, index))
-    places = np.linspace(0, len(order) - 1, limit).round().astype(int) if limit > 1 else np.zeros(limit, int)
+    places = np.linspace(0, len(order) - 1, limit).round().astype(int)
     return sorted({order[place] for place in places})
 
 

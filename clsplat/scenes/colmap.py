@@ -15,7 +15,6 @@ import struct
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
@@ -27,8 +26,7 @@ from clsplat.camera import Camera
 from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
 from clsplat.rotations import rotation_from_quaternion
-from clsplat.scenes.data_set import MAX_NUMBER, DataSet, PosedImage
-from clsplat.scenes.lens import Lens, absurd, check_lens, models
+from clsplat.scenes.data_set import MAX_NUMBER, DataSet, Lens, PosedImage, cameras_of, check_lens, models
 
 STEMS = ("cameras", "images", "points3D")
 COUNT = struct.Struct("<Q")
@@ -88,16 +86,7 @@ def read_cameras(folder: Path) -> dict[str, Camera]:
     model = find_model(Path(folder))
     if model is None:
         raise InputError(f"{folder}: no COLMAP model, expected cameras and images (.bin or .txt) in it or in sparse/0")
-    pinholes: dict[Lens, Camera] = {}
-    cameras = {}
-    images = _read_posed_images(model)
-    for image in images:
-        if image.lens not in pinholes:
-            pinholes[image.lens] = image.lens.pinhole(np.eye(3), np.zeros(3))
-        cameras[image.name] = replace(pinholes[image.lens], rotation=image.rotation, translation=image.translation)
-    if doubt := absurd([(image.name, image.lens) for image in images]):
-        warn(doubt)
-    return cameras
+    return cameras_of(_read_posed_images(model))
 
 
 def safe_name(name: str) -> bool:

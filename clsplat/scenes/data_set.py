@@ -1,18 +1,115 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The contents of a data set's files, whatever its layout: images with their lenses and poses, and points."""
+"""The contents of a data set's files, whatever its layout: images with their lenses and poses, and points. The pinhole
+camera that stands in for each lens, and the resampling between the two.
+
+The models and their formulas are COLMAP's, evaluated by pycolmap (`Camera.img_from_cam`, `undistort_camera`).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
 from clsplat.arrays import Float32, Float64
-from clsplat.scenes.lens import Lens
+from clsplat.camera import Camera
+from clsplat.errors import InputError, examples, warn
+from clsplat.images.alpha import associate, unassociate
+from clsplat.images.reading import downscale
+from clsplat.process import undisturbed
 
+with undisturbed():  # it says of a Ctrl-C that it is not installed, and puts a handler of SIGTERM that prints its stack
+    import pycolmap
+
+
+REFUSED = {"EQUIRECTANGULAR": "a panorama has no pinhole camera; cut it into perspective views first"}
+
+MAX_SIZE = 1 << 20
+"""Pixels a side; larger is a damaged file. Also keeps width times height far from overflow."""
 MAX_NUMBER = 1e30
 """Coordinates beyond it are damage; their squares are still finite."""
+BENT = 0.5
+"""Half widths or heights of the picture by which a lens may move what is at its edge."""
+
+
+@cache
+def models() -> dict[int, tuple[str, int]]:
+    """Name and number of parameters of each camera model that pycolmap knows, by COLMAP's id."""
+    known = {}
+    for name, member in pycolmap.CameraModelId.__members__.items():
+        if int(member) >= 0:
+            camera = pycolmap.Camera.create_from_model_name(1, name, 1.0, 1, 1)
+            known[int(member)] = (name, len(camera.params))
+    return known
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of the camera that took a picture.
+
+    model: COLMAP's name; width, height: pixels; params: COLMAP's, in its order, focal lengths and principal point in
+    pixels, the first pixel's centre at (0.5, 0.5).
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True if pictures can be used as they are; distorted models whose coefficients are all 0 count too."""
+        if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+            return True
+        camera = self._camera()
+        bends = self.model in ("FOV", "EUCM") or "FISHEYE" in self.model
+        return not bends and not any(self.params[index] for index in camera.extra_params_idxs())
+
+    def pinhole(self, rotation: Float64, translation: Float64) -> Camera:
+        """The pinhole camera that the picture becomes once undistorted, with the pose of the original.
+
+        Its size and focal length are those of COLMAP's image undistorter: focal length kept, and cropped so that no
+        pixel lies outside the source picture, where that leaves at least a fifth of its size. A fisheye of 180
+        degrees or more keeps about its picture's size and loses what lies beyond: no pinhole holds it.
+        """
+        camera = self._camera()
+        if not self.is_pinhole:
+            camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+        return Camera(
+            width=int(camera.width),
+            height=int(camera.height),
+            fx=float(camera.focal_length_x),
+            fy=float(camera.focal_length_y),
+            cx=float(camera.principal_point_x),
+            cy=float(camera.principal_point_y),
+            rotation=rotation,
+            translation=translation,
+        )
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens on another pixel grid."""
+        camera = self._camera()
+        sx, sy = width / self.width, height / self.height
+        params = list(self.params)
+        focal, principal = list(camera.focal_length_idxs()), list(camera.principal_point_idxs())
+        for indices in (focal, principal):
+            for index, scale in zip(indices, (sx, sy) if len(indices) == 2 else (math.sqrt(sx * sy),), strict=True):
+                params[index] *= scale
+        return replace(self, width=width, height=height, params=tuple(params))
+
+    def img_from_cam(self, points: Float64) -> Float64:
+        """Project points (N, 3) in camera space to pixels (N, 2); NaN where the model has no image of them."""
+        return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))
+
+    def _camera(self) -> pycolmap.Camera:
+        camera = pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+        camera.camera_id = 1
+        return camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,3 +137,94 @@ class DataSet:
     points: Float64 = field(default_factory=lambda: np.empty((0, 3)))
     colors: Float32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
     box: tuple[Float64, Float64] | None = None
+
+
+def cameras_of(images: Sequence[PosedImage]) -> dict[str, Camera]:
+    """The pinhole cameras that the images become, at full size, by name. Warns of lenses beyond reason."""
+    if doubt := absurd([(image.name, image.lens) for image in images]):
+        warn(doubt)
+    pinholes = {lens: lens.pinhole(np.eye(3), np.zeros(3)) for lens in dict.fromkeys(image.lens for image in images)}
+    return {
+        image.name: replace(pinholes[image.lens], rotation=image.rotation, translation=image.translation)
+        for image in images
+    }
+
+
+def check_lens(lens: Lens, where: str) -> Lens:
+    """`lens` itself; raises InputError, beginning with `where`, for one that cannot be used."""
+    counts = dict(models().values())
+    if lens.model in REFUSED:
+        raise InputError(f"{where}: camera model {lens.model} is not supported: {REFUSED[lens.model]}")
+    if lens.model not in counts:
+        listed = ", ".join(name for name in counts if name not in REFUSED)
+        raise InputError(f"{where}: unknown camera model {lens.model}, expected one of {listed}")
+    if len(lens.params) != counts[lens.model]:
+        raise InputError(
+            f"{where}: {lens.model} has {len(lens.params)} parameters, expected {counts[lens.model]}; export it again"
+        )
+    if not (0 < lens.width <= MAX_SIZE and 0 < lens.height <= MAX_SIZE):
+        raise InputError(f"{where}: image size {lens.width} x {lens.height}, expected 1 to {MAX_SIZE} pixels a side")
+    camera = lens._camera()  # noqa: SLF001
+    focal = [lens.params[index] for index in camera.focal_length_idxs()]
+    if not all(math.isfinite(value) for value in lens.params) or min(focal) <= 0:
+        raise InputError(f"{where}: parameters {list(lens.params)}, expected finite ones, focal lengths above 0")
+    return lens
+
+
+def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
+    """A warning of the pictures whose lens bends beyond reason, or nothing. lenses: with the pictures' names."""
+    bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
+    bent = [(name, lens) for name, lens in lenses if bend[lens]]
+    if not bent:
+        return ""
+    lens = bent[0][1]
+    params = " ".join(f"{value:g}" for value in lens.params)
+    return (
+        f"the lens of {examples(name for name, _ in bent)} bends the picture beyond reason ({lens.model} {params}): "
+        "check its coefficients, and their order"
+    )
+
+
+def _bends(lens: Lens) -> bool:
+    """True if the lens moves what a pinhole camera of its focal length has at the picture's edge by a large part of it.
+    Fisheyes and the like are meant to, and count as False."""
+    if lens.is_pinhole or lens.model in ("FOV", "EUCM") or "FISHEYE" in lens.model:
+        return False
+    pinhole = lens.pinhole(np.eye(3), np.zeros(3))
+    half = np.array([lens.width, lens.height]) / 2
+    edge = half * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    rays = np.concatenate([edge / [pinhole.fx, pinhole.fy], np.ones((len(edge), 1))], axis=1)
+    pixels = lens.img_from_cam(rays)
+    moved = pixels - pixels[len(pixels) // 2] - edge
+    return not bool((np.abs(moved) <= BENT * half).all())
+
+
+def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:
+    """Resample a picture (H, W, C) taken through `lens` to what `camera` sees from the same place.
+
+    Where `camera` is less than 3/4 as fine, at the lens's own scale first, bilinearly, then by area; else with a
+    cubic spline that is held within the values of the picture. Straight alpha in and out. Pixels that the picture
+    does not reach (none for `Lens.pinhole`, extreme fisheyes aside) repeat its border.
+    """
+    natural = lens.pinhole(camera.rotation, camera.translation)
+    shrinks = camera.width < 0.75 * natural.width
+    grid = camera.resized(natural.width, natural.height) if shrinks else camera
+    x, y = np.meshgrid(
+        (np.arange(grid.width) + 0.5 - grid.cx) / grid.fx, (np.arange(grid.height) + 0.5 - grid.cy) / grid.fy
+    )
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    pixels = lens.img_from_cam(rays) - 0.5  # the centre of the first pixel is sample 0
+    far = 2.0 * max(lens.width, lens.height)
+    pixels = np.clip(np.nan_to_num(pixels, nan=far), -far, far)
+    coordinates = pixels[:, ::-1].T.reshape(2, grid.height, grid.width)
+
+    has_alpha = image.shape[2] == 4
+    source = associate(image) if has_alpha else image
+    result = np.empty((grid.height, grid.width, source.shape[2]), np.float32)
+    for channel in range(source.shape[2]):
+        plane = np.ascontiguousarray(source[:, :, channel])
+        ndimage.map_coordinates(plane, coordinates, result[:, :, channel], order=1 if shrinks else 3, mode="nearest")
+        np.clip(result[:, :, channel], plane.min(), plane.max(), out=result[:, :, channel])
+    if has_alpha:
+        result = unassociate(result)
+    return downscale(result, camera.width, camera.height)

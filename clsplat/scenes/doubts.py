@@ -14,7 +14,7 @@ from clsplat.camera import Camera
 from clsplat.config.training import Background
 from clsplat.errors import examples
 from clsplat.images.alpha import background_colour, composite
-from clsplat.scenes.lens import absurd
+from clsplat.scenes.data_set import absurd
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene, View

@@ -23,8 +23,7 @@ from clsplat.files import digest, short_digest
 from clsplat.images.reading import companions, downscale, find_images, image_size, read_image, require_images
 from clsplat.progress import Progress
 from clsplat.scenes import colmap, transforms
-from clsplat.scenes.data_set import DataSet, PosedImage
-from clsplat.scenes.lens import Lens, undistort
+from clsplat.scenes.data_set import DataSet, Lens, PosedImage, undistort
 from clsplat.scenes.sfm import reconstruct
 
 Kind = Literal["colmap", "blender", "transforms", "photos"]

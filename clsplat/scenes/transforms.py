@@ -2,9 +2,7 @@
 """Reading transforms.json of Blender synthetic (NeRF), nerfstudio and instant-ngp data sets.
 
 Poses there are `world_from_camera` with OpenGL's camera axes (x right, y up, z backward). Here the camera's axes
-become COLMAP's; the world stays that of the file. So instant-ngp's `scale`, `offset` and `aabb_scale`, which place
-the scene in its own unit cube, touch no pose (they only bound the volume of random points), and nerfstudio's
-`applied_transform` is not undone: its sparse points have been through it as well.
+become COLMAP's; the world stays that of the file (docs/conventions.md, Scenes).
 """
 
 from __future__ import annotations
@@ -20,13 +18,12 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float32, Float64, numbers
-from clsplat.camera import Projection, focal_length
+from clsplat.camera import Camera, Projection, focal_length
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.images.reading import EXTENSIONS, image_size, require_images
 from clsplat.models.formats import ply
-from clsplat.scenes.data_set import MAX_NUMBER, DataSet, PosedImage
-from clsplat.scenes.lens import MAX_SIZE, Lens, absurd, check_lens
+from clsplat.scenes.data_set import MAX_NUMBER, MAX_SIZE, DataSet, Lens, PosedImage, cameras_of, check_lens
 
 DRIVE = re.compile(r"\A[A-Za-z]:/")
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -46,14 +43,11 @@ EXPORT_AGAIN = "export the data set anew or add it"
 def read_transforms(path: Path) -> DataSet:
     """Read one transforms.json.
 
-    Intrinsics may stand in the file or in each frame: `fl_x fl_y` or `camera_angle_x camera_angle_y`, `cx cy` (the
-    middle if absent), `w h` (the picture's own size, or its proportions, if absent), `k1 k2 k3 k4 p1 p2`,
-    `camera_model` or `is_fisheye`.
-    `file_path` is relative to the file, with or without extension. nerfstudio's `ply_file_path` and its
-    `train_filenames`, `val_filenames` and `test_filenames` are honoured: what is in the last two, or not in the first,
-    is held out. Warns of what is ignored and of what contradicts itself. Raises InputError that
-    names the file and the key for JSON that does not parse, a key that is missing or of the wrong kind, and listed
-    pictures that are missing.
+    docs/conventions.md (Scenes) has the keys that are read, in the file or in each frame. `file_path` is relative to
+    the file. nerfstudio's `ply_file_path` and its `train_filenames`, `val_filenames` and `test_filenames` are honoured:
+    what is in the last two, or not in the first, is held out. Warns of what is ignored and of what contradicts itself.
+    Raises InputError that names the file and the key for JSON that does not parse, a key that is missing or of the
+    wrong kind, and listed pictures that are missing.
     """
     document = load_document(path)
     readers = _readers(path, document)
@@ -73,17 +67,14 @@ def read_transforms(path: Path) -> DataSet:
     return data
 
 
-def read_poses(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
-    """The cameras of a transforms.json alone, in its order.
+def read_poses(path: Path, size: tuple[int, int] | None = None) -> dict[str, Camera]:
+    """The cameras of a transforms.json alone by image name, in its order; distorted ones as `cameras_of`.
 
     Its pictures need not be there where the file says `w h`; else, where a picture is missing, too, it counts as one of
     `size`, (width, height). Raises InputError as `read_transforms`; warns of what contradicts itself, and of
     lenses beyond reason.
     """
-    images = _images(path, _readers(path, load_document(path)), size)
-    if doubt := absurd([(image.name, image.lens) for image in images]):
-        warn(doubt)
-    return images
+    return cameras_of(_images(path, _readers(path, load_document(path)), size))
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
@@ -199,9 +190,10 @@ class Keys:
             raise self.wrong(key, "a number")
         return float(value)
 
-    def require(self, key: str) -> float:
-        """The number of `key`; InputError for what `number` refuses, and where there is none."""
-        if (value := self.number(key)) is None:
+    def require(self, key: str, default: float | None = None) -> float:
+        """The number of `key`, else the default; InputError for what `number` refuses, and where there is neither."""
+        value = self.number(key)
+        if (value := default if value is None else value) is None:
             raise self.wrong(key, "a number")
         return value
 
@@ -314,12 +306,11 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
             f"{keys.where}: has neither 'fl_x' nor 'camera_angle_x', expected the focal length in pixels or the "
             "horizontal angle of view in radians; add one of them to the file"
         )
-    cx, cy = keys.number("cx"), keys.number("cy")
     core = [
         fx if fx is not None else fy,
         fy if fy is not None else fx,
-        cx if cx is not None else width / 2,
-        cy if cy is not None else height / 2,
+        keys.require("cx", width / 2),
+        keys.require("cy", height / 2),
     ]
     model, extra = _distortion(keys)
     params = tuple(float(value) for value in (*core, *extra) if value is not None)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +17,6 @@ from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
 from clsplat.reference import blend as reference_blend
 from clsplat.reference import project as reference_project
-from clsplat.reference.sort import depth_order
 from clsplat.selftest.scenes import Frozen
 from clsplat.stages.blend import Blended
 from clsplat.stages.device_camera import pack_camera, tiles_of
@@ -116,11 +114,7 @@ class Bench:
         """The stage's value, and its arrays on the host and ms, of a second run; trouble where that differs from the
         first, which had the kernels to build."""
         first = take(launch())
-        self.device.finish()
-        start = time.perf_counter()
-        value = launch()
-        self.device.finish()
-        ms = 1e3 * (time.perf_counter() - start)
+        value, ms = self.device.timed(launch)
         arrays = take(value)
         same = digest_of(first) == digest_of(arrays)
         trouble = "" if same else "two runs on the same input gave different bits"
@@ -157,7 +151,6 @@ class Bench:
     def blend_reference(self) -> tuple[reference_blend.Blended, NDArray[np.bool_]]:
         """The frame of the splats that the device made, and the pixels that are compared (MARGIN)."""
         splats = self.splats()
-        order = depth_order(splats.depths, splats.visible)
         camera, background = self.camera, self.frozen.background.astype(np.float64)
-        frame = reference_blend.blend(splats, order, camera.width, camera.height, background)
+        frame = reference_blend.blend(splats, camera.width, camera.height, background)
         return frame, frame.margin > MARGIN

@@ -10,24 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.arrays import Float64
 from clsplat.camera import PROJECTIONS, Camera, Projection
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import upload
 from clsplat.device.layout import RAY
 from clsplat.reference import channels as reference_channels
 from clsplat.reference import deep as reference_deep
 from clsplat.reference import every_pixel
 from clsplat.reference import rays as reference_rays
-from clsplat.reference.render import parameters
-from clsplat.reference.sort import depth_order
+from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, joined
-from clsplat.stages.blend import Blended, blend
 from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera
-from clsplat.stages.duplicate import count, duplicate
-from clsplat.stages.project import Projected, project
-from clsplat.stages.ranges import tile_lists
 
 ALL = Features.of(WIDTHS)
 SIDEWAYS = 1e-4
@@ -44,11 +38,6 @@ def _after(camera: Camera) -> Camera:
     return replace(camera, translation=camera.translation + np.array([-0.0625, 0.03125, 0.125]), fx=camera.fx + 2.0)
 
 
-def _geometry(bench: Bench) -> dict[str, Float64]:
-    arrays = parameters(bench.frozen.gaussians)
-    return {name: arrays[name] for name in ("means", "quaternions", "log_scales")}
-
-
 def _features(bench: Bench) -> Outcome:
     device, camera, visible = bench.device, bench.camera, bench.visible
     after = upload(device, pack_camera(_after(camera)))
@@ -57,20 +46,12 @@ def _features(bench: Bench) -> Outcome:
         lambda rows: [rows.get()[visible]],
     )
     (got,) = outcome.arrays
-    shown = {name: values[visible] for name, values in _geometry(bench).items()}
-    normals = reference_channels.normals(**shown, camera=camera)
-    away = shown["means"] - camera.position
-    clear = np.abs((away * normals).sum(axis=1)) > SIDEWAYS * np.linalg.norm(away, axis=1)
-    wanted = {
-        "depth": bench.splats().depths[visible, None],
-        "normal": normals,
-        "position": shown["means"],
-        "motion": reference_channels.motions(shown["means"], camera, _after(camera)),
-    }
-    parts = {
-        name: (got[:, at : at + WIDTHS[name]], np.asarray(wanted[name], np.float64)) for name, at in ALL.offsets.items()
-    }
-    parts["normal"] = (parts["normal"][0][clear], normals[clear])
+    every = reference_channels.features(bench.splats(), bench.frozen.gaussians, camera, _after(camera))
+    wanted = {name: values[visible] for name, values in every.items()}
+    away = wanted["position"] - camera.position
+    clear = np.abs((away * wanted["normal"]).sum(axis=1)) > SIDEWAYS * np.linalg.norm(away, axis=1)
+    parts = {name: (got[:, at : at + WIDTHS[name]], wanted[name]) for name, at in ALL.offsets.items()}
+    parts["normal"] = (parts["normal"][0][clear], wanted["normal"][clear])
     return outcome.compared(parts)
 
 
@@ -81,8 +62,7 @@ def _channels(bench: Bench) -> Outcome:
         lambda: channels(device, bench.work, ALL, *arguments), lambda planes: [planes.means.get(), planes.whole.get()]
     )
     splats, (frame, clear) = bench.splats(), bench.blend_reference()
-    order = depth_order(splats.depths, splats.visible)
-    wanted = reference_channels.channels(splats, order, camera, _after(camera), **_geometry(bench))
+    wanted = reference_channels.channels(splats, bench.frozen.gaussians, camera, _after(camera))
     means, whole = (cropped(planes, camera) for planes in outcome.arrays)
     sure = clear & (wanted.doubt > DOUBT)
     # a sum that cancels, as normals may where little is opaque, has no digits of its own
@@ -105,8 +85,7 @@ def _deep(bench: Bench) -> Outcome:
     arguments = (bench.lists, bench.projected.splats, bench.blended, camera.height)
     _, outcome = bench.twice(lambda: deep(device, bench.work, given, *arguments), lambda slices: [slices.get()])
     (planes,), splats, (_, clear) = outcome.arrays, bench.splats(), bench.blend_reference()
-    order = depth_order(splats.depths, splats.visible)
-    wanted = reference_deep.deep(splats, order, camera.width, camera.height, bounds)[:, clear]
+    wanted = reference_deep.deep(splats, camera.width, camera.height, bounds)[:, clear]
     got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, clear]
     fields = {"colour": slice(0, 3), "alpha": slice(3, 4), "depths": slice(4, 6)}
     return outcome.compared({name: (got[..., at], wanted[..., at]) for name, at in fields.items()})
@@ -129,28 +108,18 @@ def _amid(camera: Camera, projection: Projection) -> Camera:
 
 
 def _of_rays(bench: Bench, projection: Projection) -> Outcome:
-    device = bench.device.with_switches(PROJECTIONS[projection].defines)
-    # memory of its own: the next stages want what those before have made
-    work, camera, gaussians = Workspace(device), _amid(bench.camera, projection), bench.frozen.gaussians
-    camera_array = upload(device, pack_camera(camera))
-    depth = Features.of(())
+    # with memory of its own: the next stages want what those before have made
+    rasterizer, camera, gaussians = Rasterizer(bench.device), _amid(bench.camera, projection), bench.frozen.gaussians
 
-    def launch() -> tuple[Projected, Blended, Channels]:
-        projected = project(device, work, bench.model, camera, camera_array)
-        counted = count(device, work, projected)
-        pairs = duplicate(device, work, projected.splats, counted, bench.tiles, bench.band)
-        lists = tile_lists(device, work, pairs, bench.band)
-        pixels = (projected.splats, bench.background, camera.width, camera.height)
-        blended = blend(device, work, lists, *pixels, record=False, camera_array=camera_array)
-        rows = features(device, work, depth, bench.model, camera_array, camera_array, projected)
-        of_channels = (rows, lists, projected, blended, camera.height)
-        return projected, blended, channels(device, work, depth, *of_channels, camera_array=camera_array)
+    def launch() -> tuple[Frame, Channels]:
+        frame = rasterizer.forward(bench.model, camera, bench.background, backward=False)
+        return frame, rasterizer.channels(bench.model, frame, Features(), frame.camera_array)
 
-    def take(frame: tuple[Projected, Blended, Channels]) -> list[Array]:
-        projected, blended, planes = frame
-        counts = projected.tile_counts.get()
-        arrays = (blended.image, blended.transmittance, planes.means, planes.whole)
-        return [projected.splats.get()[counts > 0], counts, *(array.get() for array in arrays)]
+    def take(results: tuple[Frame, Channels]) -> list[Array]:
+        frame, planes = results
+        counts = frame.projected.tile_counts.get()
+        arrays = (frame.blended.image, frame.blended.transmittance, planes.means, planes.whole)
+        return [frame.projected.splats.get()[counts > 0], counts, *(array.get() for array in arrays)]
 
     _, outcome = bench.twice(launch, take)
     splats, counts, image, left, means, _ = outcome.arrays

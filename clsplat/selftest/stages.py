@@ -22,7 +22,6 @@ from clsplat.reference import blend as reference_blend
 from clsplat.reference import loss as reference_loss
 from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters
-from clsplat.reference.sort import depth_order
 from clsplat.reference.tiles import touched_tiles
 from clsplat.selftest.harness import WHITEN, Array, Bench, Outcome, cropped, joined
 from clsplat.selftest.picture_stages import PICTURES
@@ -122,7 +121,7 @@ def _duplicate(bench: Bench) -> Outcome:
     )
     tile_keys, ids, first_slots = outcome.arrays
     counts, got = projected.tile_counts.get().astype(np.int64), bench.splats()
-    order = depth_order(got.depths, got.visible)
+    order = got.order
     owners = np.repeat(order, counts[order])
     place = np.arange(len(owners)) - np.repeat(np.cumsum(counts[order]) - counts[order], counts[order])
     scanned = np.cumsum(counts) - counts
@@ -225,9 +224,8 @@ def _blend_grad(bench: Bench) -> Outcome:
     given = upload(device, planes)
     _, outcome = bench.twice(lambda: launch(given), lambda slots: [slots.get()])
     got = _slot_sums(bench, launch(upload(device, exact)).get())
-    order = depth_order(splats.depths, splats.visible)
     background = bench.frozen.background.astype(np.float64)
-    wanted = reference_blend.blend_grad(splats, order, camera.width, camera.height, background, _pixels(bench, exact))
+    wanted = reference_blend.blend_grad(splats, camera.width, camera.height, background, _pixels(bench, exact))
     shown = splats.visible
     moments = _moments(splats, wanted)
     parts = {

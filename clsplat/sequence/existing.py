@@ -11,7 +11,7 @@ from pathlib import Path
 
 from clsplat.errors import InputError, reason_of
 from clsplat.files import abandoned, is_file
-from clsplat.images.channels import attribute, is_foreign, is_whole
+from clsplat.images.frame_files import attribute, is_foreign, is_whole
 from clsplat.sequence.task import SETTINGS, RenderOptions, Task, picture_camera, settings_digest
 
 MOST_WRITERS = 8

@@ -20,13 +20,12 @@ from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, Samplin
 from clsplat.errors import InputError
 from clsplat.files import digest, is_file
 from clsplat.frame.window import framed
-from clsplat.images.channels import VIDEO
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
-from clsplat.images.exr_header import Header, camera_matrices
+from clsplat.images.frame_files import VIDEO, Header, camera_matrices
 from clsplat.shots import Shot
 from clsplat.shots.frame_numbers import output_paths
-from clsplat.shots.motion import Stretch, stretches
 from clsplat.shots.motion import camera_after as following
+from clsplat.shots.motion import stretches
 
 SETTINGS = "clsplat:settings"
 """The attribute of EXR and PNG files that holds it."""
@@ -68,7 +67,7 @@ class Task:
     camera: Camera
     path: Path
     after: Camera | None = None
-    stretch: Stretch | None = None
+    stretch: Shot | None = None
     before: tuple[int, ...] | None = None
 
     def at(self, time: float) -> Camera:

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from clsplat.config.channels import CHANNELS, DEEP
 from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig
 from clsplat.device.child import abandon
-from clsplat.images import channels
-from clsplat.images.video import VideoWriter, frame_planes
+from clsplat.images import frame_files
+from clsplat.images.video import VideoWriter, frame_planes, video_writer
 from clsplat.sequence.existing import MOST_WRITERS
 from clsplat.sequence.frame_renderer import RenderedFrame, RenderFrame
 from clsplat.sequence.task import Record, RenderOptions, Task, header, picture_camera
@@ -47,7 +47,7 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
         assert frame.planes is not None, "frames of a video are not written one by one"
         yuv = frame_planes(frame.finish(frame.planes)["rgb"])
     elif frame.planes is not None:
-        channels.write_channels(task.path, frame.finish(frame.planes), options.encoding, header(task, options))
+        frame_files.write_channels(task.path, frame.finish(frame.planes), options.encoding, header(task, options))
     seconds = frame.seconds + time.monotonic() - start
     return record_of(task, options, seconds=seconds, **frame.measured), yuv
 
@@ -182,4 +182,4 @@ def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter
 def open_video(tasks: Sequence[Task], config: VideoConfig) -> AbstractContextManager[VideoWriter | None]:
     """The video that the tasks are frames of, None where they have files of their own. It takes its name at the end of
     the block, if that ends well."""
-    return VideoWriter(tasks[0].path, config) if tasks and tasks[0].is_video else nullcontext()
+    return video_writer(tasks[0].path, config) if tasks and tasks[0].is_video else nullcontext()

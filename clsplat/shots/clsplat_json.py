@@ -40,10 +40,9 @@ def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
     if not (entries := objects(document, "keys")):
         raise InputError(f"{path}: has no keys, expected 'keys' to be a list of at least one")
     whole = Keys(path, None, {}, document)
-    fps, first, loop = whole.number("fps"), whole.number("first_frame"), whole.number("loop_frames")
+    fps, first, loop = whole.number("fps"), whole.require("first_frame", 1.0), whole.number("loop_frames")
     if fps is not None and fps <= 0:
         raise InputError(f"{path}: 'fps' is {fps:g}, expected more than 0")
-    first = 1.0 if first is None else first
     keys = []
     for index, entry in enumerate(entries):
         reader = Keys(path, f"key {index}", entry, document)
@@ -95,8 +94,7 @@ def _camera(keys: Keys, whole: Keys) -> Camera:
             f"{keys.path}: 'projection' is {short(projection)}, expected one of {', '.join(get_args(Projection))}"
         )
     width, height = whole.side("width"), whole.side("height")
-    near, far = whole.number("near"), whole.number("far")
-    near, far = 0.01 if near is None else near, math.inf if far is None else far
+    near, far = whole.require("near", 0.01), whole.require("far", math.inf)
     if not 0 < near < far:
         raise InputError(f"{keys.path}: 'near' is {near:g} and 'far' {far:g}, expected 0 < near < far")
     fx, fy = _focal(keys, projection, width, height)
@@ -125,8 +123,7 @@ def _focal(keys: Keys, projection: Projection, width: int, height: int) -> tuple
     values = Keys(keys.path, None, source, {})
     values.where = keys.where
     if projection == "equirectangular":
-        across, down = values.number("fov_x"), values.number("fov_y")
-        degrees = (360.0 if across is None else across, 180.0 if down is None else down)
+        degrees = values.require("fov_x", 360.0), values.require("fov_y", 180.0)
         if not set(given) <= {"fov_x", "fov_y"} or not (0 < degrees[0] <= 360 and 0 < degrees[1] <= 180):
             raise InputError(
                 f"{keys.where}: has {_listed(source, given)}, expected of an equirectangular camera at most 'fov_x' up "

@@ -1,15 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Key frames, and the smooth camera between them.
-
-Positions go along a cubic Hermite spline over time. A key's velocity is that of the parabola through it and its two
-neighbours (Catmull-Rom for keys that are not evenly spaced in time), and never more than three times the slower of the
-two average speeds beside it. So the path and its speed are continuous, it stays within a chord's length of both keys,
-a hold (two equal keys) holds, and moving a key changes two segments on each side at most. A spline with a continuous
-second derivative has none of the last three; a centripetal one takes its knots from distances, and the times of keys
-are the user's. Rotations have the same construction on angular velocities, with cumulative Bezier curves of quaternions
-(Kim, Kim, Shin 1995, "A general construction scheme for unit quaternion curves with simple high order derivatives").
-Scalars go along monotone cubics (Fritsch and Carlson 1980), focal lengths in their logarithm.
-"""
+"""Key frames, and the smooth camera between them: cubic Hermite splines of positions and of rotations, monotone cubics
+of scalars. docs/cameras.md (Between key frames) says why these."""
 
 from __future__ import annotations
 

@@ -5,27 +5,15 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import ceil
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.shots import Shot
-from clsplat.shots.keys import Key, interpolate
+from clsplat.shots import Frame, Shot
 
 AROUND = 2
-"""Keys on each side of a time that say where the camera is then: a segment's end, and what its tangent looks at."""
-
-
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """The part of a shot that a frame's shutter looks at. keys: their frames count from the frame."""
-
-    keys: tuple[Key, ...]
-
-    def at(self, time: float) -> Camera:
-        """The camera at a time in frames from the frame; that of a key as it is."""
-        return interpolate(self.keys, [time])[0]
+"""Frames on each side of a time that say where the camera is then: a segment's end, and what its tangent looks at."""
 
 
 def camera_after(shot: Shot, index: int) -> Camera:
@@ -54,9 +42,10 @@ def continued(earlier: Camera, now: Camera) -> Camera:
 
 def stretches(
     shot: Shot, resize: Callable[[Camera], Camera], opens: float, closes: float, *, motion: bool = False
-) -> Callable[[int], Stretch | None]:
-    """The stretch of a frame by its number, None where nothing can move. opens, closes: frames from the frame; motion:
-    with the middle of the next frame's shutter.
+) -> Callable[[int], Shot | None]:
+    """The part of the shot that a frame's shutter looks at, by the frame's number, from which its own numbers count;
+    None where nothing can move. opens, closes: frames from the frame; motion: with the middle of the next frame's
+    shutter.
 
     Before its first frame and after its last the shot goes on as it does there, as for motion. Raises InputError where
     the frames' pictures have several sizes or projections, which is no camera that moves.
@@ -81,9 +70,9 @@ def stretches(
         last, following = following, continued(last, following)
     numbers = [number for number, _ in frames]
 
-    def stretch(number: int) -> Stretch:
+    def stretch(number: int) -> Shot:
         begin = max(bisect_right(numbers, number + min(opens, 0)) - AROUND, 0)
         end = bisect_left(numbers, number + max(closes, 0)) + AROUND
-        return Stretch(tuple(Key(at - number, camera) for at, camera in frames[begin:end]))
+        return Shot(tuple(Frame(at - number, camera, f"{at:04d}") for at, camera in frames[begin:end]))
 
     return stretch

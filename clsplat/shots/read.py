@@ -107,5 +107,4 @@ def _read_json(path: Path, size: tuple[int | None, int | None]) -> Shot:
         )
     width, height = size
     both = (width, height) if width is not None and height is not None else None
-    frames = read_poses(path, both)
-    return Shot(named({frame.name: frame.lens.pinhole(frame.rotation, frame.translation) for frame in frames}))
+    return Shot(named(read_poses(path, both)))

@@ -7,8 +7,9 @@ import signal
 import threading
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -18,17 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config.memory import parse_bytes
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.child import TrialInterrupted
-from clsplat.device.context import Device, open_device
 from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.images.colour import photos_space
-from clsplat.process import Interrupted, endings
+from clsplat.process import Interrupted, endings, handled
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs import scene_record
@@ -62,37 +61,30 @@ class StepReport:
     seconds: float
 
 
-class _Interruption:
-    """Inside, the first Ctrl-C or other signal to end is noted, and the loop stops between two steps. After it a Ctrl-C
-    is Python's own, and the other signals do what they did before."""
+@contextmanager
+def _interruption() -> Iterator[Callable[[], int]]:
+    """Inside, the first Ctrl-C or other signal to end is noted, and the loop stops between two steps: the function
+    gives its number then, and 0 before. After it a Ctrl-C is Python's own, and the other signals do what they did."""
+    numbers, first = (signal.SIGINT, *endings()), 0
 
-    def __init__(self) -> None:
-        self.number = 0
-        self._previous: dict[int, Any] = {}
+    def ask(number: int, _frame: FrameType | None) -> None:
+        nonlocal first
+        first = number
+        noting.close()
 
-    def __call__(self) -> bool:
-        if not self.number:  # again, as compilers of kernels install handlers of their own
-            for number in self._previous:
-                signal.signal(number, self._ask)
-        return self.number != 0
+    def asked() -> int:
+        if not first and threading.current_thread() is threading.main_thread():
+            for number in numbers:  # again, as compilers of kernels install handlers of their own
+                signal.signal(number, ask)
+        return first
 
-    def __enter__(self) -> _Interruption:  # noqa: PYI034  # Self came with 3.11
-        if threading.current_thread() is threading.main_thread():
-            self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, *endings())}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _ask(self, number: int, _frame: FrameType | None) -> None:
-        self.number = number
-        for other, handler in self._previous.items():
-            signal.signal(other, signal.default_int_handler if other == signal.SIGINT else handler)
+    with handled([signal.SIGINT], signal.default_int_handler), ExitStack() as noting:
+        noting.enter_context(handled(numbers, ask))
+        yield asked
 
 
-class _Session:
-    """One call of `train`: a trainer, the run that it writes to, and the seconds that it has trained."""
+class Session:
+    """One call of `clsplat.train`: a trainer, the run that it writes to, and the seconds that it has trained."""
 
     def __init__(
         self,
@@ -110,8 +102,7 @@ class _Session:
         self.began = time.perf_counter()
         self.recorded, self.first_step = False, 0
         self.saved = 0
-        self.warned_stages: set[str] = set()
-        self.untold = 0
+        self.troubles: Counter[str] = Counter()
 
     def resume(self) -> None:
         """Go on from the latest checkpoint, if there is one."""
@@ -175,19 +166,17 @@ class _Session:
     def tell_trouble(self) -> None:
         """A warning for the first trouble of each stage; the rest is counted."""
         for incident in self.trainer.watch.incidents:
-            if incident.stage in self.warned_stages:
-                self.untold += 1
-            else:
+            self.troubles[incident.stage] += 1
+            if self.troubles[incident.stage] == 1:
                 warnings.warn(f"{incident} (more of this kind will be counted only)")
-            self.warned_stages.add(incident.stage)
         self.trainer.watch.incidents.clear()
 
     def tell_the_rest(self) -> None:
         """Warn of the number of troubled steps that were only counted."""
         self.trainer.mend()
         self.tell_trouble()
-        if self.untold:
-            warnings.warn(f"{self.untold} more steps had something that was not finite")
+        if untold := self.troubles.total() - len(self.troubles):
+            warnings.warn(f"{untold} more steps had something that was not finite")
 
     def give_up(self) -> None:
         """Raise ClsplatError, with what reproduces the trouble in the run's folder."""
@@ -295,46 +284,75 @@ class _Session:
         if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
             self.save()
 
+    def train(self, between: Between | None) -> Gaussians:
+        """Make the steps that are left, and write down the model and its evaluation."""
+        trainer, run = self.trainer, self.run
+        self.first_step = trainer.step
+        _tell_idle_settings(trainer)
+        self.tell_plan()
+        try:
+            self.make_steps(between)
+        except (DriverError, TrialInterrupted) as error:  # with a checkpoint nothing is lost
+            written = self.rescue()
+            if written and isinstance(error, DriverError):
+                raise DriverError(f"{error}{written}") from error
+            raise
+        model = trainer.gaussians()
+        if run is not None:
+            run.save_model(model, photos_space(view.path for view in trainer.scene.views))
+            if trainer.scene.test_views:
+                run.write_eval(self.evaluate(keep=True))
+        return model
+
     def make_steps(self, between: Between | None) -> None:
         """All steps that are left, and what is due at their end. Raises Interrupted, after a checkpoint."""
         trainer, last = self.trainer, self.trainer.config.iterations
-        with _Interruption() as interrupted:
+        with _interruption() as interrupted:
             while True:
                 while trainer.step < last and not interrupted():
                     if between is not None:
-                        between(trainer, interrupted)
+                        between(trainer, lambda: interrupted() != 0)
                     self.step()
                 self.save()
                 if trainer.step < last or not self.go_back():
                     break
             self.tell_the_rest()
             if trainer.step < last:
-                raise Interrupted(interrupted.number)
+                raise Interrupted(interrupted())
             self.doubt()
 
 
-def _begin(run: Run, scene: Scene, config: TrainConfig, *, resume: bool) -> None:
-    """Record in a run what is trained. Raises InputError where it has been trained already, or on another scene."""
-    if not resume and (run.checkpoints() or run.read_metrics()):
-        raise InputError(
-            f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
-            "starts again"
-        )
-    run.keep_config(config)
-    if resume:
-        scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
-    scene_record.keep(run, scene, resuming=resume)
+def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
+    """The scene to train on, with colours, recorded in the run; a warning for each doubt in it. Raises InputError where
+    the run has been trained already, or on another scene."""
+    if run is not None:
+        if not resume and (run.checkpoints() or run.read_metrics()):
+            raise InputError(
+                f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
+                "starts again"
+            )
+        run.keep_config(config)
+        if resume:
+            scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
+        scene_record.keep(run, scene, resuming=resume)
+        if resume and run.checkpoints():
+            return scene
+    for text in doubts.of_scene(scene, config.background):
+        warnings.warn(text)
+    if is_colourless(scene):
+        warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
+        scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
+    return scene
 
 
 def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
-    """The settings. Raises InputError where the arguments of `train` make no sense."""
-    for name, value, kind in (
-        ("scene", scene, Scene),
-        ("config", config, TrainConfig | None),
-        ("run", run, Run | None),
+    """The settings. Raises InputError where the arguments of `clsplat.train` make no sense."""
+    for name, value, kind, meant in (
+        ("scene", scene, Scene, "clsplat.load_scene(...)"),
+        ("config", config, TrainConfig | None, "TrainConfig(...)"),
+        ("run", run, Run | None, "Run.create(...)"),
     ):
         if not isinstance(value, kind):
-            meant = {"scene": "clsplat.load_scene(...)", "config": "TrainConfig(...)", "run": "Run.create(...)"}[name]
             raise InputError(f"{name} is {value!r:.100}, expected {meant}")
     if resume and run is None:
         raise InputError("resume=True: expected run=..., the run to go on with")
@@ -389,50 +407,3 @@ def _tell_idle_settings(trainer: Trainer) -> None:
             f"training begins with {count:,} Gaussians, more than --density.max-gaussians "
             f"{config.density.max_gaussians:,}, which stops new ones only: give the scene fewer points"
         )
-
-
-def train(
-    scene: Scene,
-    config: TrainConfig,
-    *,
-    device: Device | str | None = None,
-    max_device_mem: str | int | None = None,
-    run: Run | None = None,
-    resume: bool = False,
-    on_step: Callable[[StepReport], None] | None = None,
-    on_plan: Callable[[Plan], None] | None = None,
-    between: Between | None = None,
-) -> Gaussians:
-    """Train like `clsplat.train`, for arguments that are `checked` and a run that is locked, and write no report."""
-    limit = parse_bytes(max_device_mem)
-    opened = device if isinstance(device, Device) else open_device(device, limit)
-    if isinstance(device, Device) and limit is not None:
-        opened = device.with_memory_limit(limit)
-    if run is not None:
-        _begin(run, scene, config, resume=resume)
-    if not (resume and run is not None and run.checkpoints()):
-        for text in doubts.of_scene(scene, config.background):
-            warnings.warn(text)
-        if is_colourless(scene):
-            warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
-            scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
-    session = _Session(Trainer(scene, config, opened), run, on_step, on_plan)
-    trainer = session.trainer
-    if resume:
-        session.resume()
-    session.first_step = trainer.step
-    _tell_idle_settings(trainer)
-    session.tell_plan()
-    try:
-        session.make_steps(between)
-    except (DriverError, TrialInterrupted) as error:  # with a checkpoint nothing is lost
-        written = session.rescue()
-        if written and isinstance(error, DriverError):
-            raise DriverError(f"{error}{written}") from error
-        raise
-    model = trainer.gaussians()
-    if run is not None:
-        run.save_model(model, photos_space(view.path for view in scene.views))
-        if scene.test_views:
-            run.write_eval(session.evaluate(keep=True))
-    return model

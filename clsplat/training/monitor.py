@@ -18,7 +18,7 @@ from clsplat.training.health import Incident, Patience
 
 
 @dataclass(frozen=True, eq=False)
-class _Last:
+class LastStep:
     """The step to look at if it turns out to have had trouble: its number, view and background; the sums of its loss,
     which are there until the next step has one."""
 
@@ -41,7 +41,7 @@ class Watch:
     """readback: what a pass reads back, in the last four what `adam` counts (`Rasterizer.readback`); names: of the
     views.
 
-    incidents: those not told yet; patience: the count of trouble.
+    last: the step under way, once it has its loss; incidents: those not told yet; patience: the count of trouble.
     """
 
     def __init__(self, readback: DeviceArray, names: Sequence[str]) -> None:
@@ -49,27 +49,23 @@ class Watch:
         self.patience = Patience()
         self.incidents: list[Incident] = []
         self.latest: Incident | None = None
-        self._last: _Last | None = None
-        self._noticed: tuple[_Last, str, int] | None = None
+        self.last: LastStep | None = None
+        self._noticed: tuple[LastStep, str, int] | None = None
 
     def forget(self) -> None:
         """Forget the last step and its trouble: the model is a new one."""
-        self._last = self._noticed = None
+        self.last = self._noticed = None
         self.readback.fill(0)
-
-    def follow(self, step: int, view: int, background: NDArray[np.float32], sums: DeviceArray) -> None:
-        """A step is under way, and has its loss."""
-        self._last = _Last(step, view, background, sums)
 
     def notice(self, refused: Sequence[int]) -> None:
         """Take what `adam` counted (`REFUSED`) in the last step, whose loss must still be there."""
-        if not any(refused) or self._noticed is not None or self._last is None:
+        if not any(refused) or self._noticed is not None or self.last is None:
             return
         counts = dict(zip(REFUSED, refused, strict=True))
         stage = "parameters" if counts["parameters"] else ("project_grad" if counts["gradients"] else "adam")
-        if not np.isfinite(self._last.sums.get()).all():
+        if not np.isfinite(self.last.sums.get()).all():
             stage = "loss"
-        self._noticed = (self._last, stage, sum(refused))
+        self._noticed = (self.last, stage, sum(refused))
 
     def look(self) -> None:
         """Read the counts now, rather than wait for the next pass."""
@@ -77,8 +73,8 @@ class Watch:
 
     def loss_failed(self) -> None:
         """A loss was read that is not finite; where no Gaussian is, `adam` has nothing to refuse."""
-        if self._last is not None and self._noticed is None:
-            self._noticed = (self._last, "loss", 0)
+        if self.last is not None and self._noticed is None:
+            self._noticed = (self.last, "loss", 0)
 
     def examine(self, models: Mapping[str, AnyGaussians]) -> Remedy | None:
         """The remedy for what was noticed, or None if nothing was; models: parameters, first and second moments."""
@@ -92,12 +88,12 @@ class Watch:
         """The remedy, or None, after a look at every number, met by `adam` or not; arrays by "parameters/means" and so
         on."""
         host = {kind: {g: arrays[f"{kind}/{g}"] for g in GROUPS} for kind in ("parameters", "first", "second")}
-        if self._last is None or self.patience.lost or not np.any(health.examine(**host)):
+        if self.last is None or self.patience.lost or not np.any(health.examine(**host)):
             return None
-        return self._judge(self._last, "parameters", 0, host)
+        return self._judge(self.last, "parameters", 0, host)
 
     def _judge(
-        self, last: _Last, stage: str, elements: int, host: Mapping[str, Mapping[str, NDArray[np.float32]]]
+        self, last: LastStep, stage: str, elements: int, host: Mapping[str, Mapping[str, NDArray[np.float32]]]
     ) -> Remedy | None:
         broken, refused = health.examine(**host)
         lost = health.lost(stage, broken, refused)

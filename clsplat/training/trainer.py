@@ -51,7 +51,7 @@ from clsplat.stages.loss import Loss
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.health import Patience
-from clsplat.training.monitor import Remedy, Watch
+from clsplat.training.monitor import LastStep, Remedy, Watch
 from clsplat.training.photographs import Photographs
 from clsplat.training.resolution import sizes_of
 from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
@@ -89,7 +89,7 @@ class _Watched(StepProbe):
 
     def loss(self, result: Loss) -> None:
         """Remember the step, to look at if it turns out to have had trouble."""
-        self.trainer.watch.follow(self.step.step, self.view, self.background, result.sums)
+        self.trainer.watch.last = LastStep(self.step.step, self.view, self.background, result.sums)
 
     def row_gradients(self, rows: StepRows) -> None:
         """Before the first row changes, have every kernel rehearsed that changes the state: a driver may fail in
@@ -102,7 +102,7 @@ class _Watched(StepProbe):
                 self.add_statistics(trainer.statistics.rows(0, rows.stop - rows.start), rows)
                 step.update(rows)
             trainer.rehearsed.add(key)
-        trainer.forget_mark()
+        trainer.mark = None
         self.add_statistics(trainer.statistics.rows(rows.start, rows.stop), rows)
 
     def add_statistics(self, statistics: DensityStatistics, rows: StepRows) -> None:
@@ -119,7 +119,8 @@ class _Watched(StepProbe):
 class Trainer:
     """A model in training: parameters, moments, statistics and the random state, all of which a checkpoint holds.
 
-    watch: what is not finite in it, and how much of that there was.
+    watch: what is not finite in it, and how much of that there was; mark: where `step_back` leads, None from where the
+    state changes on.
     """
 
     def __init__(
@@ -148,7 +149,7 @@ class Trainer:
         self.step = 0
         self.queue: list[int] = []
         self.controlled = False
-        self._mark: _Mark | None = None
+        self.mark: _Mark | None = None
         self.rehearsed: set[tuple[object, ...]] = set()
         self.strategy = self._new_strategy(self.config)
         initial = self.given
@@ -246,16 +247,12 @@ class Trainer:
     def _note(self, *, begun: bool = False) -> None:
         """Mark the state as it is now: until something of it is changed, `step_back` leads here. begun: the step's
         number has risen."""
-        self._mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
-
-    def forget_mark(self) -> None:
-        """From here on the state changes: `step_back` leads nowhere."""
-        self._mark = None
+        self.mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
 
     def step_back(self) -> bool:
         """After an error within a step, make the state that of its beginning, or of after its density control. False
         if that cannot be."""
-        mark = self._mark
+        mark = self.mark
         if mark is None:
             return False
         self.step, self.queue, self.controlled = mark.step, list(mark.queue), mark.controlled
@@ -296,7 +293,7 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.queue:
             self.queue = [int(index) for index in self.rng.permutation(len(self.views))]
-            self._mark = None
+            self.mark = None
             self.statistics = self.statistics.next_epoch()
             self._note(begun=True)
         return self.queue.pop()
@@ -333,7 +330,7 @@ class Trainer:
             return
         if plan.rows is not None:
             self._move(plan.rows, plan.fresh, new_statistics=plan.new_statistics)
-        self._mark = None
+        self.mark = None
         for group, (rows, values) in plan.values.items():
             changed = self.parameters[group].get()
             changed[rows] = values
@@ -350,7 +347,7 @@ class Trainer:
         fresh = np.zeros(len(rows), bool) if fresh is None else fresh
         with only_tried(device):
             try_gather(device, len(rows), self.parameters)
-        self._mark = None
+        self.mark = None
         self._make_plan(len(rows))
         models = [*self.models().values()] if gathers and self.plan.gathers else self._take_down()
         statistics = self.statistics.moved(rows, fresh, densified=new_statistics)
@@ -412,7 +409,7 @@ class Trainer:
             why = f"{type(error).__name__}: {error}"
             raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
         self.queue = queue if max(queue, default=0) < len(self.views) else []  # of a scene that had more of them
-        self.controlled, self._mark = bool(checkpoint.state.get("controlled", False)), None
+        self.controlled, self.mark = bool(checkpoint.state.get("controlled", False)), None
         self.watch.patience = patience
         self.watch.forget()
         del self.parameters, self.first, self.second, self.gradients, self.statistics

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import steps_of
-from clsplat.models.edit import take
+from clsplat.models.edit import drop_sh, in_box, take
 
 Image = NDArray[np.uint8]
 Mode = Literal["colour", "depth", "alpha", "count"]
@@ -73,9 +73,7 @@ def _within(value: Any, low: float, high: float, usual: float) -> float:
 
 def edited(gaussians: Gaussians, look: Look) -> Gaussians:
     """The model as it is looked at. What does not change is shared with the one given."""
-    model = replace(gaussians)
-    if look.degree < gaussians.sh_degree:
-        model.sh = np.ascontiguousarray(gaussians.sh[:, : (look.degree + 1) ** 2])
+    model = drop_sh(gaussians, look.degree) if look.degree < gaussians.sh_degree else replace(gaussians)
     if look.size != 1:
         model.log_scales = gaussians.log_scales + np.float32(math.log(look.size))
     if look.opacity != 1:
@@ -83,9 +81,7 @@ def edited(gaussians: Gaussians, look: Look) -> Gaussians:
         opacity = np.clip(opacity, 1e-6, LARGEST_OPACITY)
         model.opacity_logits = np.log(opacity / (1 - opacity)).astype(np.float32)
     if look.crop is not None:
-        low, high = (np.array(corner) - gaussians.origin for corner in (look.crop[:3], look.crop[3:]))
-        inside = np.flatnonzero(((gaussians.means >= low) & (gaussians.means <= high)).all(axis=1))
-        model = take(model, inside)
+        model = take(model, in_box(gaussians, look.crop[:3], look.crop[3:]))
     return model
 
 

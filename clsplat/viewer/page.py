@@ -18,7 +18,7 @@ from clsplat.arrays import Float64
 from clsplat.errors import ClsplatError, InputError, plain
 from clsplat.rotations import quaternion_of
 from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
-from clsplat.viewer.path_recorder import FPS, Recorder, save_path
+from clsplat.viewer.path_recorder import FPS, add_key, path_document, save_path
 from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose, Start
 from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
@@ -56,7 +56,7 @@ class ViserPage:
 
     def __init__(self, client: Any, viewing: Viewing, world: World, paths: Path | None) -> None:
         self.client, self.viewing, self.world, self.paths = client, viewing, world, paths
-        self.recorder = Recorder()
+        self.keys: list[Pose] = []
         self._status: Any = None
         self._shown = 0
         self._drawing, self._drawn = 0, threading.Lock()
@@ -177,29 +177,29 @@ class ViserPage:
         def button(name: str, action: Callable[[], None]) -> None:
             async def clicked(_: Any) -> None:
                 self._attempt(action)
-                keys = len(self.recorder.keys)
+                keys = len(self.keys)
                 count.content = f"{keys or 'no'} key{'' if keys == 1 else 's'}"
 
             gui.add_button(name).on_click(clicked)
 
         def add() -> None:
             if (pose := self.viewer.pose) is not None:
-                self.recorder.add(pose)
+                add_key(self.keys, pose)
                 # thin lines: where the camera still stands, it would frame the page
                 lines = {"thickness": 2.0, "thickness_units": "screen"}
-                self._add_frustum(f"/keys/{len(self.recorder.keys) - 1}", pose, "key", **lines)
+                self._add_frustum(f"/keys/{len(self.keys) - 1}", pose, "key", **lines)
 
         def remove() -> None:
-            del self.recorder.keys[-1:]
-            self.client.scene.remove_by_name(f"/keys/{len(self.recorder.keys)}")
+            del self.keys[-1:]
+            self.client.scene.remove_by_name(f"/keys/{len(self.keys)}")
 
         def clear() -> None:
-            self.recorder.keys.clear()
+            self.keys.clear()
             self._clear("/keys")
 
         def document() -> str:
             size = (int(width.value), int(height.value))
-            return self.recorder.document(size, apart=float(apart.value), fps=float(fps.value), loop=loop.value)
+            return path_document(self.keys, size, apart=float(apart.value), fps=float(fps.value), loop=loop.value)
 
         def download() -> None:
             self.client.send_file_download("path.json", document().encode(), save_immediately=True)

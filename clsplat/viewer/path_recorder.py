@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,42 +19,39 @@ MOST_FILES = 10_000
 FPS = 24.0
 
 
-class Recorder:
-    """The key frames of one viewer, in their order."""
+def add_key(keys: list[Pose], pose: Pose) -> None:
+    """One more key frame at the end. Raises InputError when there are too many."""
+    if len(keys) >= MOST_KEYS:
+        raise InputError(f"there are {MOST_KEYS:,} key frames already")
+    keys.append(pose)
 
-    def __init__(self) -> None:
-        self.keys: list[Pose] = []
 
-    def add(self, pose: Pose) -> None:
-        """One more at the end. Raises InputError when there are too many."""
-        if len(self.keys) >= MOST_KEYS:
-            raise InputError(f"there are {MOST_KEYS:,} key frames already")
-        self.keys.append(pose)
-
-    def document(self, size: tuple[int, int], *, apart: float = 2.0, fps: float = FPS, loop: bool = False) -> str:
-        """The file. size: width, height of its pictures; apart: seconds from key to key, brought to whole frames; loop:
-        after the last the first comes again. Raises InputError for no keys, and for numbers that make no path."""
-        width, height = size
-        if not self.keys:
-            raise InputError("no key frames are recorded yet")
-        if not (1 <= width <= 1 << 15 and 1 <= height <= 1 << 15):
-            raise InputError(f"size {width} x {height}: expected 1 to {1 << 15} pixels a side")
-        if not (math.isfinite(apart) and math.isfinite(fps) and 0 < fps <= 1000 and 0 < apart <= 3600):
-            raise InputError(f"{apart} seconds at {fps} frames a second: expected up to 3600 and up to 1000")
-        step = max(round(apart * fps), 1)
-        contents: dict[str, Any] = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
-        if loop and len(self.keys) > 1:
-            contents["loop_frames"] = step * len(self.keys)
-        contents["keys"] = [
-            {
-                "frame": 1 + step * index,
-                "position": [float(value) for value in pose.position],
-                "world_from_cam": [float(value) for value in quaternion_of(pose.rotation)],
-                "fov_y": math.degrees(pose.fov),
-            }
-            for index, pose in enumerate(self.keys)
-        ]
-        return json.dumps(contents, indent=2) + "\n"
+def path_document(
+    keys: Sequence[Pose], size: tuple[int, int], *, apart: float = 2.0, fps: float = FPS, loop: bool = False
+) -> str:
+    """The file. size: width, height of its pictures; apart: seconds from key to key, brought to whole frames; loop:
+    after the last the first comes again. Raises InputError for no keys, and for numbers that make no path."""
+    width, height = size
+    if not keys:
+        raise InputError("no key frames are recorded yet")
+    if not (1 <= width <= 1 << 15 and 1 <= height <= 1 << 15):
+        raise InputError(f"size {width} x {height}: expected 1 to {1 << 15} pixels a side")
+    if not (math.isfinite(apart) and math.isfinite(fps) and 0 < fps <= 1000 and 0 < apart <= 3600):
+        raise InputError(f"{apart} seconds at {fps} frames a second: expected up to 3600 and up to 1000")
+    step = max(round(apart * fps), 1)
+    contents: dict[str, Any] = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
+    if loop and len(keys) > 1:
+        contents["loop_frames"] = step * len(keys)
+    contents["keys"] = [
+        {
+            "frame": 1 + step * index,
+            "position": [float(value) for value in pose.position],
+            "world_from_cam": [float(value) for value in quaternion_of(pose.rotation)],
+            "fov_y": math.degrees(pose.fov),
+        }
+        for index, pose in enumerate(keys)
+    ]
+    return json.dumps(contents, indent=2) + "\n"
 
 
 def save_path(folder: Path, document: str) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ class Pose:
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
         """The camera, of the page's size or another; where that has another shape, the vertical angle is kept. It is to
-        the last bit the one that a file of cameras holds (`Recorder.document`), as a quaternion and degrees."""
+        the last bit the one that a file of cameras holds (`path_document`), as a quaternion and degrees."""
         across, down = width or self.width, height or self.height
         focal = focal_length(math.radians(math.degrees(self.fov)), down)
         quaternion = quaternion_of(self.rotation)
@@ -45,12 +45,8 @@ class Pose:
 
     def same(self, other: Pose | None) -> bool:
         """True if the other shows the same."""
-        return (
-            other is not None
-            and (self.fov, self.width, self.height) == (other.fov, other.width, other.height)
-            and np.array_equal(self.position, other.position)
-            and np.array_equal(self.rotation, other.rotation)
-        )
+        names = [item.name for item in fields(self)]
+        return other is not None and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
 
 def read_pose(

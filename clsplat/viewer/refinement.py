@@ -40,84 +40,64 @@ class Level:
         return QUALITIES[self.exact]
 
 
-class Pace:
-    """Finds the size at which pictures in motion take the time that they may take."""
-
-    def __init__(self) -> None:
-        self.scale = 0.25
-        self._exact = 0.0
-
-    def moved(self, scale: float, seconds: float) -> None:
-        """A picture in motion of this scale took so long. Part of that does not shrink with the pixels, so that the
-        next size is found step by step."""
-        factor = math.sqrt(TARGET / max(seconds, 1e-4))
-        self.scale = min(max(scale * min(max(factor, 0.6), 1.2), SMALLEST), 1.0)
-        self._exact = max(self._exact, seconds)
-
-    def rested(self, seconds: float) -> None:
-        """An exact picture took so long."""
-        self._exact = seconds
-
-    @property
-    def patient(self) -> bool:
-        """True if an exact picture may be begun at once, by the time of the latest one."""
-        return self._exact <= PATIENCE
+def next_scale(scale: float, seconds: float) -> float:
+    """The scale at which a picture in motion comes nearer to the time that it may take, after one of `scale` took
+    `seconds`. Part of that does not shrink with the pixels, so that the size is found step by step."""
+    factor = math.sqrt(TARGET / max(seconds, 1e-4))
+    return min(max(scale * min(max(factor, 0.6), 1.2), SMALLEST), 1.0)
 
 
 class Refinement:
     """The picture that a viewer sees, and the next one: coarse in motion, finer at rest, exact in the end."""
 
     def __init__(self, now: float) -> None:
-        self.pace = Pace()
+        self.scale = 0.25
         self.served = -math.inf
-        self._changed, self._at = 1, now
+        self.changes, self._at = 1, now
         self._settle = START
         self._shown = 0
         self._model = 0
         self._level = Level(0.0, exact=False)
+        self._exact_takes = 0.0
 
     @property
     def moving(self) -> bool:
         """True if the picture shown is not the one asked for."""
-        return self._shown != self._changed
+        return self._shown != self.changes
 
     def changed(self, now: float) -> None:
         """The camera, or how the model is looked at."""
         apart = now - self._at
-        usual = JUMPS * apart if self._changed > 1 and apart < SETTLE[1] else 0.0
-        before = self._settle if self._changed > 1 else 0.0
+        usual = JUMPS * apart if self.changes > 1 and apart < SETTLE[1] else 0.0
+        before = self._settle if self.changes > 1 else 0.0
         self._settle = min(max(0.7 * before + 0.3 * usual, SETTLE[0]), SETTLE[1])
-        self._changed += 1
+        self.changes += 1
         self._at = now
 
     def due(self, now: float, model: int = 0) -> Level | None:
         """The next picture, if its time has come; model: counts its changes, while it is trained."""
-        if self.moving:
-            return Level(self.pace.scale, exact=False)
-        if now < self._at + self._settle or (self._level.exact and self._model == model):
+        if self.wait(now, model) != 0:
             return None
-        if self._level.exact or self.pace.patient or self._level.scale >= 0.5:
+        if self.moving:
+            return Level(self.scale, exact=False)
+        if self._level.exact or self._exact_takes <= PATIENCE or self._level.scale >= 0.5:
             return Level(1.0, exact=True)
         return Level(2 * self._level.scale, exact=False)
 
     def wait(self, now: float, model: int = 0) -> float | None:
         """Seconds until something is due, None if nothing will be by itself."""
-        if self.due(now, model) is not None:
+        if self.moving:
             return 0.0
         if self._level.exact and self._model == model:
             return None
         return max(0.0, self._at + self._settle - now)
 
-    def begun(self) -> int:
-        """Before a picture is made: what `shown` wants to know of it."""
-        return self._changed
-
     def shown(self, begun: int, level: Level, seconds: float, now: float, model: int = 0) -> None:
-        """A picture has been sent that took so long."""
+        """A picture has been sent that took so long; begun: the number of `changes` before it was made."""
         if level.exact:
-            self.pace.rested(seconds)
+            self._exact_takes = seconds
         elif self._shown != begun:
-            self.pace.moved(level.scale, seconds)
+            self.scale, self._exact_takes = next_scale(level.scale, seconds), max(self._exact_takes, seconds)
         self._shown, self._level, self._model, self.served = begun, level, model, now
 
 

@@ -115,7 +115,7 @@ class Viewing:
             self._is_news = False
             job = self._jobs.popleft() if self._jobs else None
             turn = None if job else self._turn(model.version, share)
-            begun = turn[0].refinement.begun() if turn else 0
+            begun = turn[0].refinement.changes if turn else 0
         if job:
             self._do(*job, model)
         elif turn:

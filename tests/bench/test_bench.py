@@ -335,7 +335,7 @@ def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPat
             assert value != getattr(BenchSwitches(), field), field
     assert (off.tile_test, off.alpha_min) == ("square", BenchSwitches().alpha_min)
     times = iter([50.0, 100.0, 150.0, 210.0])  # of a frame and of a step, on and off
-    monkeypatch.setattr(tradeoff, "wall_ms", lambda _device, work: (work(), next(times))[1])
+    monkeypatch.setattr(Device, "timed", lambda _device, work: (work(), next(times)))
     candidates = {"preset exact = default": PRESETS["exact"], tradeoff.ALL_OFF: off}
     result = tradeoff.compare(bench_subject.synthetic(300, 70, 50), profiled, candidates, repeat=1)
     assert [(point["frame_ms"], point["iteration_ms"]) for point in result["points"]] == [(50, 100), (150, 210)]

@@ -172,7 +172,7 @@ def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
         "from clsplat.cli import main as cli\n"
         "from clsplat.cli import train\n"
         "def work(*_):\n"
-        "    import clsplat.scenes.lens\n"
+        "    import clsplat.scenes.data_set\n"
         "train.run = work\n"
         "sys.exit(main())\n"
     )

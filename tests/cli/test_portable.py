@@ -133,7 +133,7 @@ def test_what_is_flushed_may_be_written_to(tmp_path: Path, monkeypatch: pytest.M
     """Windows flushes no file that was opened for reading."""
     fcntl = pytest.importorskip("fcntl", reason="tells how a file was opened, on POSIX")
     pytest.importorskip("av", reason="the extra `video` brings it")
-    from clsplat.images.video import VideoWriter, frame_planes
+    from clsplat.images.video import frame_planes, video_writer
 
     real, asked = os.fsync, []
 
@@ -144,7 +144,7 @@ def test_what_is_flushed_may_be_written_to(tmp_path: Path, monkeypatch: pytest.M
         real(descriptor)
 
     monkeypatch.setattr(os, "fsync", as_windows)
-    with VideoWriter(tmp_path / "a.mp4") as video:
+    with video_writer(tmp_path / "a.mp4") as video:
         video.add(frame_planes(np.zeros((32, 32, 3), np.float32)))
     assert asked
     asked.clear()

@@ -273,7 +273,7 @@ def test_a_full_disk_ends_the_job(shot: list[str], tmp_path: Path, capsys: Captu
         if "0003" in str(path):
             raise errors.ClsplatError(f"{path}: cannot be written: No space left on device")
 
-    monkeypatch.setattr("clsplat.images.channels.write_spec", full)
+    monkeypatch.setattr("clsplat.images.frame_files.write_spec", full)
     assert render(shot, tmp_path, "--progress", "none") == 1
     assert "a.0003.exr: cannot be written: No space left on device" in error_line(capsys)
 

@@ -113,7 +113,7 @@ def test_what_is_half_changed_is_not_kept(
     real = trainer._Watched.add_statistics
 
     def add_statistics(self, statistics, rows):
-        if self.trainer.step == 5 and self.trainer._mark is None:
+        if self.trainer.step == 5 and self.trainer.mark is None:
             raise DriverError("it failed")
         return real(self, statistics, rows)
 

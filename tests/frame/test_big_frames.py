@@ -13,6 +13,7 @@ import scenes
 from compare import assert_same_bits
 
 from clsplat.camera import Camera, Window
+from clsplat.config.channels import CHANNELS
 from clsplat.config.pictures import Encoding, FramingConfig, SamplingConfig
 from clsplat.device.context import open_device
 from clsplat.errors import InputError
@@ -20,8 +21,7 @@ from clsplat.frame.draw import drawn_by
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.frame.strips import in_strips, strip_rows, strips, write_in_strips
 from clsplat.frame.window import crop, framed
-from clsplat.images.channels import CHANNELS, write_channels
-from clsplat.images.exr_header import Header
+from clsplat.images.frame_files import Header, write_channels
 from clsplat.rendering.renderer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(3000, 8, 150, 200)

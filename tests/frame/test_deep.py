@@ -23,7 +23,7 @@ from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep, writ
 from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import LINEAR, Colours
-from clsplat.images.exr_header import Header, camera_matrices
+from clsplat.images.frame_files import Header, camera_matrices
 from clsplat.reference import deep as twin
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
@@ -73,7 +73,7 @@ def test_against_the_twin(shaped_device: Device, name: str) -> None:
     bounds = bin_bounds(gaussians, camera, DeepConfig(bins=5))
     got = render_deep(Renderer(shaped_device), gaussians, camera, bounds)
     forward = reference.forward(gaussians, camera)
-    wanted = twin.deep(forward.projected, forward.order, camera.width, camera.height, bounds)
+    wanted = twin.deep(forward.projected, camera.width, camera.height, bounds)
     sure = forward.blended.margin > 1e-4
     assert sure.mean() > 0.9 and got.shape == wanted.shape
     # A depth within a float32's rounding of a bound may fall on either side: no scene has one but where all are equal.

@@ -12,13 +12,13 @@ import scenes
 from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera, Projection, Window
+from clsplat.config.channels import CHANNELS
 from clsplat.config.pictures import FramingConfig, parse_overscan
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, drawn_by
 from clsplat.frame.samples import filter_taps, supersampled
 from clsplat.frame.window import crop, framed, reframed
-from clsplat.images.channels import CHANNELS
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer

@@ -20,9 +20,8 @@ from clsplat.frame.draw import Planes
 from clsplat.frame.pipeline import FramePipeline
 from clsplat.frame.strips import write_in_strips
 from clsplat.frame.window import framed
-from clsplat.images.channels import write_channels
 from clsplat.images.colour import LINEAR, linear_to_srgb, srgb_to_linear
-from clsplat.images.exr_header import Header
+from clsplat.images.frame_files import Header, write_channels
 from clsplat.rendering.renderer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(1500, 8, 100, 70)

@@ -18,7 +18,7 @@ from clsplat.config.channels import CHANNELS, Channel, feature_names, light_and_
 from clsplat.config.pictures import Encoding
 from clsplat.device.source import kernel_root
 from clsplat.frame.draw import drawn_by, feature_floats
-from clsplat.images.channels import is_whole, parse_channels, write_channels
+from clsplat.images.frame_files import is_whole, parse_channels, write_channels
 from clsplat.stages.channels import DEPTHS, WHOLE, WIDTHS, Features
 
 CAMERA = Camera(8, 6, 9.0, 9.0, 4.0, 3.0, np.eye(3), np.zeros(3))

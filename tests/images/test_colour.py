@@ -13,7 +13,6 @@ from scenes import one
 from clsplat.config.pictures import ColourConfig, Encoding
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.images.channels import write_channels
 from clsplat.images.colour import (
     LINEAR,
     SRGB,
@@ -24,6 +23,7 @@ from clsplat.images.colour import (
     recorded_space,
     srgb_to_linear,
 )
+from clsplat.images.frame_files import write_channels
 
 HALF = 2.0**-11
 """What rounding to a half loses, relative."""

@@ -87,7 +87,7 @@ PICTURES = """
 import sys
 from pathlib import Path
 import numpy as np
-from clsplat.config.pictures import Encoding; from clsplat.images.channels import is_whole, write_channels
+from clsplat.config.pictures import Encoding; from clsplat.images.frame_files import is_whole, write_channels
 folder, name = Path(sys.argv[1]), sys.argv[2]
 rng = np.random.default_rng(0)
 for size in range(*map(int, sys.argv[3:])):
@@ -119,10 +119,10 @@ VIDEO = """
 import sys
 from pathlib import Path
 import numpy as np
-from clsplat.images.video import VideoWriter, frame_planes
+from clsplat.images.video import frame_planes, video_writer
 rng = np.random.default_rng(0)
 try:
-    with VideoWriter(Path(sys.argv[1])) as video:
+    with video_writer(Path(sys.argv[1])) as video:
         for _ in range(10):
             video.add(frame_planes((rng.random((200, 200, 3)) * 255).astype(np.uint8)))
 except OSError as error:

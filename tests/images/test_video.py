@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from clsplat.config.pictures import VideoConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.images.video import VideoWriter, check_video, frame_planes
+from clsplat.images.video import check_video, frame_planes, video_writer
 
 require("av")
 import av  # noqa: E402
@@ -31,7 +31,7 @@ def frames(count: int, width: int, height: int) -> list[NDArray[np.float32]]:
 
 def write_video(path: Path, images: Iterable[NDArray[Any]], config: VideoConfig | None = None) -> int:
     """Write all images; returns how many."""
-    with VideoWriter(path, config) as video:
+    with video_writer(path, config) as video:
         for image in images:
             video.add(frame_planes(image))
         return video.frames
@@ -120,7 +120,7 @@ def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"before")
     made = frames(2, 32, 32)
-    with pytest.raises(KeyboardInterrupt), VideoWriter(path) as video:
+    with pytest.raises(KeyboardInterrupt), video_writer(path) as video:
         video.add(frame_planes(made[0]))
         raise KeyboardInterrupt
     with pytest.raises(InputError, match="a video of no frames"):
@@ -144,7 +144,7 @@ def test_what_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         (VideoConfig(preset="best"), "--video.preset best: expected one of ultrafast"),
     ):
         with pytest.raises(InputError, match=message):
-            VideoWriter(tmp_path / "a.mp4", config)
+            write_video(tmp_path / "a.mp4", [], config)
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"a\.mp4: video needs PyAV, .*pip install 'clsplat\[video\]'"):
-        VideoWriter(tmp_path / "a.mp4")
+        write_video(tmp_path / "a.mp4", [])

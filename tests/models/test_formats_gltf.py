@@ -291,6 +291,7 @@ LIES: dict[str, Change] = {
     "mesh": lambda asset: asset["nodes"][0].update(mesh=None),
     "matrix": lambda asset: asset["nodes"][0].update(matrix=[1e999] * 16),
     "required": lambda asset: asset.update(extensionsRequired=["KHR_draco_mesh_compression"]),
+    "required object": lambda asset: asset.update(extensionsRequired=[{}]),
     "version": lambda asset: asset["asset"].update(version="1.0"),
     "no version": lambda asset: asset.pop("asset"),
     "attribute": lambda asset: asset["meshes"][0]["primitives"][0]["attributes"].pop("KHR_gaussian_splatting:SCALE"),

@@ -103,7 +103,7 @@ def test_permuted_gaussians_give_the_same_image(scene: str) -> None:
 def test_equal_depths_are_blended_by_index() -> None:
     gaussians, camera = scenes.equal_depth()
     result = forward(gaussians, camera)
-    assert (result.order == np.arange(len(gaussians))).all()
+    assert (result.projected.order == np.arange(len(gaussians))).all()
     depths = np.array([2.0, 1.0, 1.0 + 1e-9, 1.0, 3.0])
     assert depth_order(depths, np.array([True, True, True, True, False])).tolist() == [1, 2, 3, 0]
 
@@ -158,7 +158,7 @@ def test_boxes_lose_nothing_and_margins_see_the_thresholds() -> None:
     projected = result.projected
     image = np.zeros((30, 40, 3))
     transmittance, done = np.ones((30, 40)), np.zeros((30, 40), np.bool_)
-    for n in result.order:
+    for n in projected.order:
         dx = np.arange(40) + 0.5 - projected.means2d[n, 0]
         dy = np.arange(30)[:, None] + 0.5 - projected.means2d[n, 1]
         a, b, c = projected.conics[n]
@@ -174,7 +174,7 @@ def test_boxes_lose_nothing_and_margins_see_the_thresholds() -> None:
     margin = result.blended.margin
     assert margin is not None and 0 < margin.min() < 1e-3 and margin.max() <= 0.05
     fainter = replace(projected, opacities=projected.opacities * (1 - 2e-3))
-    other = blend(fainter, result.order, 40, 30)
+    other = blend(fainter, 40, 30)
     # where little is left, T moves by many times the change of an alpha; elsewhere only alphas can have flipped
     changed = (other.count != result.blended.count) & (result.blended.transmittance > 1e-2)
     assert changed.any(), "the scene has no pixel near a threshold"

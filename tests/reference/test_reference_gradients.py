@@ -17,12 +17,11 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.adam import adam
-from clsplat.reference.blend import ALPHA_MAX, blend, blend_grad, footprint
+from clsplat.reference.blend import ALPHA_MAX, blend, blend_grad
 from clsplat.reference.loss import l1_dssim
 from clsplat.reference.project import ALPHA_MIN, covariance_grad, frustum_limits, project, project_grad
 from clsplat.reference.render import forward, parameters, render_grad
 from clsplat.reference.sh import sh_basis_grad
-from clsplat.reference.sort import depth_order
 from clsplat.spherical_harmonics import sh_basis
 
 Arrays = dict[str, Float64]
@@ -42,8 +41,7 @@ class Objective:
 
     def _evaluate(self, arrays: Arrays) -> tuple[float, NDArray[np.int64], NDArray[np.int64]]:
         projected = project(**arrays, camera=self.camera, sh_degree=3)
-        order = depth_order(projected.depths, projected.visible)
-        blended = blend(projected, order, self.camera.width, self.camera.height, BACKGROUND)
+        blended = blend(projected, self.camera.width, self.camera.height, BACKGROUND)
         return l1_dssim(blended.image, self.target)[0], blended.count, blended.last
 
     def __call__(self, arrays: Arrays) -> float:
@@ -58,10 +56,9 @@ class Objective:
 
     def gradient(self) -> Arrays:
         projected = project(**self.arrays, camera=self.camera, sh_degree=3)
-        order = depth_order(projected.depths, projected.visible)
         width, height = self.camera.width, self.camera.height
-        image = blend(projected, order, width, height, BACKGROUND).image
-        screen = blend_grad(projected, order, width, height, BACKGROUND, l1_dssim(image, self.target)[1])
+        image = blend(projected, width, height, BACKGROUND).image
+        screen = blend_grad(projected, width, height, BACKGROUND, l1_dssim(image, self.target)[1])
         return project_grad(
             **self.arrays,
             camera=self.camera,
@@ -202,20 +199,20 @@ def test_whitened_moments_give_the_same_gradients(scene: str) -> None:
     width, height = camera.width, camera.height
     d_image = np.random.default_rng(4).normal(size=(height, width, 3))
     result = forward(gaussians, camera, BACKGROUND)
-    projected, order = result.projected, result.order
-    wanted = blend_grad(projected, order, width, height, BACKGROUND, d_image)
+    projected, order = result.projected, result.projected.order
+    wanted = blend_grad(projected, width, height, BACKGROUND, d_image)
     wanted_covariances = covariance_grad(projected.conics, wanted.conics)
 
     # every alpha of every pixel at once, and the colour behind each Gaussian by the sums that eq. (22) recurses
     alphas = np.zeros((len(order), height, width))
     free = np.zeros(alphas.shape, np.bool_)
     for position, gaussian in enumerate(order):
-        splat = footprint(projected, int(gaussian), width, height)
+        splat = projected.footprint(int(gaussian), width, height)
         if splat is None:
             continue
         raw = splat.raw
-        alphas[position, splat.rows, splat.columns] = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0)
-        free[position, splat.rows, splat.columns] = (raw >= ALPHA_MIN) & (raw <= ALPHA_MAX)
+        alphas[position][splat.box] = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0)
+        free[position][splat.box] = (raw >= ALPHA_MIN) & (raw <= ALPHA_MAX)
     added = np.arange(len(order))[:, None, None] <= result.blended.last
     alphas *= added
     before = np.cumprod(np.concatenate([np.ones((1, height, width)), 1 - alphas]), axis=0)
@@ -250,13 +247,13 @@ def test_absolute_screen_gradient_adds_pixel_by_pixel() -> None:
     width, height = camera.width, camera.height
     result = forward(gaussians, camera, BACKGROUND)
     d_image = np.random.default_rng(5).normal(size=(height, width, 3))
-    whole = blend_grad(result.projected, result.order, width, height, BACKGROUND, d_image)
+    whole = blend_grad(result.projected, width, height, BACKGROUND, d_image)
     absolute = np.zeros_like(whole.means2d)
     for row in range(height):
         for column in range(width):
             single = np.zeros_like(d_image)
             single[row, column] = d_image[row, column]
-            alone = blend_grad(result.projected, result.order, width, height, BACKGROUND, single)
+            alone = blend_grad(result.projected, width, height, BACKGROUND, single)
             absolute += np.abs(alone.means2d)
     assert_close(whole.abs_means2d, absolute, relative=1e-12)
     assert (whole.abs_means2d >= np.abs(whole.means2d) - 1e-12).all()

@@ -44,7 +44,9 @@ def test_a_logarithmic_axis() -> None:
 
 
 def test_areas_are_stacked_and_say_their_own_height() -> None:
-    page = drawn(Series("low", [(0, 1.0), (1, 2.0)], "area"), Series("high", [(0, 3.0), (1, 6.0)], "area", 1))
+    page = drawn(Series("low", [(0, 1.0), (1, 2.0)], "area"), Series("high", [(0, 2.0), (1, 4.0)], "area", 1))
+    (_, bottom), (_, top) = places(path_of(page, "high"))[:2]
+    assert (bottom, top) == (pytest.approx((BOTTOM + TOP) / 2, abs=0.06), TOP)
     assert path_of(page, "high").attributes["data-values"] == "0 2 1 4"
     names = [each.attributes["data-name"] for each in page.all("path") if "data-name" in each.attributes]
     assert names == ["high", "low"], "the lower one is drawn over the higher one"
@@ -55,7 +57,7 @@ def test_bars_stand_on_the_axis_with_the_height_of_their_count() -> None:
     path = path_of(page, "one").attributes["d"]
     half = (BOTTOM + TOP) / 2
     middle = (LEFT + RIGHT) / 2
-    assert path == f"M{LEFT}.0 {BOTTOM}.0V{half:.1f}H{middle:.1f}V{TOP}.0H{RIGHT}.0V{BOTTOM}.0Z"
+    assert path == f"M{LEFT}.0 {half:.1f}H{middle:.1f}V{TOP}.0H{RIGHT}.0V{BOTTOM}.0V{BOTTOM}.0H{LEFT}.0Z"
 
 
 @pytest.mark.parametrize("values", [[5.0], [0.0, 0.0], [1e-12, 1e-12], [-3.0, -3.0], [1e30, -1e30], [7.0, 7.0 + 1e-15]])

@@ -19,11 +19,11 @@ from calls import left_behind
 from scenes import tilted_camera
 
 from clsplat.camera import Camera
+from clsplat.config.channels import CHANNELS
 from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import temporary_name
 from clsplat.frame.draw import Planes
-from clsplat.images.channels import CHANNELS
 from clsplat.sequence import existing, workers
 from clsplat.sequence.existing import is_complete
 from clsplat.sequence.frame_renderer import FrameRenderer, RenderedFrame
@@ -112,7 +112,7 @@ def test_a_stretch_is_the_shot_there() -> None:
     of = stretches(shot, lambda camera: camera, -0.25, 0.75)
     for number in (4, 7):
         stretch = of(number)
-        assert stretch is not None and len(stretch.keys) < 8  # and not all of the shot goes to a worker
+        assert stretch is not None and len(stretch.frames) < 8  # and not all of the shot goes to a worker
         sent = pickle.loads(pickle.dumps(stretch))
         for time_ in (-0.25, 0.0, 0.1, 0.75):
             wanted, got = shot.at(number + time_), sent.at(time_)

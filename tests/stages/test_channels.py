@@ -59,9 +59,7 @@ def test_against_the_twin(shaped_device: Device, name: str) -> None:
     gaussians, camera = scene = SCENES[name]()
     got = run(shaped_device, scene)
     forward = reference.forward(gaussians, camera)
-    arrays = reference.parameters(gaussians)
-    geometry = {key: arrays[key] for key in ("means", "quaternions", "log_scales")}
-    wanted = twin.channels(forward.projected, forward.order, camera, moved(camera), **geometry)
+    wanted = twin.channels(forward.projected, gaussians, camera, moved(camera))
     margin = forward.blended.margin
     # Where a Gaussian may be in or out, or another the heaviest, there is nothing to compare.
     sure = (margin > 1e-4) & (wanted.doubt > 1e-5)

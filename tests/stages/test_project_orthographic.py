@@ -232,7 +232,7 @@ def test_deep_slices(device: Device) -> None:
     bounds = bin_bounds(gaussians, camera, DeepConfig(bins=5))
     got = render_deep(Renderer(device), gaussians, camera, bounds)
     forward = reference.forward(gaussians, camera)
-    wanted = deep_twin.deep(forward.projected, forward.order, camera.width, camera.height, bounds)
+    wanted = deep_twin.deep(forward.projected, camera.width, camera.height, bounds)
     sure = forward.blended.margin > 1e-4
     for values, of in zip(got, wanted, strict=True):
         # As of a perspective frame (test_deep.py).

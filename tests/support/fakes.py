@@ -17,7 +17,7 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.errors import DeviceError, InputError
 from clsplat.gaussians import Gaussians
-from clsplat.images import channels as layers
+from clsplat.images import frame_files as layers
 from clsplat.runs.run import Run
 from clsplat.sequence.frame_renderer import FrameRenderer
 from clsplat.sequence.task import RenderOptions

@@ -60,7 +60,7 @@ def _of(run: Pipeline) -> dict[str, list[Array]]:
 
 
 CHANNELS = ("rgb", "alpha", "depth", "median", "first", "normals", "position", "motion", "count", "id", "deep")
-"""All that a picture can be written with (`clsplat.images.channels`), and its slices by depth."""
+"""All that a picture can be written with (`clsplat.images.frame_files`), and its slices by depth."""
 BOUNDS = np.array([2.0, 3.5, 6.0], np.float32)
 
 

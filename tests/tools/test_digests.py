@@ -15,8 +15,8 @@ from golden_frames import SCENES, arrays_of
 from pipeline import shaped
 from quick import quick
 
+from clsplat.config.channels import CHANNELS
 from clsplat.device.context import Device
-from clsplat.images.channels import CHANNELS
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ROOT / "tools"

@@ -30,9 +30,9 @@ from clsplat.viewer.appearance import (
     edited,
     read_look,
 )
-from clsplat.viewer.path_recorder import MOST_KEYS, Recorder, save_path
+from clsplat.viewer.path_recorder import MOST_KEYS, add_key, path_document, save_path
 from clsplat.viewer.pose import Pose, extent_of, fitted, looking, read_pose, start_of
-from clsplat.viewer.refinement import PATIENCE, SETTLE, SMALLEST, START, TARGET, Level, Pace, Refinement, Share
+from clsplat.viewer.refinement import PATIENCE, SETTLE, SMALLEST, START, TARGET, Level, Refinement, Share, next_scale
 from clsplat.viewer.scheduler import Viewer, Viewing
 
 ZERO = np.zeros(3)
@@ -145,7 +145,7 @@ def test_fitted_sizes() -> None:
 
 
 def shown(refinement: Refinement, level: Level, seconds: float, now: float, model: int = 0) -> None:
-    refinement.shown(refinement.begun(), level, seconds, now, model)
+    refinement.shown(refinement.changes, level, seconds, now, model)
 
 
 def test_coarse_in_motion_exact_at_rest() -> None:
@@ -191,7 +191,7 @@ def test_the_first_exact_picture_leaves_the_browser_some_time() -> None:
 
 def test_what_changes_while_a_picture_is_made_is_shown_next() -> None:
     refinement = Refinement(0.0)
-    begun, level = refinement.begun(), refinement.due(0.0)
+    begun, level = refinement.changes, refinement.due(0.0)
     assert level is not None
     refinement.changed(0.02)
     refinement.shown(begun, level, 0.05, 0.05)
@@ -202,7 +202,7 @@ def test_what_changes_while_a_picture_is_made_is_shown_next() -> None:
 
 def test_a_slow_exact_picture_is_led_up_to() -> None:
     refinement = Refinement(0.0)
-    refinement.pace.scale = 0.2
+    refinement.scale = 0.2
     shown(refinement, Level(0.2, exact=False), 2 * PATIENCE, 0.0)
     refinement.changed(0.0)
     shown(refinement, Level(0.2, exact=False), 2 * PATIENCE, 0.0)
@@ -224,20 +224,20 @@ def test_a_model_in_training_is_shown_again() -> None:
 
 @pytest.mark.parametrize("fixed", [0.0, 0.01])
 def test_the_pace_finds_the_size_that_takes_the_time(fixed: float) -> None:
-    pace = Pace()
+    scale = Refinement(0.0).scale
     for _ in range(40):
-        pace.moved(pace.scale, fixed + 0.4 * pace.scale**2)
-    assert fixed + 0.4 * pace.scale**2 == pytest.approx(TARGET, rel=0.05)
+        scale = next_scale(scale, fixed + 0.4 * scale**2)
+    assert fixed + 0.4 * scale**2 == pytest.approx(TARGET, rel=0.05)
 
 
 def test_the_pace_stays_in_its_range() -> None:
-    pace = Pace()
+    scale = Refinement(0.0).scale
     for _ in range(50):
-        pace.moved(pace.scale, 10.0)
-    assert pace.scale == SMALLEST
+        scale = next_scale(scale, 10.0)
+    assert scale == SMALLEST
     for _ in range(50):
-        pace.moved(pace.scale, 0.0)
-    assert pace.scale == 1.0
+        scale = next_scale(scale, 0.0)
+    assert scale == 1.0
 
 
 def test_a_share_of_the_time() -> None:
@@ -332,15 +332,15 @@ def test_pictures() -> None:
 # paths
 
 
-def recorded(*positions: float) -> Recorder:
-    recorder = Recorder()
+def recorded(*positions: float) -> list[Pose]:
+    keys: list[Pose] = []
     for x in positions:
-        recorder.add(pose(x))
-    return recorder
+        add_key(keys, pose(x))
+    return keys
 
 
 def test_a_recorded_path_is_read_by_render(tmp_path: Path) -> None:
-    path = save_path(tmp_path, recorded(0.0, 1.0, 3.0).document((320, 200), apart=0.5, fps=24))
+    path = save_path(tmp_path, path_document(recorded(0.0, 1.0, 3.0), (320, 200), apart=0.5, fps=24))
     shot = choose_shot(path, path=None, count=None)
     assert [frame.number for frame in shot.frames] == list(range(1, 26))
     for number, x in ((0, 0.0), (12, 1.0), (24, 3.0)):
@@ -360,10 +360,7 @@ def test_a_recorded_key_is_seen_to_the_last_bit(tmp_path: Path) -> None:
         )
         assert pose is not None
         poses.append(pose)
-    recorder = Recorder()
-    for pose in poses:
-        recorder.add(pose)
-    (tmp_path / "path.json").write_text(recorder.document((1280, 720), apart=0.5))
+    (tmp_path / "path.json").write_text(path_document(poses, (1280, 720), apart=0.5))
     shot = choose_shot(tmp_path / "path.json").only(",".join(str(1 + 12 * index) for index in range(40)))
     for pose, camera in zip(poses, shot.cameras, strict=True):
         wanted = pose.camera(1280, 720)
@@ -374,20 +371,20 @@ def test_a_recorded_key_is_seen_to_the_last_bit(tmp_path: Path) -> None:
 
 
 def test_a_closed_loop_has_as_many_frames_as_a_turn(tmp_path: Path) -> None:
-    recorder = recorded(0.0, 1.0)
-    path = save_path(tmp_path, recorder.document((32, 20), apart=1.0, fps=10, loop=True))
+    keys = recorded(0.0, 1.0)
+    path = save_path(tmp_path, path_document(keys, (32, 20), apart=1.0, fps=10, loop=True))
     assert len(choose_shot(path, path=None, count=None).frames) == 20
-    assert "loop_frames" not in json.loads(recorded(0.0).document((32, 20), loop=True))
+    assert "loop_frames" not in json.loads(path_document(recorded(0.0), (32, 20), loop=True))
 
 
 def test_keys_are_taken_back() -> None:
-    recorder = recorded(0.0, 1.0)
-    del recorder.keys[-1:]
-    assert [key.position[0] for key in recorder.keys] == [0.0]
-    recorder.keys.clear()
-    del recorder.keys[-1:]
+    keys = recorded(0.0, 1.0)
+    del keys[-1:]
+    assert [key.position[0] for key in keys] == [0.0]
+    keys.clear()
+    del keys[-1:]
     with pytest.raises(InputError, match="no key frames"):
-        recorder.document((32, 20))
+        path_document(keys, (32, 20))
 
 
 @pytest.mark.parametrize(
@@ -396,14 +393,14 @@ def test_keys_are_taken_back() -> None:
 )
 def test_numbers_that_make_no_path(size: tuple[int, int], numbers: dict[str, float]) -> None:
     with pytest.raises(InputError, match="expected"):
-        recorded(0.0).document(size, **numbers)
+        path_document(recorded(0.0), size, **numbers)
 
 
 def test_too_many_keys(monkeypatch: pytest.MonkeyPatch) -> None:
-    recorder = recorded(0.0)
-    recorder.keys *= MOST_KEYS
+    keys = recorded(0.0)
+    keys *= MOST_KEYS
     with pytest.raises(InputError, match="10,000"):
-        recorder.add(pose())
+        add_key(keys, pose())
 
 
 @links

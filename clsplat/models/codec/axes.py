@@ -9,6 +9,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import transform
+from clsplat.spherical_harmonics import sh_basis
 
 Signs = tuple[int, int, int]
 
@@ -20,17 +21,11 @@ LEFT_UP: Signs = (-1, -1, 1)
 SLACK = 1e-4
 """Most that a node's axes may be off right angles or equal lengths: matrices are written with few digits."""
 
-_ODD = (
-    *("", "y", "z", "x", "xy", "yz", "", "xz", ""),
-    *("y", "xyz", "y", "z", "x", "z", "x"),
-)
-"""The axes that each of the 16 spherical harmonics (docs/conventions.md) changes its sign with."""
-
 
 def sh_signs(signs: Signs) -> Float32:
     """(16,): what the coefficients are multiplied by when axes change their sign."""
-    by_axis = dict(zip("xyz", signs, strict=True))
-    return np.array([np.prod([by_axis[axis] for axis in odd]) for odd in _ODD], np.float32)
+    direction = np.array([[1.0, 2.0, 4.0]]) / 21**0.5  # where none of them is 0
+    return np.asarray(np.sign(sh_basis(direction, 3) * sh_basis(direction * signs, 3))[0], np.float32)
 
 
 def quaternion_signs(signs: Signs) -> Float32:

@@ -29,7 +29,7 @@ EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
 SPZ_EXTENSIONS = (SPZ_EXTENSION, "KHR_gaussian_splatting_compression_spz")
 """Names of the extension; the second is in the draft's own example."""
-UNDERSTOOD = {EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization", "KHR_materials_unlit"}
+UNDERSTOOD = (EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization", "KHR_materials_unlit")
 COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")
 
 JSON_CHUNK, BIN_CHUNK = 0x4E4F534A, 0x004E4942
@@ -145,9 +145,6 @@ class Asset:
         result[:3, :3] = Rotation.from_quat(rotation).as_matrix() * vector("scale", [1, 1, 1])
         result[:3, 3] = vector("translation", [0, 0, 0])
         return result
-
-    def extension(self, primitive: dict[str, Any]) -> dict[str, Any]:
-        return as_object(primitive["extensions"][EXTENSION])
 
     def accessor(self, index: object, width: int, semantic: str) -> Array:
         """(count, width), as it lies in the file."""

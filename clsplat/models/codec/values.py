@@ -6,6 +6,7 @@ Colours in formats of bytes are 0.5 + C0 times SH coefficient 0, opacities lie i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,6 +19,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import C0
 
 BLOCK_ROWS = 1 << 15
+"""Rows that are read or written at once: whole chunks of the compressed PLY."""
 LEAST_SCALE = 2.0**-149
 """Value for a scale of 0, whose log has to be finite: float32's least."""
 FREE_COUNT = 1 << 20
@@ -43,6 +45,11 @@ def empty(count: int, degree: int) -> Gaussians:
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, (degree + 1) ** 2, 3))
     arrays: list[Any] = [np.empty(shape, np.float32) for shape in shapes]
     return Gaussians(*arrays)
+
+
+def row_blocks(count: int, most: int = BLOCK_ROWS) -> Iterator[slice]:
+    """The rows 0 to `count`, at most so many at a time."""
+    return (slice(start, min(start + most, count)) for start in range(0, count, most))
 
 
 def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) -> Float64:

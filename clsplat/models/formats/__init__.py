@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float64
 from clsplat.camera import NEAR, NEARS
 from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
@@ -42,8 +41,8 @@ class Format:
 
     loses: what the format does not keep, in a few words; floats: True if it keeps floats; sh_degree: the highest that
     it holds; describe(path): the format's part of `clsplat info`; order(gaussians): (n,), the Gaussian of each row of
-    a written file, None for their own order; blocks(path): the origin, and the Gaussians in the world some rows at a
-    time, for a format that need not be held whole; side_files(path): the other files of a model of this name.
+    a written file, None for their own order; blocks(path): the Gaussians in the world some rows at a time, for a format
+    that need not be held whole; side_files(path): the other files of a model of this name.
     """
 
     name: str
@@ -57,7 +56,7 @@ class Format:
     sh_degree: int = MAX_SH_DEGREE
     describe: Callable[[Path], dict[str, Any]] = lambda _: {}
     order: Callable[[Gaussians], NDArray[np.int64]] | None = None
-    blocks: Callable[[Path], tuple[Float64, Iterator[Gaussians]]] | None = None
+    blocks: Callable[[Path], Iterator[Gaussians]] | None = None
     side_files: Callable[[Path], list[Path]] = lambda _: []
 
 

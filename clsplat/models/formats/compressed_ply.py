@@ -33,7 +33,6 @@ from clsplat.models.codec import values as packing
 from clsplat.models.formats import ply
 
 CHUNK = 256
-BLOCK_ROWS = 64 * CHUNK
 MAX_LOG_SCALE = 20.0
 BOUNDS = tuple(
     f"{end}_{name}"
@@ -64,16 +63,15 @@ def read(path: Path) -> Gaussians:
         bounds = _bounds(file, header, chunks)
         rest = [] if sh is None else [f"f_rest_{index}" for index in range(len(sh.properties))]
         result = packing.empty(vertex.count, {0: 0, 9: 1, 24: 2, 45: 3}[len(rest)])
-        for start in range(0, vertex.count, BLOCK_ROWS):
-            count = min(BLOCK_ROWS, vertex.count - start)
-            block = _rows(file, header, vertex, start, count)
-            _unpack(block, bounds[np.arange(start, start + count) // CHUNK], result, slice(start, start + count))
+        for rows in packing.row_blocks(vertex.count):
+            block = _rows(file, header, vertex, rows)
+            _unpack(block, bounds[np.arange(rows.start, rows.stop) // CHUNK], result, rows)
             if sh is not None:
-                table = _rows(file, header, sh, start, count)
+                table = _rows(file, header, sh, rows)
                 columns = np.stack([table[name] for name in rest], axis=1).astype(np.float32)
                 steps = np.where(columns == 0, 0, np.where(columns == 255, 256, columns + np.float32(0.5)))
                 values = (steps / 256 - 0.5) * 8
-                result.sh[start : start + count, 1:] = values.reshape(count, 3, -1).transpose(0, 2, 1)
+                result.sh[rows, 1:] = values.reshape(len(values), 3, -1).transpose(0, 2, 1)
     packing.require_finite(path, result)
     return result
 
@@ -88,23 +86,23 @@ def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> 
     """Write it, atomically, the Gaussians in the order of `order`. comments: lines of the header, in ASCII."""
     ply.check_comments(comments)
     packing.check_writable(path, gaussians)
-    rows, count = order(gaussians), len(gaussians)
+    count, in_order = len(gaussians), order(gaussians)
     rest = 3 * (gaussians.sh.shape[1] - 1)
     lines = ["ply", "format binary_little_endian 1.0", "comment clsplat"]
     lines += [f"comment {line}" for line in comments]
     lines += [f"element chunk {-(-count // CHUNK)}", *(f"property float {name}" for name in BOUNDS)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
     lines += [f"element sh {count}", *(f"property uchar f_rest_{index}" for index in range(rest))] if rest else []
-    starts = range(0, count, BLOCK_ROWS)
-    bounds = [_ranges(*_values(gaussians, rows[start : start + BLOCK_ROWS])) for start in starts]
+    blocks = [in_order[rows] for rows in packing.row_blocks(count)]
+    bounds = [_ranges(*_values(gaussians, rows)) for rows in blocks]
     with atomic_writer(path) as file:
         file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
         for block in bounds:
             file.write(block.astype("<f4").tobytes())
-        for start, block in zip(starts, bounds, strict=True):
-            file.write(_pack(gaussians, rows[start : start + BLOCK_ROWS], block).tobytes())
-        for start in starts if rest else ():
-            sh = gaussians.sh[rows[start : start + BLOCK_ROWS], 1:].transpose(0, 2, 1)
+        for rows, block in zip(blocks, bounds, strict=True):
+            file.write(_pack(gaussians, rows, block).tobytes())
+        for rows in blocks if rest else ():
+            sh = gaussians.sh[rows, 1:].transpose(0, 2, 1)
             file.write(np.clip(np.floor((sh / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
 
 
@@ -146,15 +144,15 @@ def _elements(header: ply.Header) -> tuple[ply.Element, ply.Element, ply.Element
     return chunks, vertex, sh
 
 
-def _rows(file: BinaryIO, header: ply.Header, element: ply.Element, start: int, count: int) -> NDArray[Any]:
+def _rows(file: BinaryIO, header: ply.Header, element: ply.Element, rows: slice) -> NDArray[Any]:
     kind = header.row_type(element)
-    file.seek(header.start(header.elements.index(element)) + start * kind.itemsize)
-    return packing.read_rows(file, kind, count, header.path)
+    file.seek(header.start(header.elements.index(element)) + rows.start * kind.itemsize)
+    return packing.read_rows(file, kind, rows.stop - rows.start, header.path)
 
 
 def _bounds(file: BinaryIO, header: ply.Header, chunks: ply.Element) -> NDArray[np.float32]:
     """(chunks, 3, 2, 3): of position, log scale and colour, the least and the largest."""
-    table = _rows(file, header, chunks, 0, chunks.count)
+    table = _rows(file, header, chunks, slice(0, chunks.count))
     bounds = np.zeros((chunks.count, 18), np.float32)
     bounds[:, 15:] = 1
     for index, name in enumerate(BOUNDS):

@@ -23,7 +23,7 @@ from __future__ import annotations
 import io
 import json
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,13 +43,13 @@ from clsplat.models.codec.gltf_asset import (
     JSON_CHUNK,
     SPZ_EXTENSION,
     SPZ_EXTENSIONS,
+    WIDTHS,
     Array,
     Asset,
     as_object,
     real,
     sh_attributes,
 )
-from clsplat.models.codec.values import BLOCK_ROWS
 from clsplat.models.edit import merge
 from clsplat.models.formats import spz
 from clsplat.spherical_harmonics import C0
@@ -57,6 +57,8 @@ from clsplat.spherical_harmonics import C0
 GLB_MAGIC = 0x46546C67
 FLOAT32, UINT16 = 5126, 5123
 LARGEST_GLB = (1 << 32) - 1
+Rows = Callable[[slice], Array]
+"""An attribute: what gives some of its rows."""
 
 
 def recognises(head: bytes) -> bool:
@@ -68,7 +70,7 @@ def describe(path: Path) -> dict[str, Any]:
     """Colour space and compression in the extension of the first primitive that has it."""
     asset = Asset.open(path)
     for _, _, primitive in asset.primitives():
-        said = asset.extension(primitive)
+        said = as_object(primitive["extensions"][EXTENSION])
         compression = next((name for name in SPZ_EXTENSIONS if name in as_object(said.get("extensions"))), "none")
         return {"color_space": str(said.get("colorSpace", "")), "compression": compression}
     return {}
@@ -97,7 +99,7 @@ def read(path: Path) -> Gaussians:
 
 def _gaussians(asset: Asset, name: str, primitive: dict[str, Any]) -> Gaussians:
     """The primitive's Gaussians in our frame."""
-    said = asset.extension(primitive)
+    said = as_object(primitive["extensions"][EXTENSION])
     kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
     if kernel != "ellipse":
         raise InputError(f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse")
@@ -124,27 +126,21 @@ def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussi
     values.require_count(asset.path, asset.total if count else 0, size)
     names = [sh_attributes(degree) for degree in range(MAX_SH_DEGREE + 1)]
     degree = max((degree for degree in range(4) if indices.keys() & set(names[degree])), default=0)
-    sources = {
-        "means": position,
-        "quaternions": array(f"{EXTENSION}:ROTATION", 4),
-        "log_scales": array(f"{EXTENSION}:SCALE", 3),
-        "opacities": array(f"{EXTENSION}:OPACITY", 1),
-    }
+    widths = {"ROTATION": 4, "SCALE": 3, "OPACITY": 1}
+    rotation, scale, opacity = (array(f"{EXTENSION}:{key}", width) for key, width in widths.items())
     coefficients = [array(semantic, 3) for band in names[: degree + 1] for semantic in band]
-    for attribute in (*sources.values(), *coefficients):
+    for attribute in (rotation, scale, opacity, *coefficients):
         if len(attribute) != count:
             raise InputError(f"{asset.path}: {name} has {len(attribute)} values of an attribute, expected {count}")
     result = values.empty(count, degree)
-    for first in range(0, count, BLOCK_ROWS):
-        rows = slice(first, min(first + BLOCK_ROWS, count))
+    for rows in values.row_blocks(count):
         result.means[rows] = real(position[rows])
-        result.quaternions[rows] = real(sources["quaternions"][rows])[:, [3, 0, 1, 2]]
-        scales = real(sources["log_scales"][rows])
-        result.log_scales[rows] = values.log_scales(scales, f"{asset.path}: {name}", first)
-        opacity = real(sources["opacities"][rows])[:, 0]
-        if not ((opacity >= 0) & (opacity <= 1)).all():
+        result.quaternions[rows] = real(rotation[rows])[:, [3, 0, 1, 2]]
+        result.log_scales[rows] = values.log_scales(real(scale[rows]), f"{asset.path}: {name}", rows.start)
+        opacities = real(opacity[rows])[:, 0]
+        if not ((opacities >= 0) & (opacities <= 1)).all():
             raise InputError(f"{asset.path}: {name} has an opacity outside [0, 1]")
-        result.opacity_logits[rows] = values.logits(opacity)
+        result.opacity_logits[rows] = values.logits(opacities)
         for index, coefficient in enumerate(coefficients):
             result.sh[rows, index] = real(coefficient[rows])
     axes.flip(result, LEFT_UP)
@@ -185,46 +181,42 @@ def write(
         file.write(bytes(padded - length))
 
 
-def _layout(name: str) -> tuple[str, int, int]:
-    """Type, component type, and bytes of one Gaussian."""
-    if name == "COLOR_0":
-        return "VEC4", UINT16, 8
-    width = {"ROTATION": 4, "OPACITY": 1}.get(name.partition(":")[2], 3)
-    return {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width], FLOAT32, 4 * width
+def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
+    """The attributes by name, in the order of the buffer and in glTF's frame."""
+
+    def rotation(rows: slice) -> Array:
+        unit = values.unit_quaternions(gaussians.quaternions[rows]) * axes.quaternion_signs(LEFT_UP)
+        return unit[:, [1, 2, 3, 0]].astype(np.float32)
+
+    def opacity(rows: slice) -> Array:
+        return values.opacities(gaussians.opacity_logits[rows])
+
+    def coefficient(index: int) -> Rows:
+        return lambda rows: gaussians.sh[rows, index] * axes.sh_signs(LEFT_UP)[index]
+
+    def color(rows: slice) -> Array:
+        colors = np.clip(gaussians.sh[rows, 0] * np.float32(C0) + np.float32(0.5), 0, 1)
+        if color_space == COLOR_SPACES[0]:
+            colors = srgb_to_linear(colors)
+        return np.asarray(np.rint(np.column_stack([colors, opacity(rows)]) * 65535), np.uint16)
+
+    coefficients = [name for degree in range(gaussians.sh_degree + 1) for name in sh_attributes(degree)]
+    return {
+        "POSITION": lambda rows: gaussians.means[rows] * np.array(LEFT_UP, np.float32),
+        f"{EXTENSION}:ROTATION": rotation,
+        f"{EXTENSION}:SCALE": lambda rows: np.exp(np.clip(gaussians.log_scales[rows], -103.0, 88.0)),
+        f"{EXTENSION}:OPACITY": lambda rows: opacity(rows).astype(np.float32),
+        **{name: coefficient(index) for index, name in enumerate(coefficients)},
+        "COLOR_0": color,
+    }
 
 
-def _block(name: str, gaussians: Gaussians, rows: slice, color_space: str) -> Array:
-    """Some rows of an attribute, in glTF's frame."""
-    block: Array
-    match name.partition(":")[2] or name:
-        case "POSITION":
-            block = (gaussians.means[rows] * np.array(LEFT_UP, np.float32)).astype("<f4")
-        case "ROTATION":
-            unit = values.unit_quaternions(gaussians.quaternions[rows])
-            block = (unit * axes.quaternion_signs(LEFT_UP))[:, [1, 2, 3, 0]].astype("<f4")
-        case "SCALE":
-            block = np.exp(np.clip(gaussians.log_scales[rows], -103.0, 88.0)).astype("<f4")
-        case "OPACITY":
-            block = values.opacities(gaussians.opacity_logits[rows]).astype("<f4")
-        case "COLOR_0":
-            colors = np.clip(gaussians.sh[rows, 0] * np.float32(C0) + np.float32(0.5), 0, 1)
-            if color_space == COLOR_SPACES[0]:
-                colors = srgb_to_linear(colors)
-            opacity = values.opacities(gaussians.opacity_logits[rows])
-            block = np.rint(np.column_stack([colors, opacity]) * 65535).astype("<u2")
-        case coefficient:
-            _, _, degree, _, index = coefficient.split("_")
-            k = int(degree) ** 2 + int(index)
-            block = (gaussians.sh[rows, k] * axes.sh_signs(LEFT_UP)[k]).astype("<f4")
-    return block
-
-
-def _blocks(names: list[str], gaussians: Gaussians, color_space: str) -> Iterator[memoryview]:
+def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
     """The attributes one after another."""
-    for name in names:
-        for first in range(0, len(gaussians), BLOCK_ROWS):
-            block = _block(name, gaussians, slice(first, first + BLOCK_ROWS), color_space)
-            yield np.ascontiguousarray(block).data
+    for rows_of in attributes:
+        for rows in values.row_blocks(count):
+            block = rows_of(rows)
+            yield np.ascontiguousarray(block, block.dtype.newbyteorder("<")).data
 
 
 def _document(
@@ -232,15 +224,15 @@ def _document(
 ) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
     """The JSON but for its buffers, and the contents of the one buffer."""
     count = len(gaussians)
-    attributes = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))]
-    attributes += [name for degree in range(gaussians.sh_degree + 1) for name in sh_attributes(degree)]
-    attributes.append("COLOR_0")
+    attributes = _attributes(gaussians, color_space)
+    samples = {name: rows_of(slice(0, 1)) for name, rows_of in attributes.items()}
+    kinds = {width: kind for kind, width in WIDTHS.items()}
     corners = [gaussians.means.min(axis=0) * LEFT_UP, gaussians.means.max(axis=0) * LEFT_UP]
     bounds = {"min": np.minimum(*corners).tolist(), "max": np.maximum(*corners).tolist()}
     accessors: list[dict[str, Any]] = []
-    for index, name in enumerate(attributes):
-        kind, component, _ = _layout(name)
-        accessor: dict[str, Any] = {"componentType": component, "count": count, "type": kind}
+    for index, (name, sample) in enumerate(samples.items()):
+        component = UINT16 if name == "COLOR_0" else FLOAT32
+        accessor: dict[str, Any] = {"componentType": component, "count": count, "type": kinds[sample.size]}
         accessor |= {} if spz_compression else {"bufferView": index}
         accessor |= bounds if name == "POSITION" else {}
         accessor |= {"normalized": True} if component == UINT16 else {}
@@ -268,8 +260,8 @@ def _document(
         said["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
         document["bufferViews"] = [{"buffer": 0, "byteLength": len(contents[0])}]
     else:
-        contents = _blocks(attributes, gaussians, color_space)
-        sizes = [_layout(name)[2] * count for name in attributes]
+        contents = _blocks(attributes.values(), count)
+        sizes = [sample.nbytes * count for sample in samples.values()]
         offsets = np.cumsum([0, *sizes]).tolist()
         views = zip(offsets, sizes, strict=False)
         target = 34962  # ARRAY_BUFFER

@@ -23,7 +23,6 @@ from clsplat.errors import InputError
 from clsplat.files import open_input
 from clsplat.gaussians import Gaussians
 from clsplat.models.codec import values as packing
-from clsplat.models.codec.values import BLOCK_ROWS
 
 HEADER = np.dtype(
     {
@@ -87,11 +86,11 @@ def read(path: Path) -> Gaussians:
         first = 0
         for section in sections:
             file.seek(section.start)
-            for start in range(0, section.count, BLOCK_ROWS):
-                block = packing.read_rows(file, section.kind, min(BLOCK_ROWS, section.count - start), path)
-                rows = slice(first + start, first + start + len(block))
+            for part in packing.row_blocks(section.count):
+                block = packing.read_rows(file, section.kind, part.stop - part.start, path)
+                rows = slice(first + part.start, first + part.stop)
                 with np.errstate(invalid="ignore", over="ignore"):  # refused below
-                    gaussians.means[rows] = _means(section, block, start)
+                    gaussians.means[rows] = _means(section, block, part)
                     gaussians.log_scales[rows] = packing.log_scales(block["scales"], path, rows.start)
                     _higher_sh(gaussians, rows, section.degree, block["sh"], (low, high))
                 gaussians.quaternions[rows] = block["quaternions"]
@@ -167,10 +166,10 @@ def _ends(head: dict[str, Any], partial: NDArray[np.int64], name: str) -> NDArra
     return ends
 
 
-def _means(section: Section, block: NDArray[Any], start: int) -> NDArray[Any]:
+def _means(section: Section, block: NDArray[Any], rows: slice) -> NDArray[Any]:
     if section.centres is None or section.ends is None:
         return block["means"]
-    bucket = np.searchsorted(section.ends, np.arange(start, start + len(block)), side="right")
+    bucket = np.searchsorted(section.ends, np.arange(rows.start, rows.stop), side="right")
     return (block["means"].astype(np.float64) - section.middle) * section.step + section.centres[bucket]
 
 

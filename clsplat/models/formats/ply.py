@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from math import isqrt
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Float32, Float64, numbers
 from clsplat.camera import NEAR
 from clsplat.config.checks import misfit
 from clsplat.errors import InputError, examples, warn
@@ -141,22 +141,17 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         return gaussians
 
 
-def blocks(path: Path) -> tuple[Float64, Iterator[Gaussians]]:
-    """The origin, and the Gaussians in the file's order, some rows at a time, in the world; values that are not finite
-    are passed on. Raises InputError as `read`."""
+def blocks(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians in the file's order, some rows at a time, in the world, each block with the file's origin; values
+    that are not finite are passed on. Raises InputError as `read`."""
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
-    return np.zeros(3) if header.origin is None else header.origin, _read_blocks(header)
-
-
-def _read_blocks(header: Header) -> Iterator[Gaussians]:
-    with open_input(header.path, "a 3DGS PLY") as file:
-        file.seek(header.size)
         rest = _check_properties(header)
+        origin = np.zeros(3) if header.origin is None else header.origin
         if header.vertex.count == 0:
-            yield values.empty(0, _degree(rest))
+            yield replace(values.empty(0, _degree(rest)), origin=origin)
         for block in read_vertices(file, header, "Gaussian") if header.vertex.count else ():
-            gaussians = values.empty(len(block["x"]), _degree(rest))
+            gaussians = replace(values.empty(len(block["x"]), _degree(rest)), origin=origin)
             _fill(gaussians, block, rest)
             yield gaussians
 
@@ -202,15 +197,13 @@ def write(
     head = "\n".join(lines).encode("ascii")
     with atomic_writer(path, len(head) + 4 * count * (len(names) + (3 if far else 0))) as file:
         file.write(head)
-        for start in range(0, len(gaussians), BLOCK_ROWS):
-            rows = slice(start, start + BLOCK_ROWS)
+        for rows in values.row_blocks(count, BLOCK_ROWS):
             sh = gaussians.sh[rows]
             block = np.zeros((len(sh), len(names)), "<f4")
             block[:, 0:3] = gaussians.means[rows] + gaussians.origin if far else gaussians.means[rows]
             block[:, 6:9] = sh[:, 0]
-            rest = block[:, 9 : 9 + 3 * padded]
-            for channel in range(3):
-                rest[:, channel * padded : channel * padded + stored] = sh[:, 1:, channel]
+            rest = block[:, 9 : 9 + 3 * padded].reshape(len(sh), 3, padded)  # a view
+            rest[:, :, :stored] = sh[:, 1:].transpose(0, 2, 1)
             block[:, -8] = gaussians.opacity_logits[rows]
             block[:, -7:-4] = gaussians.log_scales[rows]
             block[:, -4:] = gaussians.quaternions[rows]
@@ -240,11 +233,11 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             break
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
-            numbers = _numbers(words[3:])
+            given = numbers(words[3:])  # none where the comment is not one of ours after all
             if words[:3] == ORIGIN:
-                origin = numbers if len(numbers) == 3 else None
+                origin = given if len(given) == 3 and np.isfinite(given).all() else None
             if words[:3] == NEAR_PLANE:
-                near = float(numbers[0]) if len(numbers) == 1 and numbers[0] > 0 else NEAR
+                near = float(given[0]) if len(given) == 1 and 0 < given[0] < np.inf else NEAR
             comments += [" ".join(words[1:])] if words else []
             continue
         if words == ["end_header"]:
@@ -269,15 +262,6 @@ def read_header(file: BinaryIO, path: Path) -> Header:
                 f"{path}: PLY header has a line that is of no PLY header: {' '.join(words)[:80]!r}"
             ) from None
     raise InputError(f"{path}: PLY header is truncated or damaged (no line 'end_header')")
-
-
-def _numbers(words: list[str]) -> Float64:
-    """Finite numbers; none where the comment is not one of ours after all."""
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        return np.empty(0)
-    return values if np.isfinite(values).all() else np.empty(0)
 
 
 def _local_means(file: BinaryIO, header: Header) -> Float32 | None:

@@ -22,6 +22,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,8 @@ from clsplat.models.codec.palette import codebook, nearest, palette
 from clsplat.progress import Progress, no_progress
 
 Bytes = NDArray[np.uint8]
+PictureFile = Callable[[str, int], Path]
+"""Gives the file of a picture by its name, and by the most bytes that it may have in an archive."""
 
 META = "meta.json"
 PICTURES = ("means", "quats", "scales", "sh0", "shN")
@@ -69,9 +72,8 @@ def recognises(head: bytes) -> bool:
 
 def describe(path: Path) -> dict[str, Any]:
     """Version and antialiasing in meta.json."""
-    with _opened(path) as files:
-        meta = files.meta()
-    return {"version": meta.get("version", 1), "antialiased": bool(meta.get("antialias", False))}
+    with _opened(path) as (_, meta, _):
+        return {"version": meta.get("version", 1), "antialiased": bool(meta.get("antialias", False))}
 
 
 def side_files(path: Path) -> list[Path]:
@@ -82,78 +84,18 @@ def side_files(path: Path) -> list[Path]:
 
 def read(path: Path) -> Gaussians:
     """Read a .sog, or a meta.json with its pictures, or the folder that has them. Raises InputError."""
-    with _opened(path) as files:
-        model = _Meta(files).gaussians()
+    with _opened(path) as opened:
+        model = _Meta(*opened).gaussians()
     packing.require_finite(path, model)
     return model
 
 
-class _Files:
-    """The pictures beside a meta.json."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path / META if path.is_dir() else path
-
-    def meta(self) -> dict[str, Any]:
-        return self.parsed(read_document(self.path, "SOG's meta.json"))
-
-    def parsed(self, text: str | bytes) -> dict[str, Any]:
-        try:
-            meta = parse_json(text)
-        except ValueError as error:
-            raise InputError(f"{self.path}: {META} does not parse ({error})") from None
-        if not isinstance(meta, dict) or "means" not in meta:
-            raise InputError(f"{self.path}: {META} has no means, expected that of a SOG model")
-        return meta
-
-    def file(self, name: str, limit: int) -> Path:  # noqa: ARG002  # an archive needs the limit
-        folder = Path(os.path.realpath(self.path)).parent
-        try:
-            picture = Path(os.path.realpath(folder / name))
-        except ValueError:  # a zero byte
-            picture = folder
-        if picture.parent != folder:
-            raise InputError(f"{self.path}: has a picture {name[:80]!r}, expected one beside it")
-        if not is_file(picture):
-            raise InputError(f"{self.path}: its picture {name} is missing")
-        return picture
-
-
-class _Archive(_Files):
-    """The files in a .sog, unpacked one by one into a folder for a while."""
-
-    def __init__(self, path: Path, archive: zipfile.ZipFile, folder: Path) -> None:
-        super().__init__(path)
-        self.archive, self.folder = archive, folder
-
-    def meta(self) -> dict[str, Any]:
-        return self.parsed(self.file(META, MAX_DOCUMENT).read_bytes())
-
-    def file(self, name: str, limit: int) -> Path:
-        target = self.folder / f"file{META[-5:] if name == META else '.webp'}"
-        try:
-            with self.archive.open(name) as source, target.open("wb") as file:
-                left = limit
-                while block := source.read(min(1 << 20, left + 1)):
-                    left -= len(block)
-                    if left < 0:
-                        raise InputError(f"{self.path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
-                    try:
-                        file.write(block)
-                        file.flush()  # here and not at the end, where it would seem that reading failed
-                    except OSError as error:
-                        raise write_error(target, error) from None
-        except KeyError:
-            raise InputError(f"{self.path}: has no {name[:80]} in it") from None
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
-            raise InputError(f"{self.path}: {name[:80]} does not unpack ({error}); is it damaged?") from None
-        return target
-
-
 @contextmanager
-def _opened(path: Path) -> Iterator[_Files]:
+def _opened(path: Path) -> Iterator[tuple[Path, dict[str, Any], PictureFile]]:
+    """The file that messages name, what meta.json says, and what makes a picture's name a file."""
     if path.is_dir() or path.name.lower().endswith(".json"):
-        yield _Files(path)
+        path = path / META if path.is_dir() else path
+        yield path, _parsed(path, read_document(path, "SOG's meta.json")), partial(_beside, path)
         return
     with open_input(path, "a .sog archive") as file, scratch_folder(0) as folder:
         try:
@@ -161,15 +103,60 @@ def _opened(path: Path) -> Iterator[_Files]:
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
             raise InputError(f"{path}: is no .sog archive ({error})") from None
         with archive:
-            yield _Archive(path, archive, folder)
+            unpacked = partial(_unpacked, path, archive, folder / "file.webp")
+            yield path, _parsed(path, unpacked(META, MAX_DOCUMENT).read_bytes()), unpacked
+
+
+def _parsed(path: Path, text: str | bytes) -> dict[str, Any]:
+    try:
+        meta = parse_json(text)
+    except ValueError as error:
+        raise InputError(f"{path}: {META} does not parse ({error})") from None
+    if not isinstance(meta, dict) or "means" not in meta:
+        raise InputError(f"{path}: {META} has no means, expected that of a SOG model")
+    return meta
+
+
+def _beside(path: Path, name: str, _limit: int) -> Path:
+    """A picture beside a meta.json."""
+    folder = Path(os.path.realpath(path)).parent
+    try:
+        picture = Path(os.path.realpath(folder / name))
+    except ValueError:  # a zero byte
+        picture = folder
+    if picture.parent != folder:
+        raise InputError(f"{path}: has a picture {name[:80]!r}, expected one beside it")
+    if not is_file(picture):
+        raise InputError(f"{path}: its picture {name} is missing")
+    return picture
+
+
+def _unpacked(path: Path, archive: zipfile.ZipFile, target: Path, name: str, limit: int) -> Path:
+    """A file in a .sog, of at most so many bytes, unpacked to the target."""
+    try:
+        with archive.open(name) as source, target.open("wb") as file:
+            left = limit
+            while block := source.read(min(1 << 20, left + 1)):
+                left -= len(block)
+                if left < 0:
+                    raise InputError(f"{path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
+                try:
+                    file.write(block)
+                    file.flush()  # here and not at the end, where it would seem that reading failed
+                except OSError as error:
+                    raise write_error(target, error) from None
+    except KeyError:
+        raise InputError(f"{path}: has no {name[:80]} in it") from None
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise InputError(f"{path}: {name[:80]} does not unpack ({error}); is it damaged?") from None
+    return target
 
 
 class _Meta:
     """meta.json, and what it leads to."""
 
-    def __init__(self, files: _Files) -> None:
-        self.files, self.path, meta = files, files.path, files.meta()
-        self.meta = meta
+    def __init__(self, path: Path, meta: dict[str, Any], file: PictureFile) -> None:
+        self.path, self.meta, self.file = path, meta, file
         self.version = meta.get("version", 1)
         if self.version not in (1, 2):
             raise InputError(f"{self.path}: SOG version {str(self.version)[:20]}, expected 1 or 2")
@@ -200,7 +187,7 @@ class _Meta:
         if not isinstance(names, list) or len(names) <= index or not isinstance(names[index], str):
             raise InputError(f"{self.path}: {section} in {META} has no file {index}")
         least = self.count if least is None else least
-        file = self.files.file(names[index], FREE_BYTES + 8 * least)
+        file = self.file(names[index], FREE_BYTES + 8 * least)
         try:
             source = open_image(file)
             spec = source.spec()

@@ -37,11 +37,10 @@ def read(path: Path) -> Gaussians:
         _check_first(values.read_rows(file, ROW, min(BLOCK_ROWS, count), path), path)
         file.seek(0)
         result = values.empty(count, 0)
-        for start in range(0, count, BLOCK_ROWS):
-            block = values.read_rows(file, ROW, min(BLOCK_ROWS, count - start), path)
-            rows = slice(start, start + len(block))
+        for rows in values.row_blocks(count):
+            block = values.read_rows(file, ROW, rows.stop - rows.start, path)
             result.means[rows] = block["means"]
-            result.log_scales[rows] = values.log_scales(block["scales"], path, start)
+            result.log_scales[rows] = values.log_scales(block["scales"], path, rows.start)
             result.sh[rows, 0] = values.coefficients(block["rgba"][:, :3] / 255)
             result.opacity_logits[rows] = values.byte_logits()[block["rgba"][:, 3]]
             result.quaternions[rows] = block["quaternions"].astype(np.float32) / 128 - 1
@@ -60,9 +59,8 @@ def write(path: Path, gaussians: Gaussians) -> None:
     """Write it, atomically."""
     values.check_writable(path, gaussians)
     with atomic_writer(path, ROW.itemsize * len(gaussians)) as file:
-        for start in range(0, len(gaussians), BLOCK_ROWS):
-            rows = slice(start, start + BLOCK_ROWS)
-            block: Any = np.empty(len(gaussians.means[rows]), ROW)
+        for rows in values.row_blocks(len(gaussians)):
+            block: Any = np.empty(rows.stop - rows.start, ROW)
             block["means"] = values.world_means(gaussians, rows)
             with np.errstate(over="ignore"):  # a scale beyond float32 is cut
                 scales = np.exp(gaussians.log_scales[rows].astype(np.float64))

@@ -18,7 +18,6 @@ for all Gaussians: positions, alphas, colours, scales, rotations, spherical harm
 from __future__ import annotations
 
 import gzip
-import io
 import os
 import struct
 import zlib
@@ -29,15 +28,17 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError, warn
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
-from clsplat.models.codec import spz_bytes, values
+from clsplat.models.codec import values
 from clsplat.models.codec.axes import UP_BACK, Signs, flip, quaternion_signs, sh_signs
-from clsplat.models.codec.values import BLOCK_ROWS
 
-MAGIC = b"NGSP"
+MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
+Bytes = NDArray[np.uint8]
 Stream = Any
 """A file, or a reader of gzip or Zstandard."""
 VERSIONS = (2, 3, 4)
@@ -57,6 +58,7 @@ MAX_EXTENSIONS = 1 << 20
 MAX_WINDOW = 1 << 27
 """Bytes that a Zstandard frame may have the decoder keep: the library's own limit."""
 COLOUR_SCALE = 0.15 * 255
+ROOT_HALF = 0.5**0.5
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Header:
 
 def recognises(head: bytes) -> bool:
     """True if a file begins as one of this format."""
-    if head[:2] != b"\x1f\x8b":
+    if head[:2] != GZIP:
         return head.startswith(MAGIC)
     try:
         return zlib.decompressobj(31).decompress(head, 4) == MAGIC
@@ -112,13 +114,13 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
         warn(f"{path}: trained with anti-aliasing, which this renderer does not do")
     result = values.empty(header.count, min(header.degree, MAX_SH_DEGREE))
     if header.version == 4:
-        signs = _frame(_records(file.read(header.table - 32), path), path) if header.flags & HAS_EXTENSIONS else UP_BACK
+        signs = _frame(file.read(header.table - 32), path) if header.flags & HAS_EXTENSIONS else UP_BACK
         _unpack(_zstd_streams(file, header, size, path), header, signs, result, path)
         return result
     assert stream is not None
     _unpack(((name, stream) for name in header.widths), header, UP_BACK, result, path)
     behind = _rest(stream, path)
-    if header.flags & HAS_EXTENSIONS and (signs := _frame(_records(behind, path), path)) != UP_BACK:
+    if header.flags & HAS_EXTENSIONS and (signs := _frame(behind, path)) != UP_BACK:
         flip(result, (signs[0] * UP_BACK[0], signs[1] * UP_BACK[1], signs[2] * UP_BACK[2]))
     elif behind and not header.flags & HAS_EXTENSIONS:
         warn(f"{path}: bytes after the last Gaussian ignored")
@@ -139,16 +141,11 @@ def _open(file: BinaryIO, size: int, path: Path) -> tuple[Header, Any]:
         if not 32 <= header.table <= min(32 + MAX_EXTENSIONS, size - 16 * expected):
             raise InputError(f"{path}: SPZ's table of streams is at byte {header.table} of {size}; is it damaged?")
         return header, None
-    if head[:2] == b"\x1f\x8b":
-        file.seek(0)
-        stream: Any = gzip.GzipFile(fileobj=file, mode="rb")
-    elif head[:4] == MAGIC:
-        file.seek(0)
-        stream = file
-    else:
+    if head[:2] != GZIP and head[:4] != MAGIC:
         raise InputError(f"{path}: not an SPZ file (it begins with neither gzip's signature nor NGSP)")
-    start = bytearray(16)
-    _fill(stream, memoryview(start), path, "the header")
+    file.seek(0)
+    stream = gzip.GzipFile(fileobj=file, mode="rb") if head[:2] == GZIP else file
+    start = _next(stream, 16, path, "the header")
     if start[:4] != MAGIC:
         raise InputError(f"{path}: not an SPZ file (a gzip file of something else)")
     header = Header(*struct.unpack("<IIBBB", start[4:15]))
@@ -165,20 +162,17 @@ def _check(header: Header, path: Path) -> None:
         raise InputError(f"{path}: SPZ has {header.fractional_bits} fractional bits, expected at most 31")
 
 
-def _records(data: bytes, path: Path) -> dict[int, bytes]:
-    """Extensions by their type. Each is its type and its length, 32 bits each, and then its bytes."""
-    records, at = {}, 0
-    while len(data) - at >= 8:
-        kind, length = struct.unpack_from("<II", data, at)
-        if length > len(data) - at - 8:
+def _frame(extensions: bytes, path: Path) -> Signs:
+    """The signs of the axes. An extension is its type and its length, 32 bits each, and then its bytes."""
+    at, system = 0, b""
+    while len(extensions) - at >= 8:
+        kind, length = struct.unpack_from("<II", extensions, at)
+        if length > len(extensions) - at - 8:
             raise InputError(f"{path}: truncated: SPZ extension {kind:#x} of {length} bytes")
-        records[kind] = data[at + 8 : at + 8 + length]
         at += 8 + length
-    return records
-
-
-def _frame(records: dict[int, bytes], path: Path) -> Signs:
-    if len(system := records.get(COORDINATE_SYSTEM, b"")) != 4:
+        if kind == COORDINATE_SYSTEM:
+            system = extensions[at - length : at]
+    if len(system) != 4:
         return UP_BACK
     (value,) = struct.unpack("<I", system)
     if value >= len(FRAMES):
@@ -186,15 +180,15 @@ def _frame(records: dict[int, bytes], path: Path) -> Signs:
     return FRAMES[value]
 
 
-class _Slice(io.BytesIO):
+@dataclass
+class _Slice:
     """The next `left` bytes of a file."""
 
-    def __init__(self, file: BinaryIO, left: int) -> None:
-        super().__init__()
-        self.file, self.left = file, left
+    file: BinaryIO
+    left: int
 
-    def read(self, size: int | None = -1, /) -> bytes:
-        data = self.file.read(self.left if size is None or size < 0 else min(size, self.left))
+    def read(self, size: int) -> bytes:
+        data = self.file.read(min(size, self.left))
         self.left -= len(data)
         return data
 
@@ -214,7 +208,8 @@ def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iter
         file.seek(at)
         at += packed
         decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
-        with decompressor.stream_reader(_Slice(file, packed), read_size=1 << 18) as stream:
+        source: Any = _Slice(file, packed)
+        with decompressor.stream_reader(source, read_size=1 << 18) as stream:
             yield name, stream
             if _rest(stream, path):
                 raise InputError(f"{path}: {name} have more than {wanted} bytes unpacked")
@@ -222,14 +217,12 @@ def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iter
         warn(f"{path}: {size - at} bytes after the last Gaussian ignored")
 
 
-def _fill(stream: Stream, buffer: memoryview, path: Path, what: str) -> None:
-    at = 0
+def _next(stream: Stream, count: int, path: Path, what: str) -> bytes:
     with _decompressing(path, f"within {what}"):
-        while at < len(buffer):
-            got = stream.readinto(buffer[at:])
-            if not got:
-                raise EOFError
-            at += got
+        data: bytes = stream.read(count)
+        if len(data) < count:
+            raise EOFError
+    return data
 
 
 def _rest(stream: Any, path: Path) -> bytes:
@@ -252,21 +245,18 @@ def _decompressing(path: Path, place: str) -> Iterator[None]:
 
 
 def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs, result: Gaussians, path: Path) -> None:
-    buffer = bytearray(BLOCK_ROWS * max(header.widths.values()))
     alpha_logits = values.byte_logits()
     means_factor = np.array(signs, np.float32) * np.float32(0.5**header.fractional_bits)
     # as wide as the array: NumPy is several times slower where the last axis is short
     sh_factor = np.repeat(sh_signs(signs)[1 : result.sh.shape[1], None] / np.float32(128), 3, axis=1)
     for name, stream in streams:
         width = header.widths[name]
-        for first in range(0, header.count, BLOCK_ROWS):
-            rows = slice(first, min(first + BLOCK_ROWS, header.count))
-            view = memoryview(buffer)[: (rows.stop - first) * width]
-            _fill(stream, view, path, f"its {name}")
-            block = np.frombuffer(view, np.uint8).reshape(-1, width)
+        for rows in values.row_blocks(header.count):
+            data = _next(stream, (rows.stop - rows.start) * width, path, f"its {name}")
+            block = np.frombuffer(data, np.uint8).reshape(-1, width)
             match name:
                 case "positions":
-                    result.means[rows] = spz_bytes.fixed(block) * means_factor
+                    result.means[rows] = _fixed(block) * means_factor
                 case "alphas":
                     result.opacity_logits[rows] = alpha_logits[block[:, 0]]
                 case "colours":
@@ -274,13 +264,37 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
                 case "scales":
                     result.log_scales[rows] = block * np.float32(1 / 16) - np.float32(10)
                 case "rotations":
-                    unpack = spz_bytes.first_three if width == 3 else spz_bytes.smallest_three
+                    unpack = _first_three if width == 3 else _smallest_three
                     result.quaternions[rows] = unpack(block) * quaternion_signs(signs)
                 case _:
                     kept = result.sh.shape[1]
                     rest = result.sh[rows, 1:]
                     np.subtract(block.reshape(len(block), -1, 3)[:, : kept - 1], np.float32(128), out=rest)
                     rest *= sh_factor
+
+
+def _fixed(block: Bytes) -> Float32:
+    """Signed integers of 24 bits, (n, 9) -> (n, 3)."""
+    wide = np.zeros((len(block), 3, 4), np.uint8)
+    wide[:, :, 1:] = block.reshape(-1, 3, 3)
+    return (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32)
+
+
+def _first_three(block: Bytes) -> Float32:
+    """Version 2: (n, 3) of x y z -> (n, 4) quaternions w x y z."""
+    result = np.empty((len(block), 4), np.float32)
+    result[:, 1:] = block * np.float32(1 / 127.5) - np.float32(1)
+    result[:, 0] = np.sqrt(np.maximum(0, 1 - np.square(result[:, 1:]).sum(axis=1)))
+    return result
+
+
+def _smallest_three(block: Bytes) -> Float32:
+    """Quaternions w x y z, (n, 4), from bytes (n, 4) of version 3 and later."""
+    packed = np.ascontiguousarray(block).view("<u4")[:, 0]
+    fields = packed[:, None] >> np.array([20, 10, 0], np.uint32)
+    three = (fields & 511).astype(np.float32) * np.float32(ROOT_HALF / 511)
+    three = np.where(fields & 512, -three, three)
+    return values.restore_largest(packed >> 30, three)[:, [3, 0, 1, 2]]  # from x y z w
 
 
 def write(
@@ -367,22 +381,57 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
 def _pack(
     name: str, gaussians: Gaussians, header: Header, sh_bits: tuple[int, int], write: Callable[[bytes], object]
 ) -> None:
-    for first in range(0, header.count, BLOCK_ROWS):
-        rows = slice(first, first + BLOCK_ROWS)
+    for rows in values.row_blocks(header.count):
         match name:
             case "positions":
-                data = spz_bytes.to_fixed(values.world_means(gaussians, rows) * UP_BACK * 2.0**header.fractional_bits)
+                data = _to_fixed(values.world_means(gaussians, rows) * UP_BACK * 2.0**header.fractional_bits)
             case "alphas":
                 data = values.to_bytes(values.opacities(gaussians.opacity_logits[rows]))
             case "colours":
-                data = spz_bytes.to_byte(gaussians.sh[rows, 0] * np.float32(COLOUR_SCALE) + np.float32(127.5))
+                data = _to_byte(gaussians.sh[rows, 0] * np.float32(COLOUR_SCALE) + np.float32(127.5))
             case "scales":
-                data = spz_bytes.to_byte((gaussians.log_scales[rows] + np.float32(10)) * np.float32(16))
+                data = _to_byte((gaussians.log_scales[rows] + np.float32(10)) * np.float32(16))
             case "rotations":
-                unit = values.unit_quaternions(gaussians.quaternions[rows]).astype(np.float32) * quaternion_signs(
-                    UP_BACK
-                )
-                data = spz_bytes.to_first_three(unit) if header.version == 2 else spz_bytes.to_smallest_three(unit)
+                unit = values.unit_quaternions(gaussians.quaternions[rows]).astype(np.float32)
+                unit *= quaternion_signs(UP_BACK)
+                data = _to_first_three(unit) if header.version == 2 else _to_smallest_three(unit)
             case _:
-                data = spz_bytes.to_sh(gaussians.sh[rows, 1:], sh_bits)
+                data = _to_sh(gaussians.sh[rows, 1:], sh_bits)
         write(data.tobytes())
+
+
+def _to_byte(steps: Float32) -> Bytes:
+    """To the nearest from 0 to 255."""
+    return np.asarray(np.clip(np.floor(steps + np.float32(0.5)), 0, 255).astype(np.uint8))
+
+
+def _to_fixed(steps: Float64) -> Bytes:
+    """(n, 3) that fit into 24 bits -> (n, 3, 3), the low bytes first."""
+    return np.rint(steps).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
+
+
+def _to_first_three(unit: Float32) -> Bytes:
+    """Bytes (n, 3) of unit quaternions (n, 4), w x y z."""
+    unit = np.where(unit[:, :1] < 0, -unit, unit)
+    return _to_byte(unit[:, 1:] * np.float32(127.5) + np.float32(127.5))
+
+
+def _to_smallest_three(unit: Float32) -> Bytes:
+    """Bytes (4 n,) of unit quaternions (n, 4), w x y z."""
+    q = unit[:, [1, 2, 3, 0]]
+    largest = np.abs(q).argmax(axis=1)
+    negate = np.take_along_axis(q, largest[:, None], axis=1) < 0
+    magnitude = np.minimum(np.floor(np.abs(q) * np.float32(511 / ROOT_HALF) + np.float32(0.5)), 511).astype(np.uint32)
+    fields = magnitude | (((q < 0) ^ negate).astype(np.uint32) << 9)
+    three = np.take_along_axis(fields, values.OTHERS[largest], axis=1)
+    packed = largest.astype(np.uint32) << 30 | three[:, 0] << 20 | three[:, 1] << 10 | three[:, 2]
+    return np.asarray(packed.astype("<u4").view(np.uint8))
+
+
+def _to_sh(rest: Float32, sh_bits: tuple[int, int]) -> Bytes:
+    """Bytes of coefficients (n, K - 1, 3) in our frame. sh_bits: bits that band 1, and those above, keep."""
+    coefficients = rest.shape[1]
+    steps = np.array([1 << (8 - sh_bits[0 if index < 3 else 1]) for index in range(coefficients)], np.int16)[:, None]
+    signs = sh_signs(UP_BACK)[1 : coefficients + 1, None]
+    codes = np.clip(rest * (signs * np.float32(128)) + np.float32(128.5), 0, 256).astype(np.int16)
+    return np.asarray(np.minimum((codes + steps // 2) & -steps, 255).astype(np.uint8))  # steps are powers of two

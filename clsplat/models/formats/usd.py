@@ -200,21 +200,18 @@ def _gaussians(where: str, prim: Any, time: Any) -> Gaussians:
     if degree > MAX_SH_DEGREE:
         warn(f"{where}: SH of degree {degree}, those above {MAX_SH_DEGREE} left out")
         sh = np.ascontiguousarray(sh[:, : (MAX_SH_DEGREE + 1) ** 2])
+
+    def optional(name: str, *default: float) -> Float32:
+        array = _array(where, prim, name, time, len(default), count)
+        return np.tile(np.array(default, np.float32), (count, 1)) if array is None else array
+
     # what the schema says where an attribute is absent: no rotation, unit scale, opaque
-    quaternions = _array(where, prim, "orientations", time, 4, count)
-    scales = _array(where, prim, "scales", time, 3, count)
-    opacity = _array(where, prim, "opacities", time, 1, count)
-    if opacity is not None and not ((opacity >= 0) & (opacity <= 1)).all():
+    quaternions = optional("orientations", 0, 0, 0, 1)[:, [3, 0, 1, 2]]
+    log_scales = packing.log_scales(optional("scales", 1, 1, 1), where, 0).astype(np.float32)
+    opacity = optional("opacities", 1)[:, 0]
+    if not ((opacity >= 0) & (opacity <= 1)).all():
         raise InputError(f"{where}: has an opacity outside [0, 1]")
-    return Gaussians(
-        means,
-        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
-        if quaternions is None
-        else quaternions[:, [3, 0, 1, 2]],
-        np.zeros((count, 3), np.float32) if scales is None else packing.log_scales(scales, where, 0).astype(np.float32),
-        packing.logits(np.ones(count, np.float32) if opacity is None else opacity[:, 0]),
-        sh,
-    )
+    return Gaussians(means, quaternions, log_scales, packing.logits(opacity), sh)
 
 
 def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_unit: float = 1.0) -> None:

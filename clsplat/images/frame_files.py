@@ -8,6 +8,7 @@ vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standa
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float64
+from clsplat.camera import Camera, Window
 from clsplat.config.channels import CHANNELS, DEEP
 from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
 from clsplat.images.alpha import unassociate
-from clsplat.images.exr_header import Header
 from clsplat.images.reading import decodes, image_size, opened
 from clsplat.images.writing import steps_of, write_spec
 
@@ -36,6 +38,47 @@ _BLOCK = 1 << 12
 
 EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
 VIDEO = ".mp4"
+
+
+@dataclass(frozen=True, eq=False)
+class Header:
+    """Contents of a file beside pixels; window: None where the picture is the display window; chromaticities: x and y
+    of red, green, blue and white, none where they are not known; is_srgb: True if the colours are sRGB's."""
+
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    matrices: Mapping[str, Float64] = field(default_factory=dict)
+    window: Window | None = None
+    chromaticities: Sequence[float] = ()
+    is_srgb: bool = True
+
+
+def camera_matrices(camera: Camera) -> dict[str, Float64]:
+    """worldToCamera and worldToNDC of row vectors, as OpenEXR defines them, for a camera that has an image plane; none
+    for others.
+
+    In the camera's space x is right, y up and z along the view, a left-handed frame. In NDC (0, 0) is the upper left
+    corner of the display window, and (1, 1) the lower right one. OpenEXR says nothing of z: here it is 0 at the near
+    plane and 1 at infinity. Of an orthographic camera it is 1 at the far plane, or without one grows by 1 a world unit.
+    """
+    if not camera.kind.flat:
+        return {}
+    to_camera = np.eye(4)
+    flip = np.diag([1.0, -1.0, 1.0])
+    to_camera[:3, :3] = (flip @ camera.rotation).T
+    to_camera[3, :3] = flip @ camera.translation
+    display = camera.window or camera
+    centre = camera.cx / display.width, camera.cy / display.height
+    projection = np.zeros((4, 4))
+    projection[0, 0] = camera.fx / display.width
+    projection[1, 1] = -camera.fy / display.height
+    if camera.projection == "perspective":  # w = z
+        projection[2] = [*centre, 1.0, 1.0]
+        projection[3, 2] = -camera.near
+    else:
+        along = 1 / (camera.far - camera.near) if np.isfinite(camera.far) else 1.0
+        projection[2, 2] = along
+        projection[3] = [*centre, -along * camera.near, 1.0]
+    return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
 
 
 def parse_channels(text: str) -> tuple[str, ...]:
@@ -171,7 +214,7 @@ def _exr_part(
     planes = [np.atleast_3d(channels[name]) for name in names]
     if set(kinds) == {"whole"}:
         pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes the largest
-        spec = _spec(pixels, oiio.UINT32, header)
+        formats = [oiio.UINT32]
     else:
         formats = [oiio.HALF if kind == "colour" and encoding.depth == "half" else oiio.FLOAT for kind in kinds]
         pixels = np.empty((*planes[0].shape[:2], len(kinds)), np.float32)
@@ -184,17 +227,11 @@ def _exr_part(
                 else:
                     pixels[:, :, at] = plane[:, :, channel]
                 at += 1
-        spec = _spec(pixels, formats[0] if len(set(formats)) == 1 else oiio.FLOAT, header)
-        if len(set(formats)) > 1:
-            spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
-    spec.channelnames = tuple(channel for name in names for channel in CHANNELS[name].names)
-    if "alpha" in names:
-        spec.alpha_channel = spec.channelnames.index("A")
+    spec = _exr_spec(pixels.shape, [channel for name in names for channel in CHANNELS[name].names], formats, header)
     deflated = encoding.compression.startswith("zip")
     spec.attribute("compression", f"{encoding.compression}:{_EXR_LEVEL}" if deflated else encoding.compression)
     if named:
         spec.attribute("oiio:subimagename", CHANNELS[names[0]].part)
-    _add_matrices(spec, header)
     return np.ascontiguousarray(pixels), spec
 
 
@@ -214,8 +251,7 @@ def _picture(
         planes = [unassociate(np.concatenate(planes, axis=2))]
     bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
     whole = steps_of(planes, bits)
-    spec = _spec(whole, oiio.UINT8 if bits == 8 else oiio.UINT16, header)
-    spec.channelnames = ("R", "G", "B", "A")[: whole.shape[2]]
+    spec = _spec(whole.shape, "RGBA", oiio.UINT8 if bits == 8 else oiio.UINT16, header)
     if extension == ".png":
         if not header.is_srgb:  # else OpenImageIO says so in the chunks sRGB, gAMA and cHRM
             spec.attribute("oiio:ColorSpace", "unknown")
@@ -227,32 +263,33 @@ def _picture(
     return whole, spec
 
 
-def _spec(pixels: NDArray[Any], kind: Any, header: Header) -> Any:
-    height, width, channels = pixels.shape
-    spec = oiio.ImageSpec(width, height, channels, kind)
-    _add_header(spec, header)
-    return spec
-
-
 def deep_spec(width: int, height: int, encoding: Encoding, header: Header) -> Any:
     """OpenImageIO's specification of a deep EXR: colours are half or float as the encoding says, depths are float."""
-    spec = oiio.ImageSpec(width, height, len(DEEP), oiio.FLOAT)
+    spec = _exr_spec((height, width, len(DEEP)), DEEP, [oiio.FLOAT], header)
     spec.deep = True
-    spec.channelnames = DEEP
     spec.channelformats = (oiio.TypeDesc(encoding.depth),) * 4 + (oiio.TypeDesc("float"),) * 2
-    spec.alpha_channel, spec.z_channel = 3, 4
+    spec.z_channel = DEEP.index("Z")
     spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
-    _add_header(spec, header)
-    _add_matrices(spec, header)
     return spec
 
 
-def _add_matrices(spec: Any, header: Header) -> None:
+def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[Any], header: Header) -> Any:
+    """formats: of the channels, or the one of all."""
+    several = len(set(formats)) > 1
+    spec = _spec(shape, names, oiio.FLOAT if several else formats[0], header)
+    if several:
+        spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
+    if "A" in names:
+        spec.alpha_channel = names.index("A")
     for name, matrix in header.matrices.items():
         spec.attribute(name, oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
+    return spec
 
 
-def _add_header(spec: Any, header: Header) -> None:
+def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Header) -> Any:
+    height, width, channels = shape
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec.channelnames = tuple(names[:channels])
     if header.window is not None:
         spec.x, spec.y = header.window.x, header.window.y
         spec.full_x = spec.full_y = 0
@@ -262,3 +299,4 @@ def _add_header(spec: Any, header: Header) -> None:
     spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes
     for name, value in header.attributes.items():
         spec.attribute(name, value)
+    return spec

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scenes import tilted_camera
 
 from clsplat.camera import Window
+from clsplat.config.channels import CHANNELS
 from clsplat.config.pictures import Encoding
 from clsplat.errors import ClsplatError, InputError
-from clsplat.images.channels import CHANNELS, check_format, parse_channels, write_channels
-from clsplat.images.exr_header import Header, camera_matrices
+from clsplat.images.frame_files import Header, camera_matrices, check_format, parse_channels, write_channels
 from clsplat.reference.cameras import pixel_from_world
 
 WIDTH, HEIGHT = 21, 13
