@@ -2,7 +2,7 @@
 //
 // Owner: A group owns a tile. On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each only the
 //   cells that its ellipse reaches and that have a pixel left to fill. On a GPU (LANES == 1) each work-item has pixels
-//   of its own. The bits are the same.
+//   of its own, and the group fetches Gaussians in batches (Kerbl et al.'s own scheme). The bits are the same.
 // Launch: One group of ITEMS work-items for each tile, the first for first_tile, in row-major order (a band of tiles,
 //   or all).
 // Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), camera
@@ -12,9 +12,6 @@
 //   contributes, for the gradient to go through.
 // Equations: docs/gradients.md, (14) to (16) and (45); with RAYS docs/cameras.md, (14); Kerbl et al. 2023, section 6
 //   and algorithm 2.
-//
-// `t` is the transmittance of pixels that go on and 0 in those that are finished, whose own is put aside in `kept`:
-// there no alpha has a weight, and no test is needed.
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -45,6 +42,33 @@
 #define COUNT(statements)
 #endif
 
+// `t` is the transmittance of pixels that go on and 0 in those that are finished, whose own is put aside in `kept`:
+// there no alpha has a weight, and no test is needed.
+typedef struct {
+  floatL t, kept, red, green, blue;
+  intL stop;
+} Pixels;
+
+// Adds the tile's i-th pair to a cell that it reaches; returns whether that fills the last pixel of the cell.
+static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, float c_green, float c_blue) {
+  const floatL before = p->t;
+  floatL alpha = exp2L(power);
+  alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
+  alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);
+  const floatL after = fmaL(-before, alpha, before);
+  const intL goes_on = MASKL(after > TRANSMITTANCE_MIN);
+  const floatL weight = AS_FLOATL(AS_INTL(before * alpha) & goes_on);
+  p->red = fmaL(weight, (floatL)(c_red), p->red);
+  p->green = fmaL(weight, (floatL)(c_green), p->green);
+  p->blue = fmaL(weight, (floatL)(c_blue), p->blue);
+  p->t = AS_FLOATL(AS_INTL(after) & goes_on);
+  const intL ended = AS_INTL(before) & ~goes_on; // a positive number's bits, or none
+  if (!ANYL(ended)) return 0;
+  p->kept = ended != 0 ? before : p->kept;
+  p->stop = ended != 0 ? (intL)(i) : p->stop;
+  return !ANYL(p->t > 0.0f);
+}
+
 GROUP __kernel void blend(const int first_tile, const int tiles_x, const int width, const int height,
                           __global const uint *ranges, __global const uint *gaussian_from_sorted,
                           __global const float *splats, __global const float *background, __global float *image,
@@ -65,22 +89,20 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   TILE_OF_GROUP
   PIXEL_TABLES
   RAY_TABLES
-  floatL t[OWNED], kept[OWNED], red[OWNED], green[OWNED], blue[OWNED];
-  intL stop[OWNED];
+  Pixels pixels[OWNED];
   COUNT(intL added = (intL)(0); uint evaluated = 0;)
 
   Open open = 0;
-  for (int k = 0; k < OWNED; ++k) {
-    const int cell = OWN_CELL(k);
-    const floatL y = (floatL)(tile_y) + PIXELS_Y(cell);
-    t[k] = (floatL)(tile_x) + PIXELS_X(cell) < (floatL)(width) ? (floatL)(1.0f) : (floatL)(0.0f);
-    t[k] = y < (floatL)(height) ? t[k] : (floatL)(0.0f);
-    kept[k] = (floatL)(1.0f);
-    red[k] = green[k] = blue[k] = (floatL)(0.0f);
-    stop[k] = t[k] > 0.0f ? (intL)(end) : (intL)(-1);
-    if (ANYL(t[k] > 0.0f)) OPEN_CELL(open, cell);
+  ALL_CELLS(cell) {
+    const floatL x = (floatL)(tile_x) + PIXELS_X(cell), y = (floatL)(tile_y) + PIXELS_Y(cell);
+    const intL inside = MASKL(x < (floatL)(width)) & MASKL(y < (floatL)(height));
+    const floatL zero = (floatL)(0.0f), one = (floatL)(1.0f);
+    const Pixels p = {inside ? one : zero, one, zero, zero, zero, inside ? (intL)(end) : (intL)(-1)};
+    pixels[cell] = p;
+    if (ANYL(inside)) OPEN_CELL(open, cell);
   }
 
+#if ITEMS == 1
   int i = begin;
   Reach reach, second; // two at a time, ahead of their use: else each waits for the end of the last one's cells
   for (; i < end && GOES_ON(open); ++i) {
@@ -95,35 +117,53 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
     RECORD(uint cells = 0;)
     FOR_CELLS(cell, IN_OPEN(reach, open)) {
-      const int k = cell / ITEMS;
-      const floatL power = LOG2_ALPHA(splat, cell, k);
+      const floatL power = LOG2_ALPHA(splat, cell);
       COUNT(evaluated += LANES;)
       const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
       if (CONTRIBUTES(reached)) {
         RECORD(cells |= 1u << cell;)
-        const floatL before = t[k];
-        floatL alpha = exp2L(power);
-        alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
-        alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);
-        const floatL after = fmaL(-before, alpha, before);
-        const intL goes_on = MASKL(after > TRANSMITTANCE_MIN);
-        const floatL weight = AS_FLOATL(AS_INTL(before * alpha) & goes_on);
-        COUNT(added += weight > 0.0f ? (intL)(1) : (intL)(0);)
-        red[k] = fmaL(weight, (floatL)(c_red), red[k]);
-        green[k] = fmaL(weight, (floatL)(c_green), green[k]);
-        blue[k] = fmaL(weight, (floatL)(c_blue), blue[k]);
-        t[k] = AS_FLOATL(AS_INTL(after) & goes_on);
-        const intL ended = AS_INTL(before) & ~goes_on; // a positive number's bits, or none
-        if (ANYL(ended)) {
-          kept[k] = ended > 0 ? before : kept[k];
-          stop[k] = ended > 0 ? (intL)(i) : stop[k];
-          if (!ANYL(t[k] > 0.0f)) CLOSE_CELL(open, cell);
-        }
+        if (add_gaussian(pixels + cell, power, i, c_red, c_green, c_blue)) CLOSE_CELL(open, cell);
+        COUNT(added -= reached & MASKL(pixels[cell].t > 0.0f);)
       }
     }
     RECORD(cells_from_sorted[i] = cells;)
   }
   RECORD(for (; i < end; ++i) cells_from_sorted[i] = 0;)
+#else
+#define OPEN_CELLS(open)                                                                                               \
+  int open = 0; /* a positive number's bits, or none */                                                                \
+  ALL_CELLS(cell) open |= AS_INTL(pixels[cell].t);
+  __local Staged staged[BATCH];
+  __local int busy[2]; // items with a pixel to fill, of this batch and the next
+  if (ITEM < 2) busy[ITEM] = 0;
+  BARRIER_LOCAL();
+  for (int batch = begin, turn = 0; batch < end; batch += BATCH, turn ^= 1) {
+    const int count = min(BATCH, end - batch);
+    for (int j = ITEM; j < count; j += ITEMS)
+      stage(staged + j, gaussian_from_sorted[batch + j], 0, splats, tile_x, tile_y);
+    OPEN_CELLS(open)
+    if (GOES_ON(open)) atomic_inc(busy + turn);
+    BARRIER_LOCAL();
+    if (busy[turn] == 0) break;
+    if (ITEM == 0) busy[turn ^ 1] = 0;
+    for (int j = 0; j < count; ++j) {
+      OPEN_CELLS(open)
+      if (!GOES_ON(open)) break;
+      const int i = batch + j;
+      SPLAT_STAGED(staged[j])
+      FOR_CELLS(cell, FROM_OWN(s.blocks)) {
+        const floatL power = LOG2_ALPHA(splat, cell);
+        COUNT(evaluated += LANES;)
+        const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
+        if (CONTRIBUTES(reached)) {
+          add_gaussian(pixels + cell, power, i, c_red, c_green, c_blue);
+          COUNT(added -= reached & MASKL(pixels[cell].t > 0.0f);)
+        }
+      }
+    }
+    BARRIER_LOCAL();
+  }
+#endif
 
 #ifdef COUNT_PAIRS
 #if LANES == 1
@@ -137,15 +177,15 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   counts[2 * get_global_id(0) + 1] = evaluated;
 #endif
 
-  for (int k = 0; k < OWNED; ++k) {
-    const int cell = OWN_CELL(k);
+  ALL_CELLS(cell) {
     const size_t pixel = CELL_IN_PLANE(cell);
-    const floatL at_end = t[k] > 0.0f ? t[k] : kept[k];
-    const floatL left = stop[k] >= 0 ? at_end : (floatL)(0.0f);
-    STORE_CELL(float, fmaL(left, (floatL)(background[0]), red[k]), image + pixel, stride);
-    STORE_CELL(float, fmaL(left, (floatL)(background[1]), green[k]), image + plane + pixel, stride);
-    STORE_CELL(float, fmaL(left, (floatL)(background[2]), blue[k]), image + 2 * plane + pixel, stride);
+    const Pixels p = pixels[cell];
+    const floatL at_end = p.t > 0.0f ? p.t : p.kept;
+    const floatL left = p.stop >= 0 ? at_end : (floatL)(0.0f);
+    STORE_CELL(float, fmaL(left, (floatL)(background[0]), p.red), image + pixel, stride);
+    STORE_CELL(float, fmaL(left, (floatL)(background[1]), p.green), image + plane + pixel, stride);
+    STORE_CELL(float, fmaL(left, (floatL)(background[2]), p.blue), image + 2 * plane + pixel, stride);
     STORE_CELL(float, at_end, transmittance + pixel, stride);
-    STORE_CELL(int, stop[k], stops + pixel, stride);
+    STORE_CELL(int, p.stop, stops + pixel, stride);
   }
 }

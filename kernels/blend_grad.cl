@@ -32,20 +32,72 @@
 #define CONTRIBUTES(mask) REACHES(mask)
 #endif
 
-#if ITEMS > 1
-// slot[field] = the sum of value over the group, in a fixed tree.
-static inline void group_sums(float *values, __local float *scratch, __global float *slot) {
-  const int item = get_local_id(0);
-  for (int field = 0; field < SLOT_STRIDE; ++field) scratch[field * ITEMS + item] = values[field];
-  for (int step = ITEMS / 2; step > 0; step /= 2) {
-    barrier(CLK_LOCAL_MEM_FENCE);
-    if (item < step)
-      for (int field = 0; field < SLOT_STRIDE; ++field)
-        scratch[field * ITEMS + item] += scratch[field * ITEMS + item + step];
+// 1 / x for x in [0.01, 1]. In a group by Newton's steps, to 2e-7 of it, where a division takes twice as many
+// instructions and rounds as the driver likes.
+#if ITEMS == 1
+#define INVERSE(x) (1.0f / (x))
+#else
+#define INVERSE(x) inverse_of(x)
+static inline float inverse_of(float x) {
+  float y = as_float(0x7ef311c7 - as_int(x));
+  for (int step = 0; step < 3; ++step) y = fma1(y, fma1(-x, y, 1.0f), y);
+  return y;
+}
+#endif
+
+// State of a cell's pixels on the way to the front; the image's gradient there.
+typedef struct {
+  floatL t, behind, red, green, blue;
+  intL stop;
+} Pixels;
+
+// Takes a pair out of a cell's pixels, in the lanes that took it, and adds their gradients to its sums (SLOT_STRIDE).
+static inline void take_gaussian(Pixels *p, floatL *sums, intL taken, floatL power, floatL u, floatL v, float l11,
+                                 float l12, float l22, float c_red, float c_green, float c_blue) {
+  const floatL uncapped = AS_FLOATL(AS_INTL(exp2L(power)) & taken);
+  const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
+  const floatL inverse = INVERSE(1.0f - alpha);
+  const floatL before = p->t * inverse;
+  const floatL shade = fmaL(p->red, (floatL)(c_red), fmaL(p->green, (floatL)(c_green), p->blue * c_blue));
+  const floatL weight = alpha * before;
+  const floatL d_alpha = fmaL(before, shade, -(p->behind * inverse));
+  const floatL g = AS_FLOATL(AS_INTL(alpha * d_alpha) & MASKL(uncapped < ALPHA_MAX));
+  p->behind = fmaL(weight, shade, p->behind);
+  p->t = before;
+  sums[SLOT_RED] = fmaL(weight, p->red, sums[SLOT_RED]);
+  sums[SLOT_GREEN] = fmaL(weight, p->green, sums[SLOT_GREEN]);
+  sums[SLOT_BLUE] = fmaL(weight, p->blue, sums[SLOT_BLUE]);
+  add_moments(g, u, v, sums);
+#ifdef ABSOLUTE_GRADIENTS
+  sums[SLOT_ABSX] += fabs(g * (l11 * u));
+  sums[SLOT_ABSY] += fabs(g * fmaL((floatL)(l12), u, l22 * v));
+#endif
+#ifdef CONTRIBUTIONS
+  sums[SLOT_WEIGHT] += weight;
+#endif
+}
+
+// The i-th pair of the tile's list, in the pixels of a cell.
+#define TAKE_CELL(cell)                                                                                                \
+  {                                                                                                                    \
+    const floatL dy = my - AT_Y(cell);                                                                                 \
+    const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;                                          \
+    const floatL power = log2_alpha(u, v, log2o);                                                                      \
+    const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels[cell].stop);                          \
+    if (CONTRIBUTES(taken))                                                                                            \
+      take_gaussian(pixels + cell, sums, taken, power, u, v, l11, l12, l22, c_red, c_green, c_blue);                   \
   }
-  barrier(CLK_LOCAL_MEM_FENCE);
-  for (int field = item; field < SLOT_STRIDE; field += ITEMS) slot[field] = scratch[field * ITEMS];
-  barrier(CLK_LOCAL_MEM_FENCE);
+
+#if ITEMS > 1
+// Pairs whose sums over the group's items are made together: each item leaves its part of a field in a row, and then
+// an item adds up a row, in an order that no driver changes. A row is padded so that rows begin in banks of their own.
+#define TOGETHER (ITEMS < 256 ? 3 : 2)
+#define ROW (ITEMS + 4)
+static inline float row_sum(__local const float *row) {
+  __local const float4 *four = (__local const float4 *)row;
+  float4 sum = four[0];
+  for (int i = 1; i < ITEMS / 4; ++i) sum += four[i];
+  return (sum.x + sum.y) + (sum.z + sum.w);
 }
 #endif
 
@@ -59,27 +111,25 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
                                __global const uint *cells_from_sorted
 #endif
 ) {
-#if ITEMS > 1
-  __local float scratch[SLOT_STRIDE * ITEMS];
-#endif
   TILE_OF_GROUP
   PIXEL_TABLES
-  floatL t[OWNED], behind[OWNED], g_red[OWNED], g_green[OWNED], g_blue[OWNED];
-  intL stop[OWNED];
+  Pixels pixels[OWNED];
   int last = begin;
   Open live = 0; // cells with a pixel that has a gradient
-  for (int k = 0; k < OWNED; ++k) {
-    const int cell = OWN_CELL(k);
+  ALL_CELLS(cell) {
     const size_t pixel = CELL_IN_PLANE(cell);
-    t[k] = LOAD_CELL(float, transmittance + pixel, stride);
-    stop[k] = LOAD_CELL(int, stops + pixel, stride);
-    const intL inside = MASKL(stop[k] >= 0); // in padding nobody has written a gradient, and 0 * NaN is not 0
-    g_red[k] = AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + pixel, stride) & inside);
-    g_green[k] = AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + plane + pixel, stride) & inside);
-    g_blue[k] = AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + 2 * plane + pixel, stride) & inside);
-    behind[k] = t[k] * (g_red[k] * background[0] + g_green[k] * background[1] + g_blue[k] * background[2]);
-    last = max(last, maxL(stop[k]));
-    if (ANYL((g_red[k] != 0.0f) | (g_green[k] != 0.0f) | (g_blue[k] != 0.0f))) OPEN_CELL(live, cell);
+    const intL stop = LOAD_CELL(int, stops + pixel, stride);
+    const intL inside = MASKL(stop >= 0); // in padding nobody has written a gradient, and 0 * NaN is not 0
+    __global const int *gradient = (__global const int *)image_gradient + pixel;
+    const floatL t = LOAD_CELL(float, transmittance + pixel, stride);
+    const floatL red = AS_FLOATL(LOAD_CELL(int, gradient, stride) & inside);
+    const floatL green = AS_FLOATL(LOAD_CELL(int, gradient + plane, stride) & inside);
+    const floatL blue = AS_FLOATL(LOAD_CELL(int, gradient + 2 * plane, stride) & inside);
+    const floatL behind = t * (red * background[0] + green * background[1] + blue * background[2]);
+    const Pixels p = {t, behind, red, green, blue, stop};
+    pixels[cell] = p;
+    last = max(last, maxL(stop));
+    if (ANYL((red != 0.0f) | (green != 0.0f) | (blue != 0.0f))) OPEN_CELL(live, cell);
   }
   RAISE_TO_GROUP_MAX(last)
 #ifdef NO_LAST_CONTRIBUTOR // RasterizerConfig.last_contributor: begin at the end of the list, to no effect
@@ -91,15 +141,14 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = 0.0f;
   }
 
+#if ITEMS == 1
   for (int i = last - 1; i >= begin; --i) {
     PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i - AHEAD > begin ? i - AHEAD : begin]);
     PREFETCH(slots + (size_t)SLOT_STRIDE * slot_from_sorted[i - AHEAD > begin ? i - AHEAD : begin]);
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
     __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[i];
-    const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
-    const float log2o = splat[SPLAT_LOG2O];
+    SPLAT_HERE(splat)
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
-    const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
 #ifdef RECORD_CELLS
     const uint reach = LIVE(cells_from_sorted[i], live);
     if (reach == 0) {
@@ -109,81 +158,49 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 #else
     const Reach reach = reach_of(splat, tile_x, tile_y);
 #endif
-    const floatL zero = (floatL)(0.0f);
-    floatL sum_g = zero, sum_gu = zero, sum_gv = zero, sum_guu = zero, sum_guv = zero, sum_gvv = zero;
-    floatL d_red = zero, d_green = zero, d_blue = zero;
-#ifdef ABSOLUTE_GRADIENTS
-    floatL abs_x = zero, abs_y = zero;
-#endif
-#ifdef CONTRIBUTIONS
-    floatL sum_weight = zero;
-#endif
-    FOR_CELLS(cell, reach) {
-      const int k = cell / ITEMS;
-      const floatL dy = my - AT_Y(cell);
-      const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;
-      const floatL power = log2_alpha(u, v, log2o);
-      const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
-      if (CONTRIBUTES(taken)) {
-        const floatL uncapped = AS_FLOATL(AS_INTL(exp2L(power)) & taken);
-        const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
-        const floatL inverse = 1.0f / (1.0f - alpha);
-        const floatL before = t[k] * inverse;
-        const floatL shade = fmaL(g_red[k], (floatL)(c_red), fmaL(g_green[k], (floatL)(c_green), g_blue[k] * c_blue));
-        const floatL weight = alpha * before;
-        const floatL d_alpha = fmaL(before, shade, -(behind[k] * inverse));
-        const floatL g = AS_FLOATL(AS_INTL(alpha * d_alpha) & MASKL(uncapped < ALPHA_MAX));
-        behind[k] = fmaL(weight, shade, behind[k]);
-        t[k] = before;
-        d_red = fmaL(weight, g_red[k], d_red);
-        d_green = fmaL(weight, g_green[k], d_green);
-        d_blue = fmaL(weight, g_blue[k], d_blue);
-        ADD_MOMENTS(g, u, v);
-#ifdef ABSOLUTE_GRADIENTS
-        abs_x += fabs(g * (l11 * u));
-        abs_y += fabs(g * fmaL((floatL)(l12), u, l22 * v));
-#endif
-#ifdef CONTRIBUTIONS
-        sum_weight += weight;
-#endif
-      }
-    }
-
-#if LANES >= 8 && ITEMS == 1
-    // The first eight fields of a slot, in the order of layout.SLOT.
+    floatL sums[SLOT_STRIDE] = {(floatL)(0.0f)};
+    FOR_CELLS(cell, reach)
+    TAKE_CELL(cell)
+#if LANES >= 8
     typedef float8 float8U __attribute__((aligned(4)));
-    *(__global float8U *)slot = sums8(sum_g, sum_gu, sum_gv, sum_guu, sum_guv, sum_gvv, d_red, d_green);
-    slot[SLOT_BLUE] = sumL(d_blue);
+    *(__global float8U *)slot = sums8(sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]);
+#else
+    for (int field = 0; field < 8; ++field) slot[field] = sumL(sums[field]);
+#endif
+    slot[SLOT_BLUE] = sumL(sums[SLOT_BLUE]);
 #ifdef ABSOLUTE_GRADIENTS
-    slot[SLOT_ABSX] = sumL(abs_x);
-    slot[SLOT_ABSY] = sumL(abs_y);
+    slot[SLOT_ABSX] = sumL(sums[SLOT_ABSX]);
+    slot[SLOT_ABSY] = sumL(sums[SLOT_ABSY]);
 #endif
 #ifdef CONTRIBUTIONS
-    slot[SLOT_WEIGHT] = sumL(sum_weight);
-#endif
-#else
-    float values[SLOT_STRIDE];
-    values[SLOT_G] = sumL(sum_g);
-    values[SLOT_GU] = sumL(sum_gu);
-    values[SLOT_GV] = sumL(sum_gv);
-    values[SLOT_GUU] = sumL(sum_guu);
-    values[SLOT_GUV] = sumL(sum_guv);
-    values[SLOT_GVV] = sumL(sum_gvv);
-    values[SLOT_RED] = sumL(d_red);
-    values[SLOT_GREEN] = sumL(d_green);
-    values[SLOT_BLUE] = sumL(d_blue);
-#ifdef ABSOLUTE_GRADIENTS
-    values[SLOT_ABSX] = sumL(abs_x);
-    values[SLOT_ABSY] = sumL(abs_y);
-#endif
-#ifdef CONTRIBUTIONS
-    values[SLOT_WEIGHT] = sumL(sum_weight);
-#endif
-#if ITEMS == 1
-    for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = values[field];
-#else
-    group_sums(values, scratch, slot);
-#endif
+    slot[SLOT_WEIGHT] = sumL(sums[SLOT_WEIGHT]);
 #endif
   }
+#else
+  __local Staged staged[BATCH];
+  __local float rows[TOGETHER * SLOT_STRIDE * ROW] __attribute__((aligned(16)));
+  for (int batch = last; batch > begin; batch -= BATCH) {
+    const int count = min(BATCH, batch - begin); // of the pairs before `batch`, the last one first
+    for (int j = ITEM; j < count; j += ITEMS)
+      stage(staged + j, gaussian_from_sorted[batch - 1 - j], slot_from_sorted[batch - 1 - j], splats, tile_x, tile_y);
+    BARRIER_LOCAL();
+    for (int first = 0; first < count; first += TOGETHER) {
+      const int together = min(TOGETHER, count - first);
+      for (int j = 0; j < together; ++j) {
+        const int i = batch - 1 - first - j;
+        SPLAT_STAGED(staged[first + j])
+        float sums[SLOT_STRIDE];
+        for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
+        FOR_CELLS(cell, FROM_OWN(s.blocks))
+        TAKE_CELL(cell) __local float *column = rows + j * (SLOT_STRIDE * ROW) + ITEM;
+        for (int field = 0; field < SLOT_STRIDE; ++field) column[field * ROW] = sums[field];
+      }
+      BARRIER_LOCAL();
+      for (int row = ITEM; row < together * SLOT_STRIDE; row += ITEMS)
+        slots[(size_t)SLOT_STRIDE * staged[first + row / SLOT_STRIDE].slot + row % SLOT_STRIDE] =
+            row_sum(rows + row * ROW);
+      BARRIER_LOCAL();
+    }
+  }
+#endif
 }

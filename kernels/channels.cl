@@ -36,15 +36,14 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
   floatL t[OWNED], sums[FEATURES + 1][OWNED], median[OWNED], nearest[OWNED], largest[OWNED];
   intL stop[OWNED], count[OWNED], heaviest[OWNED];
   int last = begin;
-  for (int k = 0; k < OWNED; ++k) {
-    const int cell = OWN_CELL(k);
-    stop[k] = LOAD_CELL(int, stops + CELL_IN_PLANE(cell), stride);
-    t[k] = (floatL)(1.0f);
-    for (int field = 0; field <= FEATURES; ++field) sums[field][k] = (floatL)(0.0f);
-    median[k] = nearest[k] = largest[k] = (floatL)(0.0f);
-    count[k] = (intL)(0);
-    heaviest[k] = (intL)(-1);
-    last = max(last, maxL(stop[k]));
+  ALL_CELLS(cell) {
+    stop[cell] = LOAD_CELL(int, stops + CELL_IN_PLANE(cell), stride);
+    t[cell] = (floatL)(1.0f);
+    for (int field = 0; field <= FEATURES; ++field) sums[field][cell] = (floatL)(0.0f);
+    median[cell] = nearest[cell] = largest[cell] = (floatL)(0.0f);
+    count[cell] = (intL)(0);
+    heaviest[cell] = (intL)(-1);
+    last = max(last, maxL(stop[cell]));
   }
   RAISE_TO_GROUP_MAX(last)
 
@@ -58,38 +57,36 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
     const float depth = splat[SPLAT_DEPTH];
     const Reach reach = reach_of(splat, tile_x, tile_y);
     FOR_CELLS(cell, reach) {
-      const int k = cell / ITEMS;
-      const floatL power = LOG2_ALPHA(splat, cell, k);
-      const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
+      const floatL power = LOG2_ALPHA(splat, cell);
+      const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[cell]);
       if (ANYL(taken)) {
-        const floatL before = t[k];
+        const floatL before = t[cell];
         const floatL alpha = alpha_where(taken, power);
         const floatL weight = before * alpha;
-        t[k] = fmaL(-before, alpha, before);
+        t[cell] = fmaL(-before, alpha, before);
         for (int field = 0; field < FEATURES; ++field)
-          sums[field][k] = fmaL(weight, (floatL)(own[field]), sums[field][k]);
-        sums[FEATURES][k] += weight;
-        const intL halving = taken & MASKL(before > 0.5f) & MASKL(t[k] <= 0.5f);
-        median[k] = halving ? (floatL)(depth) : median[k];
-        const intL opening = taken & MASKL(count[k] == 0);
-        nearest[k] = opening ? (floatL)(depth) : nearest[k];
-        count[k] -= taken; // -1 where taken
-        const intL heavier = taken & MASKL(weight > largest[k]);
-        largest[k] = heavier ? weight : largest[k];
-        heaviest[k] = heavier ? (intL)((int)gaussian) : heaviest[k];
+          sums[field][cell] = fmaL(weight, (floatL)(own[field]), sums[field][cell]);
+        sums[FEATURES][cell] += weight;
+        const intL halving = taken & MASKL(before > 0.5f) & MASKL(t[cell] <= 0.5f);
+        median[cell] = halving ? (floatL)(depth) : median[cell];
+        const intL opening = taken & MASKL(count[cell] == 0);
+        nearest[cell] = opening ? (floatL)(depth) : nearest[cell];
+        count[cell] -= taken; // -1 where taken
+        const intL heavier = taken & MASKL(weight > largest[cell]);
+        largest[cell] = heavier ? weight : largest[cell];
+        heaviest[cell] = heavier ? (intL)((int)gaussian) : heaviest[cell];
       }
     }
   }
 
-  for (int k = 0; k < OWNED; ++k) {
-    const int cell = OWN_CELL(k);
+  ALL_CELLS(cell) {
     const size_t pixel = CELL_IN_PLANE(cell);
-    const floatL total = sums[FEATURES][k];
+    const floatL total = sums[FEATURES][cell];
     const floatL divisor = total > 0.0f ? total : (floatL)(1.0f);
 #ifdef FEATURE_NORMAL
     floatL length2 = (floatL)(0.0f);
     for (int axis = 0; axis < 3; ++axis)
-      length2 = fmaL(sums[FEATURE_NORMAL + axis][k], sums[FEATURE_NORMAL + axis][k], length2);
+      length2 = fmaL(sums[FEATURE_NORMAL + axis][cell], sums[FEATURE_NORMAL + axis][cell], length2);
     const floatL length = length2 > 0.0f ? sqrt(length2) : (floatL)(1.0f);
 #endif
     for (int field = 0; field < FEATURES; ++field) {
@@ -98,11 +95,11 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
 #else
       const floatL by = divisor;
 #endif
-      STORE_CELL(float, sums[field][k] / by, planes + plane * field + pixel, stride);
+      STORE_CELL(float, sums[field][cell] / by, planes + plane * field + pixel, stride);
     }
-    STORE_CELL(float, median[k], planes + plane * MEDIAN + pixel, stride);
-    STORE_CELL(float, nearest[k], planes + plane * FIRST + pixel, stride);
-    STORE_CELL(int, count[k], whole + pixel, stride);
-    STORE_CELL(int, heaviest[k], whole + plane + pixel, stride);
+    STORE_CELL(float, median[cell], planes + plane * MEDIAN + pixel, stride);
+    STORE_CELL(float, nearest[cell], planes + plane * FIRST + pixel, stride);
+    STORE_CELL(int, count[cell], whole + pixel, stride);
+    STORE_CELL(int, heaviest[cell], whole + plane + pixel, stride);
   }
 }

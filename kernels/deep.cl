@@ -30,11 +30,10 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
   floatL values[DEEP_SIZE][OWNED]; // of the bin; DEEP_ALPHA: its transmittance
   intL stop[OWNED];
   int last = begin;
-  for (int k = 0; k < OWNED; ++k) {
-    const int cell = OWN_CELL(k);
-    stop[k] = LOAD_CELL(int, stops + CELL_IN_PLANE(cell), stride);
-    for (int field = 0; field < DEEP_SIZE; ++field) values[field][k] = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
-    last = max(last, maxL(stop[k]));
+  ALL_CELLS(cell) {
+    stop[cell] = LOAD_CELL(int, stops + CELL_IN_PLANE(cell), stride);
+    for (int field = 0; field < DEEP_SIZE; ++field) values[field][cell] = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
+    last = max(last, maxL(stop[cell]));
   }
   RAISE_TO_GROUP_MAX(last)
 
@@ -49,31 +48,29 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
       SPLAT_HERE(splat)
       const Reach reach = reach_of(splat, tile_x, tile_y);
       FOR_CELLS(cell, reach) {
-        const int k = cell / ITEMS;
-        const floatL power = LOG2_ALPHA(splat, cell, k);
-        const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[k]);
+        const floatL power = LOG2_ALPHA(splat, cell);
+        const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[cell]);
         if (ANYL(taken)) {
-          const floatL before = values[DEEP_ALPHA][k];
+          const floatL before = values[DEEP_ALPHA][cell];
           const floatL alpha = alpha_where(taken, power);
           const floatL weight = before * alpha;
-          values[DEEP_ALPHA][k] = fmaL(-before, alpha, before);
+          values[DEEP_ALPHA][cell] = fmaL(-before, alpha, before);
           for (int channel = 0; channel < 3; ++channel)
-            values[DEEP_RED + channel][k] =
-                fmaL(weight, (floatL)(splat[SPLAT_RED + channel]), values[DEEP_RED + channel][k]);
+            values[DEEP_RED + channel][cell] =
+                fmaL(weight, (floatL)(splat[SPLAT_RED + channel]), values[DEEP_RED + channel][cell]);
           const intL opening = taken & MASKL(before == 1.0f);
-          values[DEEP_FIRST][k] = opening ? (floatL)(depth) : values[DEEP_FIRST][k];
-          values[DEEP_LAST][k] = taken ? (floatL)(depth) : values[DEEP_LAST][k];
+          values[DEEP_FIRST][cell] = opening ? (floatL)(depth) : values[DEEP_FIRST][cell];
+          values[DEEP_LAST][cell] = taken ? (floatL)(depth) : values[DEEP_LAST][cell];
         }
       }
     }
-    for (int k = 0; k < OWNED; ++k) {
-      const int cell = OWN_CELL(k);
+    ALL_CELLS(cell) {
       const size_t pixel = CELL_IN_PLANE(cell);
       for (int field = 0; field < DEEP_SIZE; ++field) {
-        const floatL value = values[field][k];
+        const floatL value = values[field][cell];
         STORE_CELL(float, field == DEEP_ALPHA ? 1.0f - value : value,
                    planes + plane * (DEEP_SIZE * bin + field) + pixel, stride);
-        values[field][k] = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
+        values[field][cell] = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
       }
     }
   }

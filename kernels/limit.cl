@@ -48,8 +48,8 @@ GROUP __kernel void limit_blend_grad(const int rounds, __global const float *spl
   for (int k = 0; k < OWNED; ++k) {
     const floatL x = PIXELS_X(k), y = PIXELS_Y(k), zero = (floatL)(0.0f);
     const floatL g_red = 0.1f * x, g_green = 0.1f * y, g_blue = (floatL)(0.5f);
-    floatL t = (floatL)(1e-4f), behind = zero, sum_g = zero, sum_gu = zero, sum_gv = zero, sum_guu = zero;
-    floatL sum_guv = zero, sum_gvv = zero, d_red = zero, d_green = zero, d_blue = zero;
+    floatL t = (floatL)(1e-4f), behind = zero, sums[SLOT_PLAIN];
+    for (int field = 0; field < SLOT_PLAIN; ++field) sums[field] = zero;
     for (int i = 0; i < rounds; ++i) {
       __global const float *splat = splats + SPLAT_SIZE * (i % LIMIT_SPLATS);
       const floatL dy = splat[SPLAT_PIXEL_Y] - y;
@@ -67,12 +67,13 @@ GROUP __kernel void limit_blend_grad(const int rounds, __global const float *spl
       const floatL g = uncapped < ALPHA_MAX ? alpha * d_alpha : zero;
       behind = fmaL(weight, shade, behind);
       t = before < 1.0f ? before : (floatL)(1e-4f);
-      d_red = fmaL(weight, g_red, d_red);
-      d_green = fmaL(weight, g_green, d_green);
-      d_blue = fmaL(weight, g_blue, d_blue);
-      ADD_MOMENTS(g, u, v);
+      sums[SLOT_RED] = fmaL(weight, g_red, sums[SLOT_RED]);
+      sums[SLOT_GREEN] = fmaL(weight, g_green, sums[SLOT_GREEN]);
+      sums[SLOT_BLUE] = fmaL(weight, g_blue, sums[SLOT_BLUE]);
+      add_moments(g, u, v, sums);
     }
-    sum += sumL(sum_g + sum_gu + sum_gv + sum_guu + sum_guv + sum_gvv + d_red + d_green + d_blue + t);
+    for (int field = 0; field < SLOT_PLAIN; ++field) t += sums[field];
+    sum += sumL(t);
   }
   sums[get_global_id(0)] = sum;
 }

@@ -38,7 +38,7 @@ sys.path[:0] = [str(ROOT / part) for part in ("tests/support", "tools", ".")]
 import numpy as np  # noqa: E402
 from processor import processor  # noqa: E402
 
-SHAPES = ("8x1", "16x1", "1x1", "1x64", "1x256")
+SHAPES = ("8x1", "16x1", "1x1", "1x32", "1x64", "1x128", "1x256")
 """Lanes x items; the first is what the others are compared with."""
 METHODS = {"loops": ("8x1", "1x64"), "loopvec": ("1x64",), "cbs": ("1x64",)}
 """POCL_WORK_GROUP_METHOD, beside the one that PoCL takes by itself, and shapes."""

@@ -54,7 +54,7 @@ class Shape:
 def default_shape(device: cl.Device) -> Shape:
     """The shape by type and vector width; why there are several is in docs/decisions/0003-one-source-many-shapes.md."""
     if kind_of(device) != "cpu":
-        items = next((n for n in (256, 128, 64, 32, 16) if n <= most_items(device)), 1)
+        items = next((n for n in (64, 32, 16) if n <= most_items(device)), 1)
         return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
     lanes = min(16 if device.native_vector_width_float >= 16 else 8, most_lanes(device))
     return Shape(lanes=lanes, items=1 if lanes > 1 else 64, chunks=4 * device.max_compute_units)
@@ -73,7 +73,7 @@ def candidates(device: cl.Device) -> list[Shape]:
     if kind_of(device) == "cpu":
         others = [replace(default, lanes=lanes) for lanes in (16, 8)]
     else:
-        others = [replace(default, items=items) for items in (256, 128, 64) if items <= most_items(device)]
+        others = [replace(default, items=items) for items in (32, 128, 256) if items <= most_items(device)]
     return [default, *(shape for shape in others if shape != default)]
 
 

@@ -50,9 +50,15 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
     )
 
 
+_FEWEST = 8
+"""Work-items that share a tile at least, where there is more than one: a row of a block (kernels/shared/blocks.h)."""
+
+
 def tile_items(device: Device) -> int:
-    """Work-items that share a tile: no more than it has vectors."""
-    return min(device.shape.items, TILE * TILE // device.shape.lanes)
+    """Work-items that share a tile, no more than it has pixels; one where vectors have several pixels."""
+    if device.shape.lanes > 1 or device.shape.items == 1:
+        return 1
+    return min(max(device.shape.items, _FEWEST), TILE * TILE)
 
 
 def launch_tiles(

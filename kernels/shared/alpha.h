@@ -13,38 +13,36 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
   return fmaL((floatL)(l12), dy, l11 * dx);
 }
 
-// Moments of g over pixels, into the sums of those names.
-#define ADD_MOMENTS(g, u, v)                                                                                           \
-  do {                                                                                                                 \
-    const floatL gu = (g) * (u), gv = (g) * (v);                                                                       \
-    sum_g += g;                                                                                                        \
-    sum_gu += gu;                                                                                                      \
-    sum_gv += gv;                                                                                                      \
-    sum_guu = fmaL(gu, u, sum_guu);                                                                                    \
-    sum_guv = fmaL(gu, v, sum_guv);                                                                                    \
-    sum_gvv = fmaL(gv, v, sum_gvv);                                                                                    \
-  } while (0)
+// Adds the moments of g in pixels to the first fields of a slot.
+static inline void add_moments(floatL g, floatL u, floatL v, floatL *sums) {
+  const floatL gu = g * u, gv = g * v;
+  sums[SLOT_G] += g;
+  sums[SLOT_GU] += gu;
+  sums[SLOT_GV] += gv;
+  sums[SLOT_GUU] = fmaL(gu, u, sums[SLOT_GUU]);
+  sums[SLOT_GUV] = fmaL(gu, v, sums[SLOT_GUV]);
+  sums[SLOT_GVV] = fmaL(gv, v, sums[SLOT_GVV]);
+}
 
-// A Gaussian's values for a loop over cells, and log2 of its alpha before the cap in cell `cell`, the k-th of the
-// item's.
+// A Gaussian's values for a loop over cells, and log2 of its alpha before the cap in cell `cell`.
 #ifdef RAYS
 #include "shared/rays.h"
 #define RAY_TABLES                                                                                                     \
   floatL ray_x[OWNED], ray_y[OWNED], ray_z[OWNED];                                                                     \
-  for (int k = 0; k < OWNED; ++k) {                                                                                    \
-    const int cell = OWN_CELL(k);                                                                                      \
+  ALL_CELLS(cell) {                                                                                                    \
     const float left = (float)tile_x + camera[CAMERA_WINDOW_X], top = (float)tile_y + camera[CAMERA_WINDOW_Y];         \
-    ray_of(left + 0.5f + PIXELS_X(cell), top + 0.5f + PIXELS_Y(cell), camera, ray_x + k, ray_y + k, ray_z + k);        \
+    ray_of(left + 0.5f + PIXELS_X(cell), top + 0.5f + PIXELS_Y(cell), camera, ray_x + cell, ray_y + cell,              \
+           ray_z + cell);                                                                                              \
   }
 #define SPLAT_HERE(splat)
-#define LOG2_ALPHA(splat, cell, k) log2_alpha_of_ray(ray_x[k], ray_y[k], ray_z[k], splat)
+#define LOG2_ALPHA(splat, cell) log2_alpha_of_ray(ray_x[cell], ray_y[cell], ray_z[cell], splat)
 #else
 #define RAY_TABLES
 #define SPLAT_HERE(splat)                                                                                              \
   const float l11 = (splat)[SPLAT_L11], l12 = (splat)[SPLAT_L12], l22 = (splat)[SPLAT_L22];                            \
   const float log2o = (splat)[SPLAT_LOG2O];                                                                            \
   const float mx = FROM_TILE(splat, X, tile_x), my = FROM_TILE(splat, Y, tile_y);
-#define LOG2_ALPHA(splat, cell, k)                                                                                     \
+#define LOG2_ALPHA(splat, cell)                                                                                        \
   log2_alpha(whitened_u(l11, l12, mx - AT_X(cell), my - AT_Y(cell)), (l22) * (my - AT_Y(cell)), log2o)
 #endif
 

@@ -1,24 +1,20 @@
-// A tile as cells: a vector has the pixels of a block of CELL_W x CELL_H, row by row, as an ellipse's edge cuts fewer
-// blocks than rows of as many pixels. Cell c is the one at column c % COLUMNS and row c / COLUMNS. A group has ITEMS
-// work-items; item i owns cells i, i + ITEMS, ... as its own 0, 1, ...
+// The pixels of a tile as cells, and which of them a Gaussian reaches. A group that shares a tile has those of
+// blocks.h. Else one work-item walks the tile: a vector has the pixels of a block of CELL_W x CELL_H, row by row, as an
+// ellipse's edge cuts fewer blocks than rows of as many pixels. Cell c is the one at column c % COLUMNS and row c /
+// COLUMNS.
+#if ITEMS > 1
+#include "shared/blocks.h"
+#else
 #define CELL_W (LANES == 1 ? 1 : 4)
 #define CELL_H (LANES / CELL_W)
 #define COLUMNS (TILE / CELL_W)
 #define ROWS (TILE / CELL_H)
 #define CELLS (COLUMNS * ROWS)
-#define OWNED (CELLS / ITEMS)
+#define OWNED CELLS // by a work-item
+#define ALL_CELLS(cell) for (int cell = 0; cell < OWNED; ++cell)
 #define CELL_X(cell) ((cell) % COLUMNS * CELL_W)
 #define CELL_Y(cell) ((cell) / COLUMNS * CELL_H)
-#define OWN_CELL(k) (get_local_id(0) + (k) * ITEMS)
 
-// Where a group is, from a kernel's first_tile, tiles_x, height and ranges: the first pixel of its tile; its list, the
-// pairs from `begin` to before `end`; floats from a row of a plane to the next, and from plane to plane.
-#define TILE_OF_GROUP                                                                                                  \
-  const int tile = first_tile + get_group_id(0);                                                                       \
-  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                        \
-  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];                                \
-  const size_t stride = (size_t)tiles_x * TILE;                                                                        \
-  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
 // Where a cell's first pixel is in a plane.
 #define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
 
@@ -57,13 +53,9 @@ typedef int4 int4U __attribute__((aligned(4)));
 #endif
 #endif
 
-// From the first pixel's centre to the mean: whole pixels apart from the rest, which a float32 of the sum would cut.
-#define FROM_TILE(splat, axis, origin)                                                                                 \
-  ((splat[SPLAT_PIXEL_##axis] - (float)(origin)) + (splat[SPLAT_SUB_##axis] - 0.5f))
-
-// The cells that a Gaussian reaches: those that have a pixel in its ellipse, as bits, where one work-item walks
-// a tile of at most 32; else those that its box reaches.
-#if LANES >= 8 && ITEMS == 1
+// The cells that a Gaussian reaches: those that have a pixel in its ellipse, as bits, in a tile of at most 32; else
+// those that its box reaches.
+#if LANES >= 8
 #ifndef RAYS // there every cell of a tile is looked at
 #define CELLS_BY_ELLIPSE
 #endif
@@ -189,21 +181,13 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #define AT_X(cell) PIXELS_X(cell)
 #define AT_Y(cell) PIXELS_Y(cell)
 
-typedef int Open; // how many of the item's
+typedef int Open; // how many
 #define OPEN_CELL(open, cell) (++(open))
 #define CLOSE_CELL(open, cell) (--(open))
 #define IN_OPEN(reach, open) (reach)
 
-#if ITEMS == 1
 #define FOR_CELLS(cell, reach)                                                                                         \
   for (int row = (reach).y0; row < (reach).y1; ++row)                                                                  \
     for (int cell = row * COLUMNS + (reach).x0, end_ = cell + (reach).x1 - (reach).x0; cell < end_; ++cell)
-#else
-#define IN_REACH(cell, reach)                                                                                          \
-  ((cell) % COLUMNS >= (reach).x0 && (cell) % COLUMNS < (reach).x1 && (cell) / COLUMNS >= (reach).y0 &&                \
-   (cell) / COLUMNS < (reach).y1)
-#define FOR_CELLS(cell, reach)                                                                                         \
-  for (int cell = get_local_id(0); cell < CELLS; cell += ITEMS)                                                        \
-    if (IN_REACH(cell, reach))
 #endif
 #endif

@@ -46,3 +46,12 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
   return before;
 #endif
 }
+
+// Where a group is, from a kernel's first_tile, tiles_x, height and ranges: the first pixel of its tile; its list, the
+// pairs from `begin` to before `end`; floats from a row of a plane to the next, and from plane to plane.
+#define TILE_OF_GROUP                                                                                                  \
+  const int tile = first_tile + get_group_id(0);                                                                       \
+  const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                        \
+  const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];                                \
+  const size_t stride = (size_t)tiles_x * TILE;                                                                        \
+  const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);

@@ -25,3 +25,7 @@ static inline float larger_eigenvalue(float l11, float l12, float l22) {
 #else
 #define SLOT_STRIDE SLOT_GRADIENTS
 #endif
+
+// From the first pixel's centre to the mean: whole pixels apart from the rest, which a float32 of the sum would cut.
+#define FROM_TILE(splat, axis, origin)                                                                                 \
+  ((splat[SPLAT_PIXEL_##axis] - (float)(origin)) + (splat[SPLAT_SUB_##axis] - 0.5f))

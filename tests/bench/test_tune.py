@@ -109,7 +109,7 @@ def gpu(items: int, local_kib: int) -> Any:
 def test_items_that_fit_local_memory(items: int, local_kib: int, most: int) -> None:
     device = gpu(items, local_kib)
     assert most_items(device) == most
-    assert default_shape(device).items == min(most, 256)
+    assert default_shape(device).items == min(most, 64)
     assert all(shape.items <= most for shape in candidates(device))
     if most > 1:
         assert replace(default_shape(device), items=most).local_bytes <= max(local_kib, 32) << 10

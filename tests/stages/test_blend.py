@@ -10,6 +10,7 @@ import pytest
 import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
 from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
+from quick import quick
 
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
@@ -63,6 +64,32 @@ def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
     for other in frames[1:]:
         assert_same_bits(other.image.get(), frames[0].image.get())
         assert_same_bits(other.transmittance.get(), frames[0].transmittance.get())
+
+
+HARD = {"needles": scenes.needles, "saturating": scenes.saturating, "cloud": lambda: scenes.random_cloud(900, 8, 75, 50)}
+
+
+@pytest.mark.parametrize("name", HARD)
+@pytest.mark.parametrize("items", quick([8, 16, 32, 64, 128, 256], 32, 256))
+def test_a_group_of_any_size_has_the_bits_of_a_lone_item(default_device: Device, items: int, name: str) -> None:
+    """Blocks that an ellipse is found not to reach have no pixel of it: a needle's ellipse cuts them at any angle."""
+    scene = HARD[name]()
+    alone, group = (Pipeline.run(shaped(default_device, 1, size), scene).frame.blended for size in (1, items))
+    assert_same_bits(group.image.get(), alone.image.get())
+    assert_same_bits(group.transmittance.get(), alone.transmittance.get())
+    assert_same_bits(group.stops.get(), alone.stops.get())
+
+
+@pytest.mark.parametrize("items", quick([16, 32, 64, 128, 256], 32, 128))
+def test_the_gradient_of_a_group_of_any_size(default_device: Device, items: int) -> None:
+    scene = scenes.many_per_tile()
+    d_image = np.random.default_rng(2).standard_normal((scene[1].height, scene[1].width, 3))
+    alone, group = (Pipeline.run(shaped(default_device, 1, size), scene).backward(d_image)[0] for size in (1, items))
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        wanted, got = getattr(alone, name), getattr(group, name)
+        # two orders of adding up 256 numbers, sqrt(256) half ulp where nothing cancels, and three Newton steps for a
+        # division, an ulp more
+        assert np.linalg.norm(got - wanted) <= 2e-6 * np.linalg.norm(wanted), name
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.25, 1.0])

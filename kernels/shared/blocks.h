@@ -1,0 +1,133 @@
+// cells.h for a group of ITEMS work-items that share a tile: one pixel a cell, which belongs to a block of 8 x 4
+// pixels. 32 items have a pixel of a block each, so that items which run together skip a block together; groups of
+// fewer items have lower blocks. Item i owns pixel i % 32 of the blocks i / 32, i / 32 + ITEMS / 32, ...: its cells 0,
+// 1, ... Splats come in batches through local memory, each with the blocks that its ellipse reaches.
+#if LANES > 1
+#error "a group of work-items has one pixel a vector"
+#endif
+#define BLOCK_ITEMS (ITEMS < 32 ? ITEMS : 32)
+#define BLOCK_W 8
+#define BLOCK_H (BLOCK_ITEMS / BLOCK_W)
+#define BLOCK_COLUMNS (TILE / BLOCK_W)
+#define BLOCK_ROWS (TILE / BLOCK_H)
+#define OWNED (TILE * TILE / ITEMS)
+#define ITEM ((int)get_local_id(0))
+
+#if ITEMS < BLOCK_COLUMNS * 32
+#define CELL_X(cell) ((cell) % BLOCK_COLUMNS * BLOCK_W + ITEM % BLOCK_W)
+#define CELL_Y(cell) ((cell) / BLOCK_COLUMNS * BLOCK_H + ITEM / BLOCK_W)
+#else // an item's pixels are in one column
+#define CELL_X(cell) (ITEM / 32 % BLOCK_COLUMNS * BLOCK_W + ITEM % BLOCK_W)
+#define CELL_Y(cell) (((cell) * (ITEMS / 64) + ITEM / 64) * BLOCK_H + ITEM % 32 / BLOCK_W)
+#endif
+#define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
+#define PIXELS_X(cell) ((float)CELL_X(cell))
+#define PIXELS_Y(cell) ((float)CELL_Y(cell))
+#define AT_X(cell) PIXELS_X(cell)
+#define AT_Y(cell) PIXELS_Y(cell)
+#define PIXEL_TABLES
+#define LOAD_CELL(type, p, stride) (*(p))
+#define STORE_CELL(type, x, p, stride) (*(p) = (x))
+
+#if TILE * TILE / ITEMS <= 8 // in registers then, as every index is a constant
+#define UNROLLED _Pragma("unroll")
+#else
+#define UNROLLED
+#endif
+#define ALL_CELLS(cell) UNROLLED for (int cell = 0; cell < OWNED; ++cell)
+
+typedef int Open; // how many of the item's
+#define OPEN_CELL(open, cell) (++(open))
+#define CLOSE_CELL(open, cell) (--(open))
+
+// Blocks as bits, from the item's first one on.
+typedef uint Reach;
+#define ALL_BLOCKS (0xffffffffu >> (32 - BLOCK_COLUMNS * BLOCK_ROWS))
+#define FROM_OWN(blocks) ((blocks) >> (ITEM / BLOCK_ITEMS))
+#define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> (cell * (ITEMS / BLOCK_ITEMS)) & 1)
+
+// Every block: for kernels that take one splat after the other, where the test costs more than the pixels.
+static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
+
+#if defined(RAYS) || (defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP))
+static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
+#else
+// The right edge of an ellipse, from its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)), or a little
+// beyond: the root is of up to 0.2 % more.
+static inline float block_edge(float d0, float d1, float tangent, float half_w, float l12, float l22, float inverse_l11,
+                               float budget) {
+  const float dy = tangent < d0 ? d0 : d1, v = l22 * dy;
+  const float rest = max(budget - v * v, 0.0f);
+  const float y = as_float(0x5f375a86 - (as_int(rest) >> 1)), root = rest * y; // Newton's step, as in cells.h
+  const float edge = (root * (1.502f - 0.5f * (root * y)) - l12 * dy) * inverse_l11;
+  return tangent >= d0 && tangent <= d1 ? half_w : edge;
+}
+
+// The blocks that an ellipse reaches.
+static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y) {
+  const float mx = (splat[SPLAT_PIXEL_X] - (float)tile_x) + splat[SPLAT_SUB_X];
+  const float my = (splat[SPLAT_PIXEL_Y] - (float)tile_y) + splat[SPLAT_SUB_Y];
+  const float half_w = splat[SPLAT_HALF_W], half_h = splat[SPLAT_HALF_H];
+  const float l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22], inverse_l11 = splat[SPLAT_INVERSE_L11];
+  const float budget = EXTENT(splat[SPLAT_LOG2O]) + 0.01f;
+  const float tangent = -l12 * splat[SPLAT_L11] / (l22 * l22 + l12 * l12) * half_w;
+  uint blocks = 0;
+  for (int row = 0; row < BLOCK_ROWS; ++row) {
+    float d0 = (float)(row * BLOCK_H) + (0.5f - TILE_SLACK) - my;
+    float d1 = d0 + ((float)BLOCK_H - 1.0f + 2.0f * TILE_SLACK);
+#ifdef NO_ROW_SKIP // RasterizerConfig.row_skip
+    d0 = -half_h;
+    d1 = half_h;
+#endif
+    d0 = max(d0, -half_h);
+    d1 = min(d1, half_h);
+    const float right = mx + block_edge(d0, d1, tangent, half_w, l12, l22, inverse_l11, budget);
+    const float left = mx - block_edge(-d1, -d0, tangent, half_w, l12, l22, inverse_l11, budget);
+    for (int column = 0; column < BLOCK_COLUMNS; ++column) {
+      const float first = (float)(column * BLOCK_W) + (0.5f - TILE_SLACK);
+#ifdef NO_COLUMN_SKIP // RasterizerConfig.column_skip
+      const int reached = d0 <= d1;
+#else
+      const int reached = d0 <= d1 && right >= first && left <= first + ((float)BLOCK_W - 1.0f + 2.0f * TILE_SLACK);
+#endif
+      blocks |= reached ? 1u << (row * BLOCK_COLUMNS + column) : 0;
+    }
+  }
+  return blocks;
+}
+#endif
+
+// A batch: what the items of a group fetch together, one splat each, and then all read.
+#define BATCH 64
+typedef struct {
+  float mx, my, l11, l12; // mx, my: from the tile's first pixel to the mean
+  float l22, log2o, red, green;
+  float blue;
+  uint blocks, gaussian, slot;
+} __attribute__((aligned(16))) Staged;
+
+static inline void stage(__local Staged *place, uint gaussian, uint slot, __global const float *splats, int tile_x,
+                         int tile_y) {
+  __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian;
+  Staged s;
+  s.mx = FROM_TILE(splat, X, tile_x);
+  s.my = FROM_TILE(splat, Y, tile_y);
+  s.l11 = splat[SPLAT_L11];
+  s.l12 = splat[SPLAT_L12];
+  s.l22 = splat[SPLAT_L22];
+  s.log2o = splat[SPLAT_LOG2O];
+  s.red = splat[SPLAT_RED];
+  s.green = splat[SPLAT_GREEN];
+  s.blue = splat[SPLAT_BLUE];
+  s.blocks = blocks_of(splat, tile_x, tile_y);
+  s.gaussian = gaussian;
+  s.slot = slot;
+  *place = s;
+}
+
+// A staged splat by the names that LOG2_ALPHA and the kernels have for one in global memory.
+#define SPLAT_STAGED(place)                                                                                            \
+  const Staged s = place;                                                                                              \
+  __global const float *splat = splats + (size_t)SPLAT_SIZE * s.gaussian;                                              \
+  const float mx = s.mx, my = s.my, l11 = s.l11, l12 = s.l12, l22 = s.l22, log2o = s.log2o;                            \
+  const float c_red = s.red, c_green = s.green, c_blue = s.blue;
