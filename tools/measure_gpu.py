@@ -59,7 +59,7 @@ SIZES = {
 
 @dataclass(frozen=True)
 class Setting:
-    """What all parts share: the environment of their processes, where runs are kept, the device, seconds of a part."""
+    """The setting that all parts share: the environment of their processes, where runs are kept, the device, seconds of a part."""
 
     environment: dict[str, str]
     runs: Path
