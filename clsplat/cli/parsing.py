@@ -22,6 +22,8 @@ from clsplat.cli.options import Verb
 DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
 VERBS = {
     "devices": "List the OpenCL devices.",
+    "doctor": "Say what is installed and what is missing: packages, OpenCL drivers, devices, GPUs without a "
+    "driver; and what to install for them on this system.",
     "demo": "Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable.",
     "sfm": "Turn a folder of photos into a scene: COLMAP's cameras and points, and the undistorted images.",
     "train": "Train a scene.",

@@ -6,12 +6,15 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
+import clsplat
 from clsplat.cli.options import Flag, Verb
 from clsplat.cli.session import Services, chosen_devices
+from clsplat.files import atomic_write, check_new
 from clsplat.progress import aligned
 
 if TYPE_CHECKING:
@@ -35,12 +38,19 @@ class Selftest(Verb):
     """all, or one of them: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them."""
     json: Flag = False
     """Print the result as JSON."""
+    report: Annotated[Path | None, arg(metavar="FILE.json")] = None
+    """Write the result to a file as well, with what else a report of a bug needs: system, packages, limits of each
+    device, digests, and the shapes and kernels in which drivers have failed."""
+    overwrite: Flag = False
+    """Replace the file if it is there."""
 
 
 def run(verb: Selftest, _: Services) -> int:
     """Test the devices one after the other; 1 if one of them cannot be trusted."""
     from clsplat.selftest.trust import examine_device
 
+    if verb.report is not None:
+        check_new(verb.report, overwrite=verb.overwrite)
     devices = chosen_devices(None if verb.device == "all" else verb.device)
     reports: list[Report] = []
     for info in devices:
@@ -53,8 +63,12 @@ def run(verb: Selftest, _: Services) -> int:
             print(f"This driver {report.verdict}.", flush=True)
             if report.remembered:
                 print(f"The shape is not used all the same: {report.remembered}.", flush=True)
+    records = [record(info, report) for info, report in zip(devices, reports, strict=True)]
     if verb.json:
-        print(json.dumps([record(info, report) for info, report in zip(devices, reports, strict=True)], indent=2))
+        print(json.dumps(records, indent=2))
+    if verb.report is not None:
+        atomic_write(verb.report, (json.dumps(_bug_report(records), indent=2) + "\n").encode())
+        print(f"Wrote {verb.report}.", file=sys.stderr if verb.json else sys.stdout)
     failed = [name_of(info) for info, report in zip(devices, reports, strict=True) if report.failure]
     if failed:
         print(
@@ -79,7 +93,19 @@ def record(info: DeviceInfo, report: Report) -> dict[str, object]:
         "remembered": report.remembered,
         "build_seconds": report.build_seconds,
         "stages": stages,
+        "digests": report.digests,
     }
+
+
+def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
+    """The results with what is known of the installation."""
+    from clsplat.cli.doctor import lines
+    from clsplat.device.context import all_devices, limits
+    from clsplat.device.shapes import failures
+
+    for entry, device in zip(records, (all_devices()[int(str(entry["index"]))] for entry in records), strict=True):
+        entry |= {"limits": limits(device), "refused": failures(device)}
+    return {"clsplat": clsplat.__version__, "installation": [asdict(line) for line in lines()], "devices": records}
 
 
 def table(report: Report) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 import pyopencl as cl
 
 from clsplat.device.account import Memory
-from clsplat.device.child import patience
+from clsplat.device.child import TIMEOUT, patience
 from clsplat.device.known import tell_once
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Recorder
@@ -24,9 +24,12 @@ from clsplat.device.quirks import compiles_by_size, kind_of, no_device, title
 from clsplat.device.rehearsal import Rehearsal
 from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text
 from clsplat.device.source import kernel_source
-from clsplat.errors import DeviceError, DriverError
+from clsplat.errors import DeviceError, DriverError, switched_on
 
 T = TypeVar("T")
+
+SYNC = "CLSPLAT_SYNC"
+"""Variable that makes each launch wait for its kernel: the one that hangs or fails is named."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +82,28 @@ def list_devices() -> list[DeviceInfo]:
     ]
 
 
+def limits(device: cl.Device) -> dict[str, object]:
+    """The limits of a device that decide how kernels are launched, for a report of a bug."""
+    names = (
+        *("driver_version", "opencl_c_version", "extensions", "max_clock_frequency", "max_compute_units"),
+        *("max_work_group_size", "local_mem_size", "max_constant_buffer_size", "max_mem_alloc_size", "global_mem_size"),
+        *("mem_base_addr_align", "native_vector_width_float", "single_fp_config", "host_unified_memory"),
+    )
+    values: dict[str, object] = {}
+    for name in names:
+        try:
+            value = getattr(device, name)
+        except cl.Error as error:
+            value = str(error)
+        values[name] = value.strip() if isinstance(value, str) else int(value)
+    return values
+
+
 class Device:
     """A device with its context, in-order queue, kernel shape and built kernels.
 
     why: the warning that this is not the wanted shape, given when the device is used; only_tries: a launch is
-    rehearsed, if it has to be, and not made (`launch.only_tried`).
+    rehearsed, if it has to be, and not made (`launch.only_tried`); waits: for each kernel, as SYNC asks.
     """
 
     def __init__(self, device: cl.Device, shape: Shape | None = None, *, profile: bool = False, why: str = "") -> None:
@@ -93,6 +113,7 @@ class Device:
         self.kind = kind_of(device)
         self.shape, self._why_another = (shape, why) if shape else shape_of(device)
         self.only_tries = False
+        self.waits = switched_on(SYNC)
         self.compiles_by_size = compiles_by_size(device)
         self.max_allocation = int(device.max_mem_alloc_size)
         self.max_group = int(device.max_work_group_size)
@@ -179,18 +200,33 @@ class Device:
         *,
         wait: bool = False,
     ) -> cl.Event:
-        """Put a kernel on the queue, and wait for it if asked to. Raises DriverError."""
+        """Put a kernel on the queue, and wait for it if asked to, or with CLSPLAT_SYNC=1. Raises DriverError."""
         try:
             event = kernel.cl_kernel(self.queue, size, local, *values)
-            if wait:  # so that the last kernel that was named is the one that fails
+            if self.waits:
+                self._wait_for(event, kernel)
+            elif wait:  # so that the last kernel that was named is the one that fails
                 self.finish()
         except cl.Error as error:
             text = " ".join(str(error).split())
-            where = f"{kernel.variant.stem}.cl, {kernel.name}"
-            raise DriverError(
-                f"{title(self.cl_device)}, kernels in the shape {self.shape.label}: {where}, cannot be launched: {text}"
-            ) from None
+            raise DriverError(self._trouble(kernel, f"cannot be launched: {text}")) from None
         return event
+
+    def _wait_for(self, event: cl.Event, kernel: Kernel) -> None:
+        """Wait for a kernel that has been put on the queue. Raises DriverError for one that does not come back."""
+        self.queue.flush()
+        start, seconds, pause = time.monotonic(), patience(), 1e-5
+        while (status := event.command_execution_status) > cl.command_execution_status.COMPLETE:
+            if time.monotonic() - start > seconds:
+                raise DriverError(self._trouble(kernel, f"does not come back within {seconds:g} s ({TIMEOUT})"))
+            time.sleep(pause)
+            pause = min(2 * pause, 1e-2)
+        if status < 0:
+            raise DriverError(self._trouble(kernel, f"failed with OpenCL's status {status}"))
+
+    def _trouble(self, kernel: Kernel, text: str) -> str:
+        where = f"{kernel.variant.stem}.cl, {kernel.name}"
+        return f"{title(self.cl_device)}, kernels in the shape {self.shape.label}: {where}, {text}"
 
     def finish(self) -> None:
         """Wait until the device has nothing to do."""

@@ -8,12 +8,13 @@ driver is loaded.
 from __future__ import annotations
 
 import atexit
+import importlib.util
 import os
 import platform
 import shutil
 import sys
 import tempfile
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +31,32 @@ _ICD_FILENAMES = "OCL_ICD_FILENAMES"
 _INTEL = Path("Library", "bin", "intelocl64.dll")
 """Path of intel-opencl-rt's driver, below `sys.prefix`, with the libraries that it needs beside it."""
 _POCL_CACHE = "POCL_CACHE_DIR"
+_VENDORS = "OCL_ICD_VENDORS"
+"""Variable for another folder of drivers than the system's."""
+VARIABLES = (_VENDORS, _ICD_FILENAMES, _POCL_CACHE, "POCL_DEVICES", "RUSTICL_ENABLE", "CUDA_VISIBLE_DEVICES")
+"""Variables of loaders and drivers that change which devices there are, or how they work."""
+MAKERS = {0x10DE: "NVIDIA", 0x1002: "AMD", 0x8086: "Intel"}
+"""Makers of GPUs by their number on the PCI bus."""
+_GPU_PACKAGES = {
+    "NVIDIA": {
+        "debian": "apt install nvidia-opencl-icd, beside the driver; in a container the host's libraries, with "
+        "NVIDIA_DRIVER_CAPABILITIES=compute,utility",
+        "ubuntu": "apt install nvidia-driver-NUMBER, which brings libnvidia-compute",
+        "fedora": "dnf install xorg-x11-drv-nvidia-cuda (RPM Fusion)",
+        "arch": "pacman -S opencl-nvidia",
+    },
+    "AMD": {
+        "debian": "AMD's rocm-opencl-runtime, or apt install mesa-opencl-icd and set RUSTICL_ENABLE=radeonsi",
+        "fedora": "dnf install rocm-opencl, or mesa-libOpenCL and set RUSTICL_ENABLE=radeonsi",
+        "arch": "pacman -S rocm-opencl-runtime",
+    },
+    "Intel": {
+        "debian": "apt install intel-opencl-icd",
+        "fedora": "dnf install intel-compute-runtime",
+        "arch": "pacman -S intel-compute-runtime",
+    },
+}
+"""Packages with a GPU's OpenCL driver, by maker and family of Linux."""
 
 
 def kind_of(device: cl.Device) -> str:
@@ -115,6 +142,29 @@ def driver_advice(system: str | None = None, machine: str | None = None) -> str:
     else:
         cpu = ", or one for the CPU: your distribution's PoCL, such as apt install pocl-opencl-icd"
     return f"install your GPU's driver{cpu}"
+
+
+def gpu_advice(maker: str, families: Sequence[str]) -> str:
+    """Advice on the OpenCL driver of a maker's GPU. families: this Linux and those that it is like, empty elsewhere."""
+    if not families:
+        return f"install {maker}'s own graphics driver, which has OpenCL in it"
+    packages = _GPU_PACKAGES.get(maker, {})
+    return next((packages[name] for name in families if name in packages), f"install {maker}'s OpenCL driver")
+
+
+def of_maker(platform_name: str, device_name: str, maker: str) -> bool:
+    """True if an OpenCL GPU is one of this maker's: its driver's name or its own says so."""
+    names = f"{platform_name} {device_name}".lower()
+    return any(word in names for word in {"AMD": ("amd", "radeon", "gfx")}.get(maker, (maker.lower(),)))
+
+
+def driver_files(environment: Mapping[str, str] = os.environ) -> list[Path]:
+    """The .icd files, each of which names a driver's library in a line: of the system's folder or the one that is given
+    in its place, and of packages of Python."""
+    folders = [Path(environment.get(_VENDORS) or "/etc/OpenCL/vendors")]
+    spec = importlib.util.find_spec("pyopencl")
+    folders += [Path(place) / ".libs" for place in (spec.submodule_search_locations or ())] if spec else []
+    return [path for folder in folders for path in ([folder] if folder.is_file() else sorted(folder.glob("*.icd")))]
 
 
 def no_device() -> DeviceError:

@@ -117,8 +117,9 @@ def _child(index: int, shape: tuple[int, int], stages: Sequence[str], *, quick: 
             for path in sorted(kernel_root().glob("*.cl")):
                 device.kernels(path.stem, **BUILT_WITH.get(path.stem, {}))
             tell(built=time.perf_counter() - start)
-        for result in run(device, quick=quick, stages=stages, say=lambda name: tell(begins=name)):
-            tell(result=asdict(result))
+        digests: dict[str, str] = {}
+        for result in run(device, quick=quick, stages=stages, say=lambda name: tell(begins=name), digests=digests):
+            tell(result=asdict(result), digests=digests)
     except DriverError as error:
         tell(failed=str(error))
     else:

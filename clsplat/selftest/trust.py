@@ -25,12 +25,13 @@ from clsplat.selftest.result import FORWARD, STAGES, TRAINING, Result
 
 @dataclass
 class Report:
-    """The test of a device. build_seconds: None where the kernels were not built first; end: the end of the process
-    before its work was done, in words, or empty; crashed: True if that was the driver's doing; kernels: those that were
-    built and launched, in the form of `device.rehearsal`; remembered: a failure in this shape that has not been seen to
-    be gone, in words, or empty."""
+    """The test of a device. digests: of what each stage made, by "scene/stage"; build_seconds: None where the kernels
+    were not built first; end: the end of the process before its work was done, in words, or empty; crashed: True if
+    that was the driver's doing; kernels: those that were built and launched, in the form of `device.rehearsal`;
+    remembered: a failure in this shape that has not been seen to be gone, in words, or empty."""
 
     results: list[Result] = field(default_factory=list)
+    digests: dict[str, str] = field(default_factory=dict)
     build_seconds: float | None = None
     end: str = ""
     crashed: bool = False
@@ -82,6 +83,7 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = STAGES, *, quick: 
                 report.build_seconds = message.get("built", report.build_seconds)
                 if "result" in message:
                     report.results.append(Result(**message["result"]))
+                    report.digests = message["digests"]
                 if "done" in message or "failed" in message:
                     report.kernels, report.end = message.get("done", {}), message.get("failed", "")
                     report.crashed = bool(report.end)

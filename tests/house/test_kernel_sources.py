@@ -29,3 +29,12 @@ def test_a_file_opens_with_what_it_computes_its_owners_its_launch_its_buffers_an
 def test_the_pages_that_a_file_names_are_there(path: Path) -> None:
     pages = re.findall(r"docs/[\w/.-]+\.md", path.read_text(encoding="utf-8"))
     assert [page for page in pages if not (kernel_root().parent / page).is_file()] == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_no_item_returns_before_a_barrier(path: Path) -> None:
+    """A barrier that not every item of a group reaches hangs or corrupts on real drivers."""
+    for kernel in re.split(r"(?=__kernel void )", path.read_text(encoding="utf-8"))[1:]:
+        before_last, barrier, _ = kernel.rpartition("BARRIER_")
+        if barrier:
+            assert not re.search(r"\breturn\b", before_last), kernel.splitlines()[0]

@@ -66,7 +66,11 @@ def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
         assert_same_bits(other.transmittance.get(), frames[0].transmittance.get())
 
 
-HARD = {"needles": scenes.needles, "saturating": scenes.saturating, "cloud": lambda: scenes.random_cloud(900, 8, 75, 50)}
+HARD = {
+    "needles": scenes.needles,
+    "saturating": scenes.saturating,
+    "cloud": lambda: scenes.random_cloud(900, 8, 75, 50),
+}
 
 
 @pytest.mark.parametrize("name", HARD)

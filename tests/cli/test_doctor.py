@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""clsplat doctor, and the report of a bug that clsplat selftest writes with its lines."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from calls import error_line
+
+from clsplat.cli.main import main
+from clsplat.device import installation
+from clsplat.device.context import list_devices
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.mark.smoke
+def test_it_names_packages_and_devices(capsys: Capture) -> None:
+    assert main(["doctor", "--json"]) == 0
+    lines: list[dict[str, str]] = json.loads(capsys.readouterr().out)
+    texts = [line["text"] for line in lines if line["part"] == "device"]
+    assert len(texts) == len(list_devices())
+    assert list_devices()[0].name in texts[0]
+    assert any(line["text"].startswith("numpy ") for line in lines if line["part"] == "package")
+    assert not [line for line in lines if line["state"] == "missing"]
+
+
+def test_what_is_missing_has_advice_and_status_1(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(installation, "listed_devices", lambda: ([], "a driver took the process down (signal 6)"))
+    monkeypatch.setattr(installation, "gpus", lambda: ["NVIDIA"])
+    monkeypatch.setattr(installation, "families", lambda: ["debian"])
+    assert main(["doctor"]) == 1
+    text = capsys.readouterr().out
+    assert re.search(r"^missing +device +a driver took the process down \(signal 6\)$", text, re.MULTILINE)
+    assert "-> apt install nvidia-opencl-icd" in text
+    assert text.splitlines()[-1].startswith("1 missing.")
+
+
+def test_variables_are_shown(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CLSPLAT_DRIVER_TIMEOUT", "77")
+    assert main(["doctor"]) == 0
+    assert "CLSPLAT_DRIVER_TIMEOUT=77" in capsys.readouterr().out
+
+
+def test_the_report_of_a_bug(tmp_path: Path, capsys: Capture) -> None:
+    file = tmp_path / "report.json"
+    assert main(["selftest", "--device", "0", "--report", str(file)]) == 0
+    assert f"Wrote {file}." in capsys.readouterr().out
+    report: dict[str, Any] = json.loads(file.read_text())
+    (device,) = report["devices"]
+    assert device["trusted"]
+    assert device["limits"]["max_work_group_size"] >= 1
+    assert device["refused"] == {}
+    assert len(device["digests"]) == 3 * len(device["stages"])  # three scenes
+    assert any(line["part"] == "package" for line in report["installation"])
+    assert main(["selftest", "--report", str(file)]) == 2
+    assert "is there already" in error_line(capsys)
+
+
+def test_the_report_is_refused_before_the_test(tmp_path: Path, capsys: Capture) -> None:
+    assert main(["selftest", "--report", str(tmp_path / "none" / "report.json")]) == 2
+    assert "no such folder" in error_line(capsys)
