@@ -59,7 +59,7 @@ SIZES = {
 
 @dataclass(frozen=True)
 class Setting:
-    """The setting that all parts share: the environment of their processes, where runs are kept, the device, seconds of a part."""
+    """The setting that all parts share: environment of their processes, folder of runs, device, seconds of a part."""
 
     environment: dict[str, str]
     runs: Path
