@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How often the loops of kernels run: for each pair of a tile and a Gaussian in blending, for each item elsewhere.
+"""Rounds of the loops of kernels: for each pair of a tile and a Gaussian in blending, for each item elsewhere.
 
 A compiler's loops are recognised by the line of the kernel's text that they were made of. A loop that no rule knows is
 an error in a kernel that is counted by the pair, so that a kernel that is rewritten gets rules of its own.
@@ -21,12 +21,13 @@ from clsplat.errors import ClsplatError
 @dataclass(frozen=True)
 class Run:
     """Numbers that the rounds of a loop depend on. items: of a group; wave: items that run in step; addends: pairs of a
-    visible Gaussian; list: pairs of a tile."""
+    visible Gaussian; width: of the image; coefficients: of SH."""
 
     items: int
     wave: int = 32
     addends: float = 12.5
-    list: float = 1050.0
+    width: int = 1600
+    coefficients: int = 16
 
     @property
     def waves(self) -> int:
@@ -37,6 +38,26 @@ class Run:
     def owned(self) -> float:
         """Pixels of an item."""
         return 256 / self.items
+
+    @property
+    def batches(self) -> float:
+        """Batches of splats that are fetched together, for a pair."""
+        return 1 / 64
+
+    @property
+    def fetches(self) -> float:
+        """Rounds in which a wave fetches splats, for a pair: an item fetches one."""
+        return max(1 / self.items, 1 / 64 / self.waves)
+
+    @property
+    def block_rows(self) -> int:
+        """Rows of the blocks of a tile."""
+        return 4 if self.items >= 32 else 8
+
+    @property
+    def together(self) -> int:
+        """Pairs whose sums are made together."""
+        return 3 if self.items < 256 else 2
 
     @property
     def tree(self) -> float:
@@ -52,14 +73,20 @@ Rounds = Callable[[Run], float]
 class Rule:
     """A part of a line of a kernel's text, and how often the loop that it opens runs, in all: for a pair, or an item.
 
+    ends: parts of other lines, in which some compiler jumps back to the loop's head.
     part: not a loop but a branch: the share of its loop's rounds in which a wave takes it; the line is inside.
     mark: instructions of a class that a round has, such as ("shared", 2): a loop with more is unrolled so many times.
     """
 
     text: str
     rounds: Rounds
+    ends: tuple[str, ...] = ()
     part: bool = False
     mark: tuple[str, int] | None = None
+
+    def opens(self, loop: Loop, lines: Sequence[str]) -> bool:
+        """True if the loop was made of such a line."""
+        return any(text in lines[number - 1] for number in loop.sources if number for text in (self.text, *self.ends))
 
 
 BY_PAIR: dict[str, tuple[Rule, ...]] = {
@@ -67,6 +94,10 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule("for (; i < end && GOES_ON(open); ++i)", lambda run: 1),
         Rule("FOR_CELLS(cell, IN_OPEN(reach, open))", lambda run: run.owned),
         Rule("second = reach_of(", lambda run: 0.5, part=True),
+        Rule("for (int batch = begin", lambda run: run.batches, ends=("if (busy[turn] == 0) break;",)),
+        Rule("for (int j = ITEM; j < count; j += ITEMS)", lambda run: run.fetches),
+        Rule("for (int row = 0; row < BLOCK_ROWS; ++row)", lambda run: run.fetches * run.block_rows),
+        Rule("for (int j = 0; j < count", lambda run: 1, ends=("if (!GOES_ON(open)) break;",)),
         Rule("for (int k = 0; k < OWNED; ++k)", lambda run: 0),
     ),
     "blend_grad": (
@@ -76,10 +107,87 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule("scratch[field * ITEMS + item] += scratch", lambda run: run.tree, part=True),
         Rule("for (int i = last + (int)get_local_id(0); i < end; i += ITEMS)", lambda run: 0),
         Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),
+        Rule("for (int batch = last", lambda run: run.batches),
+        Rule("for (int j = ITEM; j < count; j += ITEMS)", lambda run: run.fetches),
+        Rule("for (int row = 0; row < BLOCK_ROWS; ++row)", lambda run: run.fetches * run.block_rows),
+        Rule("for (int first = 0; first < count; first += TOGETHER)", lambda run: 1 / run.together),
+        Rule("for (int j = 0; j < together; ++j)", lambda run: 1, ends=("column[field * ROW] = sums[field];",)),
+        Rule("for (int row = ITEM; row < together * SLOT_STRIDE", lambda run: 1 / run.together / run.waves),
+        Rule("for (int i = 1; i < ITEMS / 4; ++i)", lambda run: run.items / 4 / run.together, mark=("shared", 1)),
+        Rule("for (int i = 1; i < ITEMS / 4; ++i)", lambda run: 1 / run.waves, part=True),
+        Rule("return (sum.x + sum.y)", lambda run: 1 / run.waves, part=True),
         Rule("for (int k = 0; k < OWNED; ++k)", lambda run: 0),
     ),
 }
 """Kernels that a group runs for a tile: rounds for a pair in each of the group's waves."""
+
+_AN_ITEM = 16
+"""Elements of an item in scans and sorts, see `clsplat.stages.scan`."""
+_UNEVEN = 2
+"""Rounds of a wave, of which the longest item counts, over those of an item, where Gaussians of all sizes are side by
+side: a guess."""
+
+
+def _elements(run: Run) -> float:  # noqa: ARG001  # one of the rounds
+    return _AN_ITEM
+
+
+def _bands(run: Run) -> float:
+    return run.coefficients - 1
+
+
+def _side(run: Run) -> float:
+    return _UNEVEN * math.sqrt(run.addends)
+
+
+BY_ITEM: dict[str, tuple[Rule, ...]] = {
+    "project": (
+        Rule("for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)", _side),
+        Rule("for (int k = 0; k < 3; ++k) {", lambda run: 0),  # needles alone
+        Rule("for (int k = 1; k < used; ++k, rest += 3)", _bands, mark=("global", 3)),
+    ),
+    "scan_sums": (Rule("for (uint i = begin + get_local_id(0); i < end; i += ITEMS)", _elements, mark=("global", 1)),),
+    "scan_top": (Rule("for (uint base = 0; base < groups; base += ITEMS)", _elements),),
+    "scan_chunks": (Rule("for (uint base = begin; base < end; base += ITEMS)", _elements),),
+    "compact_visible": (Rule("for (uint i = begin + get_local_id(0); i < end; i += ITEMS)", _elements),),
+    "radix_histogram": (
+        Rule("i < digits * ITEMS; i += ITEMS) counters[i] = 0;", _elements, mark=("shared", 1)),
+        Rule("for (uint i = begin; i < end; ++i) counters[DIGIT(keys[i])", _elements, mark=("global", 1)),
+        Rule("for (uint digit = get_local_id(0); digit < digits; digit += ITEMS)", lambda run: 1 / run.waves),
+        Rule("for (uint item = 0; item < ITEMS; ++item)", lambda run: run.items / run.waves, mark=("shared", 1)),
+    ),
+    "radix_scatter": (
+        Rule("i < digits * ITEMS; i += ITEMS) counters[i] = 0;", _elements, mark=("shared", 1)),
+        Rule("for (uint i = begin; i < end; ++i) counters[DIGIT(keys[i])", _elements, mark=("global", 1)),
+        Rule("for (uint digit = get_local_id(0); digit < digits; digit += ITEMS)", lambda run: 1 / run.waves),
+        Rule("for (uint item = 0; item < ITEMS; ++item) {", lambda run: run.items / run.waves, mark=("shared", 2)),
+        Rule("for (uint i = begin; i < end; ++i) {", _elements),
+    ),
+    "duplicate": (
+        Rule("for (int ty = y0; ty < y1; ++ty)", _side),
+        Rule("for (int tx = x0; tx < x1; ++tx, ++pair, ++slot)", lambda run: _side(run) ** 2, mark=("global", 2)),
+    ),
+    "loss_vertical": (
+        Rule("for (int x = x_first; x < stride; x += step)", lambda run: run.width / 64),
+        Rule("for (int tap = tap0; tap < tap1; ++tap)", lambda run: 11 * run.width / 64, mark=("global", 2)),
+    ),
+    "loss_ssim": (
+        Rule("for (int x = x_first; x < stride; x += step)", lambda run: run.width / 64),
+        Rule("for (int tap = 0; tap < TAPS; ++tap)", lambda run: 11 * run.width / 64),
+    ),
+    "loss_vertical_grad": (
+        Rule("for (int x = x_first; x < stride; x += step)", lambda run: run.width / 64),
+        Rule("for (int tap = tap0; tap < tap1; ++tap)", lambda run: 11 * run.width / 64, mark=("global", 3)),
+    ),
+    "loss_grad": (Rule("for (int x = x_first; x < stride; x += step)", lambda run: run.width / 64),),
+    "project_grad": (
+        Rule("for (uint k = 0; k < addends; ++k, slot +=", lambda run: _UNEVEN * run.addends, mark=("global", 9)),
+        Rule("for (int k = 0; k < 3; ++k) {", lambda run: 0),  # needles alone
+        Rule("for (int k = 1; k < SH_USED(coefficients); ++k", _bands, mark=("global", 6)),
+    ),
+    "adam": (Rule("for (ulong k = i; k < min(i + LANES, n); ++k)", lambda run: 1),),
+}
+"""The other kernels of a training step: rounds for an item. Loops without a rule count as one round."""
 
 
 class UnknownLoopError(ClsplatError):
@@ -96,15 +204,14 @@ class Cost:
 
 
 def _unrolled(loop: Loop, rule: Rule, twins: Sequence[Loop]) -> float:
-    """Rounds of the text in one of the loop: by the rule's mark, or beside a loop of the same line that is made for
-    what is left over by how often memory is used; 0 for that one."""
-    if rule.mark:
-        return max(loop.counts[rule.mark[0]] / rule.mark[1], 1)
+    """Rounds of the text in one of the loop: by the rule's mark, or beside a shorter loop of the same line, which does
+    what is left over, by how often memory is used; infinite for that one."""
     uses = [each.counts["shared"] + each.counts["global"] for each in twins]
-    own = loop.counts["shared"] + loop.counts["global"]
-    if len(twins) == 1 or own == 0 or min(uses) == 0:
-        return 1
-    return math.inf if own < max(uses) else max(uses) / min(uses)
+    if len(twins) > 1 and loop is not max(twins, key=lambda each: each.size):
+        return math.inf
+    if rule.mark:
+        return max(loop.counts[rule.mark[0]] // rule.mark[1], 1)
+    return max(uses) / min(uses) if min(uses) else 1
 
 
 def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run, *, strict: bool) -> Cost:
@@ -118,9 +225,9 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run,
         for loop in outer.inner:
             if loop.size <= 1 and not loop.inner:  # a jump to itself behind the end
                 continue
-            matching = [rule for rule in rules if not rule.part and _made_of(loop, lines, rule.text)]
+            matching = [rule for rule in rules if not rule.part and rule.opens(loop, lines)]
             if len(matching) == 1:
-                twins = [each for each in outer.inner if _made_of(each, lines, matching[0].text)]
+                twins = [each for each in outer.inner if matching[0].opens(each, lines)]
                 factor = matching[0].rounds(run) / _unrolled(loop, matching[0], twins)
             else:
                 unknown.append(_title(loop, lines))
@@ -136,10 +243,6 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run,
             f"more than one, is for {'; '.join(unknown)}"
         )
     return Cost(once, rounds, tuple(unknown))
-
-
-def _made_of(loop: Loop, lines: Sequence[str], text: str) -> bool:
-    return any(text in lines[number - 1] for number in loop.sources if number)
 
 
 def _title(loop: Loop, lines: Sequence[str]) -> str:

@@ -4,14 +4,16 @@
 
     python tools/gpu_static.py [--shapes 1x64] [--targets sm_89,gfx1100] [--stems blend,...] [--all] [--loops] [--json]
     python tools/gpu_static.py --check
+    python tools/gpu_static.py --page
 
 The kernels are those of a training step, with the defines that the package gives them (`gpu_variants.py`); with --all
 every kernel, as `check_memory.py` builds them. clang 19 makes NVIDIA's and AMD's assembly of them; NVIDIA's is
 assembled by ptxas, of a package that pip fetches once into the cache folder. Division and sqrt are rounded correctly.
 
 Instructions for a pair of a tile and a Gaussian are those of all waves of a group, from the loops of `gpu_loops.py`.
---check holds the ceilings below. Exit status 0: as expected, 1: a ceiling is broken, or a loop is not known, or a
-compiler refuses a kernel, 2: a compiler is missing.
+--check holds the ceilings below; --page writes docs/gpu-static.md, with the times that `gpu_model.py` predicts. Exit
+status 0: as expected, 1: a ceiling is broken, or a loop is not known, or a compiler refuses a kernel, 2: a compiler is
+missing.
 """
 
 from __future__ import annotations
@@ -32,8 +34,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from gpu_assembly import CLASSES
 from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, clang, compile_source, nvidia
-from gpu_devices import ARCHITECTURES, occupancy
+from gpu_devices import ARCHITECTURES, GPUS, occupancy
 from gpu_loops import BY_PAIR, Run, UnknownLoopError, by_pair, loop_table
+from gpu_model import Stage, predict
+from gpu_page import write_page
 from measuring import reporting, require
 
 from clsplat.progress import aligned
@@ -205,8 +209,12 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--loops", action="store_true", help="print the loops of each kernel")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--check", action="store_true", help="hold the ceilings")
+    parser.add_argument("--page", action="store_true", help="write the tables and the plot of docs/gpu-static.md")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once")
     options = parser.parse_args(arguments)
+    frames = json.loads(FRAMES.read_text())["frames"]
+    if options.page:
+        return make_page(frames, options.jobs)
     shapes = [CHECKED[0]] if options.check else options.shapes.split(",")
     targets = CHECKED[1] if options.check else TARGETS if options.targets == "all" else options.targets.split(",")
     for shape in shapes:
@@ -216,10 +224,9 @@ def run(arguments: list[str]) -> int:
     wanted = options.stems.split(",") if options.stems else []
     if options.check:
         wanted = [*NO_STACK]
-    frame = json.loads(FRAMES.read_text())["frames"][-1]
     rows: list[Row] = []
     for shape in shapes:
-        asked = ask_package("all", shape) if options.all else ask_package("step", shape, [frame])[0]
+        asked = ask_package("all", shape) if options.all else ask_package("step", shape, frames[-1:])[0]
         sources = {
             source: kernels for source, kernels in sources_of(asked).items() if not wanted or source.stem in wanted
         }
@@ -236,6 +243,23 @@ def run(arguments: list[str]) -> int:
     found = broken(rows)
     print("\n".join(["", *(found or ["every ceiling holds"])]))
     return int(bool(found))
+
+
+def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
+    """Count and predict everything, and write the page."""
+    rows: list[Row] = []
+    predictions: dict[tuple[str, str, str], dict[str, Stage]] = {}
+    for shape in SHAPES:
+        steps = ask_package("step", shape, frames)
+        sources = sources_of(launch for step in steps for launch in step)
+        found = compiled(sources, TARGETS, jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
+        rows += found
+        for gpu in GPUS:
+            built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
+            for frame, step in zip(frames, steps, strict=True):
+                predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
+    write_page(rows, predictions, frames)
+    return 0
 
 
 def note(text: str) -> None:
