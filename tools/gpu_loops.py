@@ -94,6 +94,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule("for (; i < end && GOES_ON(open); ++i)", lambda run: 1),
         Rule("FOR_CELLS(cell, IN_OPEN(reach, open))", lambda run: run.owned),
         Rule("second = reach_of(", lambda run: 0.5, part=True),
+        Rule("RAY_TABLES", lambda run: 0),
         Rule("for (int batch = begin", lambda run: run.batches, ends=("if (busy[turn] == 0) break;",)),
         Rule("for (int j = ITEM; j < count; j += ITEMS)", lambda run: run.fetches),
         Rule("for (int row = 0; row < BLOCK_ROWS; ++row)", lambda run: run.fetches * run.block_rows),

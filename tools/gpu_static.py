@@ -145,18 +145,28 @@ def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
 
 
 def table(rows: Sequence[Row]) -> list[str]:
-    """Text table of the rows."""
-    lines: list[tuple[str, ...]] = [
-        ("kernel", "shape", "target", "registers", "spills", "stack", "shared", "occupancy", "instructions", "a pair")
-    ]
+    """Text table of the rows; behind each the defines that are not the shape's."""
+    head = (
+        "kernel",
+        "shape",
+        "target",
+        "registers",
+        "spills",
+        "stack",
+        "shared",
+        "occupancy",
+        "instructions",
+        "a pair",
+    )
+    lines: list[tuple[str, ...]] = [head]
     for row in rows:
         told = row.told()
         numbers = [str(told[name]) for name in ("registers", "spills", "stack", "shared")]
-        pair = "unknown" if row.unknown else "" if row.a_pair is None else f"{row.a_pair:.0f}"
-        defines = row.source.label.removeprefix(row.source.stem)
+        pair = "unknown" if row.unknown else "-" if row.a_pair is None else f"{row.a_pair:.0f}"
         last = (f"{told['occupancy']:.0%}", str(told["instructions"]), pair)
-        lines.append((f"{row.built.kernel}{defines}", told["shape"], row.built.target, *numbers, *last))
-    return list(aligned(lines))
+        lines.append((row.built.kernel, told["shape"], row.built.target, *numbers, *last))
+    defines = ["", *(row.source.label.removeprefix(row.source.stem) for row in rows)]
+    return [f"{line} {text}".rstrip() for line, text in zip(aligned(lines), defines, strict=True)]
 
 
 def loops_of(rows: Sequence[Row]) -> list[str]:
