@@ -115,7 +115,7 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
 
 
-def _checked(command: Sequence[str], what: str) -> str:
+def run_checked(command: Sequence[str], what: str) -> str:
     """Output of a command that has to succeed, both streams. Raises ClsplatError."""
     done = _run(command)
     if done.returncode:
@@ -135,7 +135,7 @@ def build_builtins(target: str, folder: Path) -> Path:
     """Bitcode of the built-in functions. It names no lines, so that a call of one counts as its caller's line."""
     path = folder / f"builtins-{target}.bc"
     options = (*FLAGS, *target_flags(target), "-cl-std=CL1.2", "-cl-fp32-correctly-rounded-divide-sqrt")
-    _checked([clang(), *options, "-c", "-emit-llvm", str(BUILTINS), "-o", str(path)], BUILTINS.name)
+    run_checked([clang(), *options, "-c", "-emit-llvm", str(BUILTINS), "-o", str(path)], BUILTINS.name)
     return path
 
 
@@ -147,15 +147,17 @@ def compile_source(source: Source, target: str, builtins: Path) -> list[Built]:
         text.write_text(kernel_source(source.stem), encoding="utf-8")
         link = ("-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(builtins))
         options = (*FLAGS, "-gline-tables-only", *target_flags(target), *source.options, *link)
-        _checked([clang(), *options, "-S", str(text), "-o", str(assembly)], what)
+        run_checked([clang(), *options, "-S", str(text), "-o", str(assembly)], what)
         written = assembly.read_text()
         if missing := re.search(r"\b_Z(\d+)(\w+)", written):
             name = missing[2][: int(missing[1])]
             raise ClsplatError(f"{what}: {BUILTINS.name} has no body of the built-in function {name}")
         if not target.startswith("sm_"):
             return read_amd(written, target)
-        told = _checked([nvidia("ptxas"), "-v", "-lineinfo", f"-arch={target}", str(assembly), "-o", str(cubin)], what)
-        return read_nvidia(told, _checked([nvidia("nvdisasm"), "-c", "-g", str(cubin)], what), target)
+        told = run_checked(
+            [nvidia("ptxas"), "-v", "-lineinfo", f"-arch={target}", str(assembly), "-o", str(cubin)], what
+        )
+        return read_nvidia(told, run_checked([nvidia("nvdisasm"), "-c", "-g", str(cubin)], what), target)
 
 
 _FUNCTION = re.compile(

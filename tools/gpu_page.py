@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gpu_devices import GPUS, occupancy
+from gpu_intel import INTEL, IntelBuilt
 from gpu_model import Stage
 from plotting import plot_stacks
 
@@ -75,6 +76,22 @@ def pair_table(rows: Sequence[Any]) -> str:
     return markdown(lines)
 
 
+def intel_table(built: Sequence[IntelBuilt]) -> str:
+    """Items in step, and stack, by shape and device."""
+    found = {(each.kernel, each.device, each.source.items): each for each in built}
+    shapes = sorted({items for _, _, items in found})
+    lines = [["kernel", *(f"{INTEL[device]}, 1x{items}" for device in INTEL for items in shapes)]]
+    for kernel in dict.fromkeys(kernel for kernel, _, _ in found):
+        cells = []
+        for device in INTEL:
+            for items in shapes:
+                each = found.get((kernel, device, items))
+                stack = f", {each.stack} B" if each and each.stack else ""
+                cells.append(f"{each.step}{stack}" if each else "")
+        lines.append([f"`{kernel}`", *cells])
+    return markdown(lines)
+
+
 def stage_table(predictions: Predictions, frame: str) -> str:
     """Milliseconds of each stage on one GPU."""
     stages = predictions[SHAPE, GPU, frame]
@@ -128,8 +145,10 @@ def fill_in(page: str, tables: Mapping[str, str]) -> str:
     return page
 
 
-def write_page(rows: Sequence[Any], predictions: Predictions, frames: Sequence[Mapping[str, Any]]) -> None:
-    """Write the tables into the page, and the plot beside it."""
+def write_page(
+    rows: Sequence[Any], intel: Sequence[IntelBuilt], predictions: Predictions, frames: Sequence[Mapping[str, Any]]
+) -> None:
+    """Write the tables into the page, and the plot beside it. intel: empty leaves Intel's table as it is."""
     names = [frame["name"] for frame in frames]
     largest = names[-1]
     tables = {
@@ -140,6 +159,8 @@ def write_page(rows: Sequence[Any], predictions: Predictions, frames: Sequence[M
         "steps": device_table(predictions, names),
         "devices": gpu_table(),
     }
+    if intel:
+        tables["intel"] = intel_table(intel)
     atomic_write(PAGE, fill_in(PAGE.read_text("utf-8"), tables).encode())
     bars = {gpu.name: _parts(predictions[SHAPE, gpu.name, largest]) for gpu in GPUS}
     plot_stacks(PLOT, bars, f"A training step, {largest}, {SHAPE}: predicted", "ms: issue and memory added up")

@@ -5,15 +5,16 @@
     python tools/gpu_static.py [--shapes 1x64] [--targets sm_89,gfx1100] [--stems blend,...] [--all] [--loops] [--json]
     python tools/gpu_static.py --check
     python tools/gpu_static.py --page
+    python tools/gpu_static.py --intel [--shapes 1x64] [--stems blend,...] [--all]
 
 The kernels are those of a training step, with the defines that the package gives them (`gpu_variants.py`); with --all
 every kernel, as `check_memory.py` builds them. clang 19 makes NVIDIA's and AMD's assembly of them; NVIDIA's is
 assembled by ptxas, of a package that pip fetches once into the cache folder. Division and sqrt are rounded correctly.
 
 Instructions for a pair of a tile and a Gaussian are those of all waves of a group, from the loops of `gpu_loops.py`.
---check holds the ceilings below; --page writes docs/gpu-static.md, with the times that `gpu_model.py` predicts. Exit
-status 0: as expected, 1: a ceiling is broken, or a loop is not known, or a compiler refuses a kernel, 2: a compiler is
-missing.
+--intel has a table of Intel's own compiler, which says less (`gpu_intel.py`). --check holds the ceilings below; --page
+writes docs/gpu-static.md, with the times that `gpu_model.py` predicts. Exit status 0: as expected, 1: a ceiling is
+broken, or a loop is not known, or a compiler refuses a kernel, 2: a compiler is missing.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from gpu_assembly import CLASSES
 from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, clang, compile_source, nvidia
 from gpu_devices import ARCHITECTURES, GPUS, occupancy
+from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import BY_PAIR, Run, UnknownLoopError, by_pair, loop_table
 from gpu_model import Stage, predict
 from gpu_page import write_page
@@ -169,6 +171,15 @@ def table(rows: Sequence[Row]) -> list[str]:
     return [f"{line} {text}".rstrip() for line, text in zip(aligned(lines), defines, strict=True)]
 
 
+def intel_lines(built: Sequence[IntelBuilt]) -> list[str]:
+    """Text table of what Intel's compiler says."""
+    lines: list[tuple[str, ...]] = [("kernel", "shape", "device", "items in step", "stack", "shared")]
+    for each in built:
+        numbers = (str(value) for value in (each.step, each.stack, each.shared))
+        lines.append((each.kernel, f"1x{each.source.items}", each.device, *numbers))
+    return list(aligned(lines))
+
+
 def loops_of(rows: Sequence[Row]) -> list[str]:
     """The loops of each row, as a tree."""
     lines = []
@@ -220,6 +231,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--check", action="store_true", help="hold the ceilings")
     parser.add_argument("--page", action="store_true", help="write the tables and the plot of docs/gpu-static.md")
+    parser.add_argument("--intel", action="store_true", help="Intel's GPUs in place of --targets")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once")
     options = parser.parse_args(arguments)
     frames = json.loads(FRAMES.read_text())["frames"]
@@ -240,7 +252,13 @@ def run(arguments: list[str]) -> int:
         sources = {
             source: kernels for source, kernels in sources_of(asked).items() if not wanted or source.stem in wanted
         }
+        if options.intel:
+            built = compiled_for_intel(sources, options.jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
+            print("\n".join(intel_lines(built)))
+            continue
         rows += compiled(sources, targets, options.jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
+    if options.intel:
+        return 0
     if options.json:
         print(json.dumps([row.told() for row in rows], indent=2))
     else:
@@ -258,17 +276,20 @@ def run(arguments: list[str]) -> int:
 def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
     """Count and predict everything, and write the page."""
     rows: list[Row] = []
+    sources_for_intel: list[Source] = []
     predictions: dict[tuple[str, str, str], dict[str, Stage]] = {}
     for shape in SHAPES:
         steps = ask_package("step", shape, frames)
         sources = sources_of(launch for step in steps for launch in step)
         found = compiled(sources, TARGETS, jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
         rows += found
+        sources_for_intel += [source for source in sources if source.stem in NO_STACK]
         for gpu in GPUS:
             built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
             for frame, step in zip(frames, steps, strict=True):
                 predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
-    write_page(rows, predictions, frames)
+    intel = compiled_for_intel(sources_for_intel, jobs, note) if ocloc() else []
+    write_page(rows, intel, predictions, frames)
     return 0
 
 

@@ -10,15 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import gpu_compilers
+import gpu_intel
 import gpu_page
 import gpu_static
 import pytest
 from gpu_assembly import Loop, gcn_kind, parse_gcn, parse_sass, sass_kind
 from gpu_compilers import Built, NoCompilerError, Source, ask_package, read_amd, read_nvidia
 from gpu_devices import Gpu, occupancy, waves_at_a_time
+from gpu_intel import read_intel
 from gpu_loops import BY_PAIR, Rule, Run, UnknownLoopError, cost_of
 from gpu_model import predict
 from gpu_static import FRAMES, MOST_A_PAIR, NO_STACK, Row, broken, sources_of
+
+from clsplat.errors import ClsplatError
 
 SASS = """
 .text.walk:
@@ -85,6 +89,26 @@ amdhsa.kernels:
     .vgpr_spill_count: 2
 amdhsa.target:   amdgcn-amd-amdhsa--gfx1100
 """
+
+ZEBIN = b"""\x7fELF\x00---
+version:         '1.20'
+kernels:
+  - name:            walk
+    execution_env:
+      grf_count:       128
+      simd_size:       8
+      slm_size:        2336
+    per_thread_memory_buffers:
+      - type:            scratch
+        usage:           single_space
+        size:            1024
+      - type:            global
+        usage:           private_space
+        size:            64
+        is_simt_thread:  true
+kernels_misc_info:
+  - name:            walk
+\x00"""
 
 TOLD = """ptxas info    : Compiling entry function 'walk' for 'sm_89'
 ptxas info    : Function properties for walk
@@ -164,6 +188,24 @@ def test_what_ptxas_says() -> None:
 def test_what_amds_metadata_says() -> None:
     (kernel,) = read_amd(GCN, "gfx1100")
     assert (kernel.registers, kernel.spills, kernel.stack, kernel.shared) == (52, 12, 16, 512)
+
+
+def test_what_intels_binary_says() -> None:
+    (kernel,) = read_intel(Source("ranges", ("-DITEMS=64",)), "tgllp", ZEBIN)
+    assert (kernel.kernel, kernel.step, kernel.shared) == ("walk", 8, 2336)
+    assert kernel.stack == 1024 // 8 + 64  # of eight items, and of one
+
+
+def test_a_binary_that_says_nothing() -> None:
+    with pytest.raises(ClsplatError, match="ranges for tgllp: the binary of ocloc does not describe its kernels"):
+        read_intel(Source("ranges", ("-DITEMS=64",)), "tgllp", b"\x7fELF")
+
+
+def test_without_ocloc(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(gpu_intel, "ocloc", lambda: None)
+    monkeypatch.setattr(gpu_static, "ask_package", lambda *_: [[{"stem": "ranges", "options": ["-DITEMS=64"]}]])
+    assert gpu_static.main(["--intel"]) == 2
+    assert capsys.readouterr().err.endswith("gpu_static: error: no ocloc found: apt install intel-opencl-icd\n")
 
 
 def test_instructions_a_pair() -> None:
@@ -305,8 +347,8 @@ def test_a_prediction() -> None:
 
 def test_tables_have_a_place_in_the_page() -> None:
     page = gpu_page.PAGE.read_text("utf-8")
-    names = ("kernels", "pairs", "frames", "stages", "steps", "devices")
+    names = ("kernels", "pairs", "frames", "stages", "steps", "devices", "intel")
     filled = gpu_page.fill_in(page, {name: f"table of {name}" for name in names})
     assert all(f"<!-- {name} -->\ntable of {name}\n<!-- end -->" in filled for name in names)
-    with pytest.raises(Exception, match="has no place for the table costs"):
+    with pytest.raises(ClsplatError, match="has no place for the table costs"):
         gpu_page.fill_in(page, {"costs": ""})
