@@ -150,7 +150,11 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "scan_sums": (Rule("for (uint i = begin + get_local_id(0); i < end; i += ITEMS)", _elements, mark=("global", 1)),),
     "scan_top": (Rule("for (uint base = 0; base < groups; base += ITEMS)", _elements),),
     "scan_chunks": (Rule("for (uint base = begin; base < end; base += ITEMS)", _elements),),
-    "compact_visible": (Rule("for (uint i = begin + get_local_id(0); i < end; i += ITEMS)", _elements),),
+    "compact_visible": (
+        Rule("for (uint i = begin + get_local_id(0); i < end; i += ITEMS)", _elements),
+        Rule("atomic_max(extremes, complement)", lambda run: run.wave),  # AMD's, over a wave's items
+        Rule("atomic_max(extremes + 1, largest)", lambda run: run.wave),
+    ),
     "radix_histogram": (
         Rule("i < digits * ITEMS; i += ITEMS) counters[i] = 0;", _elements, mark=("shared", 1)),
         Rule("for (uint i = begin; i < end; ++i) counters[DIGIT(keys[i])", _elements, mark=("global", 1)),

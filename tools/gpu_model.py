@@ -9,7 +9,7 @@ may be trusted, real times are longer.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,8 +59,10 @@ def predict(
     built: Mapping[tuple[Source, str], Built],
     frame: Mapping[str, Any],
     gpu: Gpu,
+    say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Stage]:
-    """The stages of a step, in order, from its launches (`gpu_variants.py`) and the kernels for the GPU's target."""
+    """The stages of a step, in order, from its launches (`gpu_variants.py`) and the kernels for the GPU's target.
+    say: is told of each loop that no rule knows, and that counts as one round."""
     stages: dict[str, Stage] = {}
     costs: dict[tuple[Source, str], tuple[float, float]] = {}
     wave = ARCHITECTURES[gpu.target].wave
@@ -75,6 +77,8 @@ def predict(
                 rules = BY_PAIR.get(name, BY_ITEM.get(name, ()))
                 cost = cost_of(built[source, name], source.lines, rules, run, strict=name in BY_PAIR)
                 costs[source, name] = issued(cost, gpu.target)
+                for loop in cost.unknown:
+                    say(f"{name} for {gpu.target}: counted as one round, BY_ITEM in gpu_loops.py has no rule: {loop}")
             once, rounds = costs[source, name]
             waves = math.prod(launch["size"]) / wave
             if name in BY_PAIR:

@@ -277,6 +277,7 @@ def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
     """Count and predict everything, and write the page."""
     rows: list[Row] = []
     sources_for_intel: list[Source] = []
+    unknown: set[str] = set()
     predictions: dict[tuple[str, str, str], dict[str, Stage]] = {}
     for shape in SHAPES:
         steps = ask_package("step", shape, frames)
@@ -287,7 +288,9 @@ def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
         for gpu in GPUS:
             built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
             for frame, step in zip(frames, steps, strict=True):
-                predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
+                predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu, unknown.add)
+    for text in sorted(unknown):
+        note(text)
     intel = compiled_for_intel(sources_for_intel, jobs, note) if ocloc() else []
     write_page(rows, intel, predictions, frames)
     return 0

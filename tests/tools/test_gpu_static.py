@@ -338,7 +338,9 @@ def test_a_prediction() -> None:
     frame = {"listed": 4, "visible": 2, "width": 64, "sh_degree": 3, "walked": 4}
     gpu = Gpu("some", "sm_89", units=2, issue=4, ghz=1.0, gb=1000)
     copied = {"kernel": "write", "bytes": 1e9, "stage": "target"}
-    stages = predict([launch, copied, launch], {(source, "ranges"): kernel}, frame, gpu)
+    told: list[str] = []
+    stages = predict([launch, copied, launch], {(source, "ranges"): kernel}, frame, gpu, told.append)
+    assert len(told) == 2 and all("ranges for sm_89: counted as one round" in text for text in told)
     instructions = 3 + 6 + 4  # every loop once
     assert stages["ranges"].issue == pytest.approx(2 * 100 * instructions / 8e6)
     assert stages["ranges"].memory == pytest.approx(2 * 0.005)
