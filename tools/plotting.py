@@ -88,6 +88,28 @@ def plot_grid(path: Path, panels: Sequence[Panel], title: str, columns: int = CO
     save_figure(figure, path)
 
 
+def plot_stacks(path: Path, bars: Mapping[str, Mapping[str, float]], title: str, x: str) -> None:
+    """A horizontal bar for each name, of the same parts end to end, and its sum behind it."""
+    figure = _figure(0.42 * len(bars) + 1.6, title)
+    axes = figure.subplots()
+    names = list(bars)
+    ends = [0.0] * len(names)
+    for number, part in enumerate(next(iter(bars.values()))):
+        widths = [bars[name][part] for name in names]
+        axes.barh(names, widths, left=ends, color=COLOURS[number % len(COLOURS)], edgecolor="white", label=part)
+        ends = [end + width for end, width in zip(ends, widths, strict=True)]
+    for place, end in enumerate(ends):
+        axes.text(end, place, f" {end:.1f}", va="center", fontsize=SIZE)
+    axes.set_xlim(0, 1.1 * max(ends))
+    axes.invert_yaxis()
+    axes.set_axisbelow(True)
+    axes.set_xlabel(x, fontsize=SIZE)
+    axes.tick_params(labelsize=SIZE)
+    axes.grid(axis="x", alpha=0.3)
+    _legend_below(figure, axes, columns=3)
+    save_figure(figure, path)
+
+
 def _figure(height: float, title: str) -> Any:
     figure = import_module("matplotlib.figure").Figure((WIDTH, height), layout="constrained")
     figure.suptitle("\n".join(wrap(title, LETTERS)), fontsize=SIZE)

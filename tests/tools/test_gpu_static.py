@@ -1,0 +1,356 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Counting for GPUs: what is read of assembly and of compilers' words, and what is said where one is missing."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import gpu_compilers
+import gpu_intel
+import gpu_page
+import gpu_static
+import pytest
+from gpu_assembly import Loop, gcn_kind, parse_gcn, parse_sass, sass_kind
+from gpu_compilers import Built, NoCompilerError, Source, ask_package, read_amd, read_nvidia
+from gpu_devices import Gpu, occupancy, waves_at_a_time
+from gpu_intel import read_intel
+from gpu_loops import BY_PAIR, Rule, Run, UnknownLoopError, cost_of
+from gpu_model import predict
+from gpu_static import FRAMES, MOST_A_PAIR, NO_STACK, Row, broken, sources_of
+
+from clsplat.errors import ClsplatError
+
+SASS = """
+.text.walk:
+\t//## File "walk.cl", line 1
+        /*0000*/                   S2R R2, SR_CTAID.X ;
+        /*0010*/               @P0 EXIT ;
+.L_x_3:
+\t//## File "walk.cl", line 2
+        /*0020*/                   LDG.E R0, [R4.64] ;
+        /*0030*/                   BSSY B0, `(.L_x_1) ;
+.L_x_0:
+\t//## File "walk.cl", line 3
+        /*0040*/                   LDS R1, [R3] ;
+        /*0050*/                   FFMA R5, R1, R1, R5 ;
+        /*0060*/               @P1 CALL.REL.NOINC `(.L_x_2) ;
+        /*0070*/                   BRA `(.L_x_0) ;
+.L_x_2:
+\t//## File "walk.cl", line 2
+        /*0080*/                   BSYNC B0 ;
+.L_x_1:
+        /*0090*/                   MUFU.RCP R8, R8 ;
+        /*00a0*/                   CALL.REL.NOINC `($__internal_0_$__cuda_sm20_rcp_rn_f32_slowpath) ;
+\t//## File "walk.cl", line 4
+        /*00b0*/              @!P2 BRA P3, `(.L_x_3) ;
+        /*00c0*/                   EXIT ;
+.L_x_4:
+        /*00d0*/                   BRA `(.L_x_4);
+        /*00e0*/                   NOP;
+"""
+"""A loop in a loop, whose way out is a CALL to a label, which ptxas writes for a far jump of some items."""
+
+LINES = ["kernel", "for (outer)", "for (inner)", "while (outer);"]
+
+GCN = """
+\t.file\t1 "." "walk.cl"
+walk:
+\t.loc\t1 1 0
+\ts_load_dwordx2 s[0:1], s[4:5], 0x0
+.LBB0_1:                                ; %loop
+\t.loc\t1 2 3 is_stmt 1
+\tglobal_load_b32 v1, v0, s[0:1]          ; 4-byte load
+\ts_waitcnt vmcnt(0)
+\tv_fma_f32 v2, v1, v1, v2
+\tv_rcp_f32_e32 v3, v2
+\tv_add_nc_u32_e32 v0, 4, v0
+\ts_add_i32 s2, s2, 1
+\ts_cbranch_scc0 .LBB0_1
+; %bb.2:
+\ts_endpgm
+.Lfunc_end0:
+\t.amdhsa_kernel walk
+\t.end_amdhsa_kernel
+amdhsa.kernels:
+  - .args:
+      - .offset:         0
+        .size:           8
+        .value_kind:     global_buffer
+    .group_segment_fixed_size: 512
+    .name:           walk
+    .private_segment_fixed_size: 16
+    .sgpr_count:     70
+    .sgpr_spill_count: 1
+    .vgpr_count:     52
+    .vgpr_spill_count: 2
+amdhsa.target:   amdgcn-amd-amdhsa--gfx1100
+"""
+
+ZEBIN = b"""\x7fELF\x00---
+version:         '1.20'
+kernels:
+  - name:            walk
+    execution_env:
+      grf_count:       128
+      simd_size:       8
+      slm_size:        2336
+    per_thread_memory_buffers:
+      - type:            scratch
+        usage:           single_space
+        size:            1024
+      - type:            global
+        usage:           private_space
+        size:            64
+        is_simt_thread:  true
+kernels_misc_info:
+  - name:            walk
+\x00"""
+
+TOLD = """ptxas info    : Compiling entry function 'walk' for 'sm_89'
+ptxas info    : Function properties for walk
+    96 bytes stack frame, 8 bytes spill stores, 4 bytes spill loads
+ptxas info    : Used 81 registers, used 1 barriers, 96 bytes cumulative stack size, 2308 bytes smem, 440 bytes cmem[0]
+"""
+
+
+def built(whole: Loop | None = None, **changes: Any) -> Built:
+    values = {"kernel": "blend", "target": "sm_89", "registers": 40, "spills": 0, "stack": 0, "shared": 0, **changes}
+    return Built(**values, whole=whole or Loop([], set()))
+
+
+def test_loops_of_sass() -> None:
+    whole = parse_sass(SASS)["walk"]
+    (outer, _) = whole.inner
+    (inner,) = outer.inner
+    assert whole.tree == "((())())"  # the last one is a jump to itself behind the end
+    assert outer.sources == {4}
+    assert inner.sources == {3}
+    assert inner.counts == {"shared": 1, "fp32": 1, "control": 2}
+    assert outer.counts == {"global": 1, "other": 1, "control": 4}
+    assert whole.counts == {"other": 1, "control": 2}
+
+
+def test_loops_of_amd() -> None:
+    whole = parse_gcn(GCN)["walk"]
+    (loop,) = whole.inner
+    assert loop.sources == {2}
+    assert loop.counts == {"global": 1, "control": 2, "fp32": 1, "other": 1, "integer": 1, "scalar": 1}
+    assert whole.counts == {"global": 1, "control": 1}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("FFMA", "fp32"),
+        ("FSETP.GEU.AND", "fp32"),
+        ("IMAD.MOV.U32", "integer"),
+        ("I2FP.F32.S32", "other"),
+        ("LDL.64", "shared"),
+        ("ATOMS.MAX", "shared"),
+        ("STG.E.128", "global"),
+        ("LDGSTS.E", "other"),
+        ("BAR.SYNC.DEFER_BLOCKING", "control"),
+        ("ULDC.64", "other"),
+        ("VOTE.ANY", "other"),
+        ("UISETP.NE.AND", "integer"),
+    ],
+)
+def test_kinds_of_sass(name: str, kind: str) -> None:
+    assert sass_kind(name) == kind
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("v_dual_fmac_f32", "fp32"),
+        ("v_cmp_lt_f32_e32", "fp32"),
+        ("v_cndmask_b32_e32", "integer"),
+        ("ds_load_b128", "shared"),
+        ("scratch_store_b32", "shared"),
+        ("s_delay_alu", "control"),
+        ("s_and_b32", "scalar"),
+        ("v_cvt_f32_i32_e32", "other"),
+    ],
+)
+def test_kinds_of_amd(name: str, kind: str) -> None:
+    assert gcn_kind(name) == kind
+
+
+def test_what_ptxas_says() -> None:
+    (kernel,) = read_nvidia(TOLD, SASS, "sm_89")
+    assert (kernel.registers, kernel.spills, kernel.stack, kernel.shared) == (81, 12, 96, 2308)
+
+
+def test_what_amds_metadata_says() -> None:
+    (kernel,) = read_amd(GCN, "gfx1100")
+    assert (kernel.registers, kernel.spills, kernel.stack, kernel.shared) == (52, 12, 16, 512)
+
+
+def test_what_intels_binary_says() -> None:
+    (kernel,) = read_intel(Source("ranges", ("-DITEMS=64",)), "tgllp", ZEBIN)
+    assert (kernel.kernel, kernel.step, kernel.shared) == ("walk", 8, 2336)
+    assert kernel.stack == 1024 // 8 + 64  # of eight items, and of one
+
+
+def test_a_binary_that_says_nothing() -> None:
+    with pytest.raises(ClsplatError, match="ranges for tgllp: the binary of ocloc does not describe its kernels"):
+        read_intel(Source("ranges", ("-DITEMS=64",)), "tgllp", b"\x7fELF")
+
+
+def test_without_ocloc(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(gpu_intel, "ocloc", lambda: None)
+    monkeypatch.setattr(gpu_static, "ask_package", lambda *_: [[{"stem": "ranges", "options": ["-DITEMS=64"]}]])
+    assert gpu_static.main(["--intel"]) == 2
+    assert capsys.readouterr().err.endswith("gpu_static: error: no ocloc found: apt install intel-opencl-icd\n")
+
+
+def test_instructions_a_pair() -> None:
+    kernel = built(parse_sass(SASS)["walk"])
+    rules = (
+        Rule("while (outer)", lambda run: 0.5),
+        Rule("for (inner)", lambda run: run.items),
+        Rule("for (outer)", lambda run: 0.25, part=True),  # in both of the outer loop's blocks
+    )
+    cost = cost_of(kernel, LINES, rules, Run(64), strict=True)
+    assert cost.once == {"other": 1, "control": 2}
+    assert cost.rounds["fp32"] == 64
+    assert cost.rounds["global"] == 0.5 * 0.25
+
+
+def test_a_loop_that_no_rule_knows_is_told() -> None:
+    kernel = built(parse_sass(SASS)["walk"])
+    rules = (Rule("for (inner)", lambda run: 1),)
+    with pytest.raises(UnknownLoopError, match=r"blend for sm_89 .*BY_PAIR.* the loop of `while \(outer\);` \(6 instr"):
+        cost_of(kernel, LINES, rules, Run(64), strict=True)
+    assert len(cost_of(kernel, LINES, rules, Run(64), strict=False).unknown) == 1
+
+
+def test_an_unrolled_loop_runs_less_often() -> None:
+    kernel = built(parse_sass(SASS.replace("FFMA R5, R1, R1, R5", "LDS R5, [R6]"))["walk"])
+    rules = (Rule("while (outer)", lambda run: 1), Rule("for (inner)", lambda run: 8, mark=("shared", 1)))
+    assert cost_of(kernel, LINES, rules, Run(64), strict=True).rounds["shared"] == 8
+
+
+def test_waves_of_a_tree() -> None:
+    assert Run(256).tree == pytest.approx(
+        12 / 64
+    )  # steps of 128, 64, 32 and five of fewer: 4 + 2 + 1 + 5 waves of 8 x 8
+    assert Run(64, wave=64).tree == 1
+
+
+@pytest.mark.parametrize(
+    ("registers", "shared", "items", "waves", "by"),
+    [
+        (32, 0, 64, 48, "warps"),
+        (72, 0, 64, 28, "registers: 65,536 / (72 x 32)"),
+        (40, 33_000, 64, 6, "memory: 102,400 / 34,024 groups of two"),
+        (40, 0, 32, 24, "groups"),
+    ],
+)
+def test_occupancy_on_ada(registers: int, shared: int, items: int, waves: int, by: str) -> None:
+    kernel = built(registers=registers, shared=shared)
+    assert waves_at_a_time(kernel, items) == waves, by
+    assert occupancy(kernel, items) == waves / 48
+
+
+def row(stem: str = "blend", pair: float | None = None, unknown: str = "", **changes: Any) -> Row:
+    counts = None if pair is None else Counter(fp32=pair)
+    source = Source(stem, ("-DITEMS=64", "-DLANES=1"))
+    return Row(source, built(kernel=stem, **changes), 64, 0, counts, unknown)  # type: ignore[arg-type]
+
+
+def test_ceilings() -> None:
+    good = [row(stem, MOST_A_PAIR.get(stem)) for stem in NO_STACK]
+    assert broken(good) == []
+    (told,) = broken([*good, row("blend_grad", MOST_A_PAIR["blend_grad"] + 1)])
+    assert told == "blend_grad, 1x64, sm_89: 951 instructions of a warp for a pair, expected at most 950"
+    (told,) = broken([*good, row("sort_radix", stack=8)])
+    assert told == "sort_radix, 1x64, sm_89: 8 bytes of stack and 0 of spills, expected none"
+    assert broken([*good, row("project_grad", stack=8, target="gfx1100")]) == []
+    assert len(broken([*good, row("blend", spills=4, target="gfx1100")])) == 1
+    assert broken([*good, row("blend", unknown="a loop")]) == ["a loop"]
+    assert "sort_radix: no kernel file of a step" in broken(good[:-1])[0]
+
+
+def test_without_clang(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(gpu_compilers.shutil, "which", lambda _: None)
+    monkeypatch.setattr(gpu_static, "ask_package", lambda *_: [[]])
+    assert gpu_static.main(["--check"]) == 2
+    assert capsys.readouterr().err == "gpu_static: error: no clang 19 found: apt install clang-19\n"
+
+
+def test_another_clang(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_compilers.shutil, "which", lambda name: "/bin/clang" if name == "clang" else None)
+    monkeypatch.setattr(
+        gpu_compilers, "_run", lambda _: subprocess.CompletedProcess([], 0, "clang version 15.0.6\n", "")
+    )
+    with pytest.raises(
+        NoCompilerError, match=r"no clang 19 found; /bin/clang is another version: apt install clang-19"
+    ):
+        gpu_compilers.clang()
+
+
+def test_without_an_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    gpu_compilers.nvidia.cache_clear()
+    monkeypatch.setattr(gpu_compilers, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(gpu_compilers, "_run", lambda _: subprocess.CompletedProcess([], 1, "", "ERROR: no index\n"))
+    with pytest.raises(
+        NoCompilerError, match=r"no ptxas found: .*pip download nvidia-cuda-nvcc==\S+ failed: ERROR: no i"
+    ):
+        gpu_compilers.nvidia("ptxas")
+
+
+@pytest.mark.parametrize("arguments", [["--shapes", "8x1"], ["--targets", "sm_20"]])
+def test_what_is_not_known_is_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert gpu_static.main(arguments) != 0
+    assert capsys.readouterr().err.startswith(f"gpu_static: error: {arguments[0]} {arguments[1]}: expected one of")
+
+
+def test_a_rehearsed_step_is_the_packages() -> None:
+    frame = {**json.loads(FRAMES.read_text())["frames"][0], "listed": 1_000_000}
+    (launches,) = ask_package("step", "1x64", [frame])
+    sources = sources_of(launches)
+    assert {source.stem for source in sources} >= set(NO_STACK)
+    assert {source.items for source in sources} == {64}
+    stages = {launch["stage"] for launch in launches}
+    assert {"project", "duplicate", "ranges", "blend", "loss", "blend_grad"} <= stages
+    (blend,) = [launch for launch in launches if launch["kernel"] == "blend"]
+    tiles = -(-frame["width"] // 16) * -(-frame["height"] // 16)
+    assert (blend["size"], blend["local"]) == ([64 * tiles], [64])
+    assert set(BY_PAIR) <= {kernel for kernels in sources.values() for kernel in kernels}
+
+
+def test_a_prediction() -> None:
+    source = Source("ranges", ("-DITEMS=64",))
+    kernel = built(parse_sass(SASS)["walk"], kernel="ranges")
+    launch = {
+        "kernel": "ranges",
+        "stem": source.stem,
+        "options": list(source.options),
+        "size": [3200],
+        "bytes": 5e6,
+        "stage": "ranges",
+    }
+    frame = {"listed": 4, "visible": 2, "width": 64, "sh_degree": 3, "walked": 4}
+    gpu = Gpu("some", "sm_89", units=2, issue=4, ghz=1.0, gb=1000)
+    copied = {"kernel": "write", "bytes": 1e9, "stage": "target"}
+    told: list[str] = []
+    stages = predict([launch, copied, launch], {(source, "ranges"): kernel}, frame, gpu, told.append)
+    assert len(told) == 2 and all("ranges for sm_89: counted as one round" in text for text in told)
+    instructions = 3 + 6 + 4  # every loop once
+    assert stages["ranges"].issue == pytest.approx(2 * 100 * instructions / 8e6)
+    assert stages["ranges"].memory == pytest.approx(2 * 0.005)
+    assert set(stages) == {"ranges"}
+
+
+def test_tables_have_a_place_in_the_page() -> None:
+    page = gpu_page.PAGE.read_text("utf-8")
+    names = ("kernels", "pairs", "frames", "stages", "steps", "devices", "intel")
+    filled = gpu_page.fill_in(page, {name: f"table of {name}" for name in names})
+    assert all(f"<!-- {name} -->\ntable of {name}\n<!-- end -->" in filled for name in names)
+    with pytest.raises(ClsplatError, match="has no place for the table costs"):
+        gpu_page.fill_in(page, {"costs": ""})

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GPUs as their makers' data sheets and guides have them: what limits a group, and what a whole device does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gpu_compilers import Built
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """The limits of a unit that groups share: NVIDIA's SM, half of AMD's work-group processor or its compute unit.
+
+    wave: items that run in step; waves, groups: most at a time; registers: of 32 bits, for all waves together, of which
+    a wave gets `grain` times as many for each item as it has items; shared: bytes, and `reserved` for each group.
+    """
+
+    name: str
+    wave: int
+    waves: int
+    groups: int
+    registers: int
+    grain: int
+    shared: int
+    reserved: int = 0
+
+
+ARCHITECTURES = {
+    "sm_75": Architecture("Turing", 32, 32, 16, 64 << 10, 8, 64 << 10),
+    "sm_89": Architecture("Ada", 32, 48, 24, 64 << 10, 8, 100 << 10, 1 << 10),
+    "sm_90": Architecture("Hopper", 32, 64, 32, 64 << 10, 8, 228 << 10, 1 << 10),
+    "gfx90a": Architecture("CDNA 2", 64, 32, 16, 128 << 10, 8, 64 << 10),
+    "gfx1030": Architecture("RDNA 2", 32, 32, 16, 64 << 10, 8, 64 << 10),
+    "gfx1100": Architecture("RDNA 3", 32, 32, 16, 96 << 10, 24, 64 << 10),
+}
+"""By target. CUDA programming guide, table of compute capabilities; AMD's ISA guides and LLVM's AMDGPU usage guide."""
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """A device. units: SMs or compute units; issue: instructions of a wave that a unit starts each cycle; ghz: the
+    boost clock; gb: memory, GB/s."""
+
+    name: str
+    target: str
+    units: int
+    issue: int
+    ghz: float
+    gb: float
+
+    @property
+    def issued(self) -> float:
+        """Instructions of a wave that the device starts in a millisecond, at most."""
+        return self.units * self.issue * self.ghz * 1e6
+
+
+GPUS = (
+    Gpu("RTX 2080 Ti", "sm_75", 68, 4, 1.545, 616),
+    Gpu("RTX 3090", "sm_89", 82, 4, 1.695, 936),  # sm_86, for which no code is made
+    Gpu("RTX 4090", "sm_89", 128, 4, 2.520, 1008),
+    Gpu("H100 SXM", "sm_90", 132, 4, 1.980, 3350),
+    Gpu("H200", "sm_90", 132, 4, 1.980, 4800),
+    Gpu("RX 6800 XT", "gfx1030", 72, 2, 2.250, 512),
+    Gpu("RX 7900 XTX", "gfx1100", 96, 2, 2.500, 960),
+    Gpu("MI250, one of two", "gfx90a", 104, 1, 1.700, 1638),
+)
+
+
+def waves_at_a_time(built: Built, items: int, more_shared: int = 0) -> int:
+    """Waves of a kernel that a unit holds; more_shared: bytes that a launch gives to a group."""
+    unit = ARCHITECTURES[built.target]
+    waves = -(-items // unit.wave)
+    a_wave = -(-max(built.registers, 1) // unit.grain) * unit.grain * unit.wave
+    shared = built.shared + more_shared + unit.reserved
+    groups = min(unit.groups, unit.waves // waves, unit.registers // a_wave // waves)
+    if shared:
+        groups = min(groups, unit.shared // shared)
+    return groups * waves
+
+
+def occupancy(built: Built, items: int, more_shared: int = 0) -> float:
+    """The same, of as many as a unit can hold at all."""
+    return waves_at_a_time(built, items, more_shared) / ARCHITECTURES[built.target].waves

@@ -1,0 +1,310 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Registers, spills, memory and instructions of the kernels as GPUs' compilers make them, counted without a GPU.
+
+    python tools/gpu_static.py [--shapes 1x64] [--targets sm_89,gfx1100] [--stems blend,...] [--all] [--loops] [--json]
+    python tools/gpu_static.py --check
+    python tools/gpu_static.py --page
+    python tools/gpu_static.py --intel [--shapes 1x64] [--stems blend,...] [--all]
+
+The kernels are those of a training step, with the defines that the package gives them (`gpu_variants.py`); with --all
+every kernel, as `check_memory.py` builds them. clang 19 makes NVIDIA's and AMD's assembly of them; NVIDIA's is
+assembled by ptxas, of a package that pip fetches once into the cache folder. Division and sqrt are rounded correctly.
+
+Instructions for a pair of a tile and a Gaussian are those of all waves of a group, from the loops of `gpu_loops.py`.
+--intel has a table of Intel's own compiler, which says less (`gpu_intel.py`). --check holds the ceilings below; --page
+writes docs/gpu-static.md, with the times that `gpu_model.py` predicts. Exit status 0: as expected, 1: a ceiling is
+broken, or a loop is not known, or a compiler refuses a kernel, 2: a compiler is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from gpu_assembly import CLASSES
+from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, clang, compile_source, nvidia
+from gpu_devices import ARCHITECTURES, GPUS, occupancy
+from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
+from gpu_loops import BY_PAIR, Run, UnknownLoopError, by_pair, loop_table
+from gpu_model import Stage, predict
+from gpu_page import write_page
+from measuring import reporting, require
+
+from clsplat.progress import aligned
+
+SHAPES = ("1x32", "1x64", "1x128", "1x256")
+FRAMES = Path(__file__).with_name("gpu_frames.json")
+CHECKED = ("1x64", ("sm_89", "gfx1100"))
+NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
+"""Kernel files of which nothing may lie in stack memory or be spilled, on sm_89."""
+NO_SCRATCH = ("blend", "blend_grad")
+"""The same on gfx1100."""
+MOST_A_PAIR = {"blend": 350, "blend_grad": 950}
+"""Instructions of a warp for a pair, at most, on sm_89."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A kernel of a file, for a target and shape. pair: instructions for a pair by class, or None where it is not
+    counted so; unknown: the reason, where there should be a number."""
+
+    source: Source
+    built: Built
+    items: int
+    more_shared: int
+    pair: Counter[str] | None
+    unknown: str = ""
+
+    @property
+    def a_pair(self) -> float | None:
+        """Instructions for a pair."""
+        return None if self.pair is None else sum(self.pair.values())
+
+    def told(self) -> dict[str, Any]:
+        """For JSON."""
+        built = self.built
+        loops = [
+            {"depth": depth, "loop": title, "instructions": dict(counts)}
+            for depth, title, counts in loop_table(built, self.source.lines)
+        ]
+        return {
+            "kernel": built.kernel,
+            "source": self.source.label,
+            "target": built.target,
+            "shape": f"1x{self.source.items}",
+            "group": self.items,
+            "registers": built.registers,
+            "spills": built.spills,
+            "stack": built.stack,
+            "shared": built.shared + self.more_shared,
+            "occupancy": round(occupancy(built, self.items, self.more_shared), 3),
+            "instructions": built.whole.size + sum(loop.size for depth, loop in built.whole.walk() if depth),
+            "loops": loops,
+            "a_pair": None if self.pair is None else {kind: round(self.pair[kind], 1) for kind in CLASSES},
+        }
+
+
+def sources_of(launches: Iterable[Mapping[str, Any]]) -> dict[Source, dict[str, tuple[int, int]]]:
+    """The kernel files of launches, and of each kernel the items of a group and the shared memory that it is given."""
+    found: dict[Source, dict[str, tuple[int, int]]] = {}
+    for launch in launches:
+        if "stem" in launch:
+            kernels = found.setdefault(Source(launch["stem"], tuple(launch["options"])), {})
+            if "kernel" in launch:
+                items = 1
+                for side in launch["local"] or (64,):
+                    items *= side
+                kernels[launch["kernel"]] = (items, launch["shared"])
+    return found
+
+
+def compiled(
+    sources: Mapping[Source, Mapping[str, tuple[int, int]]],
+    targets: Sequence[str],
+    jobs: int,
+    say: Callable[[str], None],
+) -> list[Row]:
+    """The rows of every source for every target. Raises ClsplatError."""
+    clang()
+    if any(target.startswith("sm_") for target in targets):
+        nvidia("ptxas")
+        nvidia("nvdisasm")
+    with tempfile.TemporaryDirectory(prefix="clsplat-gpu-") as scratch, ThreadPoolExecutor(jobs) as pool:
+        builtins = {target: build_builtins(target, Path(scratch)) for target in targets}
+        asked = [(source, target) for target in targets for source in sources]
+        say(f"{len(asked)} kernel files to compile")
+        built = pool.map(lambda each: compile_source(*each, builtins[each[1]]), asked)
+        return [
+            row_of(source, kernel, sources[source].get(kernel.kernel))
+            for (source, _), kernels in zip(asked, built, strict=True)
+            for kernel in kernels
+            if not sources[source] or kernel.kernel in sources[source]
+        ]
+
+
+def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
+    """The row of a kernel; launch: items of a group and shared memory, if it is known to be launched."""
+    items, more_shared = launch or (source.items if built.kernel in BY_PAIR else 64, 0)
+    pair, unknown = None, ""
+    if built.kernel in BY_PAIR:
+        try:
+            pair = by_pair(built, source.lines, Run(source.items, ARCHITECTURES[built.target].wave))
+        except UnknownLoopError as error:
+            unknown = str(error)
+    return Row(source, built, items, more_shared, pair, unknown)
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Text table of the rows; behind each the defines that are not the shape's."""
+    head = (
+        "kernel",
+        "shape",
+        "target",
+        "registers",
+        "spills",
+        "stack",
+        "shared",
+        "occupancy",
+        "instructions",
+        "a pair",
+    )
+    lines: list[tuple[str, ...]] = [head]
+    for row in rows:
+        told = row.told()
+        numbers = [str(told[name]) for name in ("registers", "spills", "stack", "shared")]
+        pair = "unknown" if row.unknown else "-" if row.a_pair is None else f"{row.a_pair:.0f}"
+        last = (f"{told['occupancy']:.0%}", str(told["instructions"]), pair)
+        lines.append((row.built.kernel, told["shape"], row.built.target, *numbers, *last))
+    defines = ["", *(row.source.label.removeprefix(row.source.stem) for row in rows)]
+    return [f"{line} {text}".rstrip() for line, text in zip(aligned(lines), defines, strict=True)]
+
+
+def intel_lines(built: Sequence[IntelBuilt]) -> list[str]:
+    """Text table of what Intel's compiler says."""
+    lines: list[tuple[str, ...]] = [("kernel", "shape", "device", "items in step", "stack", "shared")]
+    for each in built:
+        numbers = (str(value) for value in (each.step, each.stack, each.shared))
+        lines.append((each.kernel, f"1x{each.source.items}", each.device, *numbers))
+    return list(aligned(lines))
+
+
+def loops_of(rows: Sequence[Row]) -> list[str]:
+    """The loops of each row, as a tree."""
+    lines = []
+    for row in rows:
+        lines.append(f"{row.source.label}: {row.built.kernel}, 1x{row.source.items}, {row.built.target}")
+        for depth, title, counts in loop_table(row.built, row.source.lines):
+            kinds = ", ".join(f"{counts[kind]} {kind}" for kind in CLASSES if counts[kind])
+            lines.append(f"{'  ' * (depth + 1)}{title}: {kinds}")
+        if row.pair:
+            kinds = ", ".join(f"{row.pair[kind]:.0f} {kind}" for kind in CLASSES if row.pair[kind])
+            lines.append(f"  for a pair: {kinds}")
+    return lines
+
+
+def broken(rows: Sequence[Row]) -> list[str]:
+    """The ceilings that are broken, in words."""
+    found = []
+    for row in rows:
+        built, stem = row.built, row.source.stem
+        where = f"{built.kernel}, 1x{row.source.items}, {built.target}"
+        bare = NO_STACK if built.target.startswith("sm_") else NO_SCRATCH
+        if stem in bare and (built.stack or built.spills):
+            found.append(f"{where}: {built.stack} bytes of stack and {built.spills} of spills, expected none")
+        most = MOST_A_PAIR.get(built.kernel)
+        if most is not None and built.target.startswith("sm_"):
+            if row.unknown:
+                found.append(row.unknown)
+            elif row.a_pair is not None and row.a_pair > most:
+                found.append(f"{where}: {row.a_pair:.0f} instructions of a warp for a pair, expected at most {most}")
+    stems = {row.source.stem for row in rows}
+    found += [
+        f"{stem}: no kernel file of a step; NO_STACK in gpu_static.py is to follow"
+        for stem in NO_STACK
+        if stem not in stems
+    ]
+    return found
+
+
+def run(arguments: list[str]) -> int:
+    """Compile, count and print."""
+    parser = argparse.ArgumentParser(
+        prog="gpu_static", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("--shapes", default="1x64", help=f"of the kernels, such as {','.join(SHAPES)}")
+    parser.add_argument("--targets", default=",".join(CHECKED[1]), help=f"of {','.join(TARGETS)}, or `all`")
+    parser.add_argument("--stems", default="", help="kernel files; all where not given")
+    parser.add_argument("--all", action="store_true", help="every kernel with every define, not a training step's")
+    parser.add_argument("--loops", action="store_true", help="print the loops of each kernel")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--check", action="store_true", help="hold the ceilings")
+    parser.add_argument("--page", action="store_true", help="write the tables and the plot of docs/gpu-static.md")
+    parser.add_argument("--intel", action="store_true", help="Intel's GPUs in place of --targets")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once")
+    options = parser.parse_args(arguments)
+    frames = json.loads(FRAMES.read_text())["frames"]
+    if options.page:
+        return make_page(frames, options.jobs)
+    shapes = [CHECKED[0]] if options.check else options.shapes.split(",")
+    targets = CHECKED[1] if options.check else TARGETS if options.targets == "all" else options.targets.split(",")
+    for shape in shapes:
+        require(shape in SHAPES, f"--shapes {shape}: expected one of {', '.join(SHAPES)}")
+    for target in targets:
+        require(target in TARGETS, f"--targets {target}: expected one of {', '.join(TARGETS)}")
+    wanted = options.stems.split(",") if options.stems else []
+    if options.check:
+        wanted = [*NO_STACK]
+    rows: list[Row] = []
+    for shape in shapes:
+        asked = ask_package("all", shape) if options.all else ask_package("step", shape, frames[-1:])[0]
+        sources = {
+            source: kernels for source, kernels in sources_of(asked).items() if not wanted or source.stem in wanted
+        }
+        if options.intel:
+            built = compiled_for_intel(sources, options.jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
+            print("\n".join(intel_lines(built)))
+            continue
+        rows += compiled(sources, targets, options.jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
+    if options.intel:
+        return 0
+    if options.json:
+        print(json.dumps([row.told() for row in rows], indent=2))
+    else:
+        print("\n".join(loops_of(rows) if options.loops else table(rows)))
+    for row in rows:
+        if row.unknown and not options.check:
+            note(row.unknown)
+    if not options.check:
+        return 0
+    found = broken(rows)
+    print("\n".join(["", *(found or ["every ceiling holds"])]))
+    return int(bool(found))
+
+
+def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
+    """Count and predict everything, and write the page."""
+    rows: list[Row] = []
+    sources_for_intel: list[Source] = []
+    unknown: set[str] = set()
+    predictions: dict[tuple[str, str, str], dict[str, Stage]] = {}
+    for shape in SHAPES:
+        steps = ask_package("step", shape, frames)
+        sources = sources_of(launch for step in steps for launch in step)
+        found = compiled(sources, TARGETS, jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
+        rows += found
+        sources_for_intel += [source for source in sources if source.stem in NO_STACK]
+        for gpu in GPUS:
+            built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
+            for frame, step in zip(frames, steps, strict=True):
+                predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu, unknown.add)
+    for text in sorted(unknown):
+        note(text)
+    intel = compiled_for_intel(sources_for_intel, jobs, note) if ocloc() else []
+    write_page(rows, intel, predictions, frames)
+    return 0
+
+
+def note(text: str) -> None:
+    """Print a line to standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def main(arguments: list[str]) -> int:
+    """`run`, with trouble told in one line."""
+    return reporting("gpu_static", lambda: run(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Builds and launches of kernels as the package itself asks for them, noted in a child process for `gpu_static.py`.
+
+    gpu_variants.py step LANESxITEMS FRAME...    a training step of frames of these counts, in JSON
+    gpu_variants.py all LANESxITEMS              every kernel: what `memory_workload.py` runs
+
+A step is not made: nothing is built, put on a queue or kept in memory, and the numbers that it reads back are the
+frame's. What the kernels would have been given is noted all the same. `all` runs on the first device that there is.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+os.environ["CLSPLAT_TRUST_DRIVER"] = "1"  # nothing is launched, or the outcome does not matter
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import memory_workload
+import numpy as np
+import pyopencl as cl
+
+from clsplat.bench.stages import trainer_of
+from clsplat.bench.subject import Subject
+from clsplat.camera import Camera
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.device import buffers, profile
+from clsplat.device.buffers import DeviceArray
+from clsplat.device.context import Device, all_devices
+from clsplat.device.layout import COUNTED, READBACK
+from clsplat.device.program import Variant, variant_of
+from clsplat.device.shapes import Shape
+from clsplat.gaussians import Gaussians
+
+MEMORY = 64 << 30
+"""Bytes of the device that is made believe: a step's arrays are whole."""
+OPTIONS = "-cl-std=CL1.2 -cl-fp32-correctly-rounded-divide-sqrt"
+"""Options of a build: NVIDIA's and AMD's drivers say that they can divide and take roots with correct rounding."""
+
+
+def noted(variant: Variant) -> dict[str, Any]:
+    """A variant for JSON: stem and options."""
+    return {"stem": variant.stem, "options": list(variant.options)}
+
+
+class _Buffer:
+    """Stands for a buffer; it has a size alone."""
+
+    def __init__(self, context: object, flags: object, size: int) -> None:
+        del context, flags
+        self.size = size
+
+    def get_sub_region(self, origin: int, size: int) -> _Buffer:
+        del origin
+        return _Buffer(None, None, size)
+
+
+class _Kernel:
+    """Stands for a kernel: its variant and name."""
+
+    def __init__(self, variant: Variant, name: str) -> None:
+        self.variant, self.name = variant, name
+        self.tried: set[str] = set()
+        self.cl_kernel = self
+
+    def most_items(self, device: object) -> int:
+        del device
+        return 1024
+
+    def set_scalar_arg_dtypes(self, types: object) -> None:
+        del types
+
+
+class _Kernels:
+    """Stands for the kernels of a file."""
+
+    def __init__(self, variant: Variant) -> None:
+        self.variant, self.made = variant, {}  # type: ignore[var-annotated]
+
+    def __getattr__(self, name: str) -> _Kernel:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return self.made.setdefault(name, _Kernel(self.variant, name))
+
+
+class Rehearsed:
+    """The launches of a step that is not made."""
+
+    def __init__(self, frame: Mapping[str, Any]) -> None:
+        self.frame = frame
+        self.launches: list[dict[str, Any]] = []
+
+    def install(self) -> None:
+        """Put the stand-ins in the place of the driver."""
+        rehearsed = self
+
+        def built(device: Device, stem: str, defines: Mapping[str, object]) -> _Kernels:
+            shape = {"LANES": device.shape.lanes, "ITEMS": device.shape.items}
+            return _Kernels(variant_of(stem, {**shape, **defines}, OPTIONS))
+
+        def enqueue(device: Device, kernel: Any, size: Any, local: Any, values: Any, *, wait: bool = False) -> None:
+            del device, wait
+            memory = sum(value.size for value in values if isinstance(value, cl.LocalMemory))
+            entry = {"kernel": kernel.name, **noted(kernel.variant), "size": size, "local": local, "shared": memory}
+            rehearsed.launches.append(entry)
+
+        def add(recorder: profile.Recorder, name: str, event: object, nbytes: int) -> None:
+            del event
+            stack = recorder._stack  # noqa: SLF001
+            entry = {"stage": stack[0] if stack else profile.OUTSIDE, "bytes": nbytes}
+            if rehearsed.launches and rehearsed.launches[-1]["kernel"] == name:
+                rehearsed.launches[-1].update(entry)
+            else:
+                rehearsed.launches.append({"kernel": name, **entry})
+
+        def note(array: DeviceArray, name: str) -> None:
+            if array.device.recorder.on:
+                array.device.recorder.add(name, None, array.nbytes)
+
+        def read_into(array: DeviceArray, host: np.ndarray) -> None:  # type: ignore[type-arg]
+            host[...] = 0
+            if array.shape in ((len(COUNTED),), (len(READBACK),)):
+                host[: len(COUNTED)] = rehearsed.counted()
+            note(array, "read")
+
+        Device._built = built  # type: ignore[assignment,method-assign]  # noqa: SLF001
+        Device.enqueue = enqueue  # type: ignore[assignment,method-assign]
+        profile.Recorder.add = add  # type: ignore[assignment,method-assign]
+        buffers._Buffer = _Buffer  # type: ignore[assignment,misc]  # noqa: SLF001
+        DeviceArray.read_into = read_into  # type: ignore[assignment,method-assign]
+        DeviceArray.set = lambda array, values: note(array, "write")  # type: ignore[assignment,method-assign]
+        DeviceArray.fill = lambda array, value: note(array, "fill")  # type: ignore[assignment,method-assign]
+
+    def counted(self) -> list[int]:
+        """The numbers that a forward pass reads back."""
+        least = 0x3F800000
+        largest = least + (1 << self.frame["key_bits"]) - 1
+        return [self.frame["visible"], self.frame["listed"], 2**32 - 1 - least, largest]
+
+
+def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The launches of a training step of this frame, copies among them, each with its stage and bytes."""
+    rehearsed = Rehearsed(frame)
+    rehearsed.install()
+    device = Device(all_devices()[0], shape).with_memory_limit(MEMORY)
+    device.kind, device.max_allocation = "gpu", MEMORY
+    width, height, count = frame["width"], frame["height"], frame["gaussians"]
+    camera = Camera(width, height, float(width), float(width), width / 2, height / 2, np.eye(3), np.zeros(3))
+    groups = ((3,), (4,), (3,), (), ((frame["sh_degree"] + 1) ** 2, 3))
+    gaussians = Gaussians(*(np.zeros((count, *group), np.float32) for group in groups))
+    photograph = np.zeros((height, width, 3), np.uint8)
+    trainer = trainer_of(Subject("rehearsed", gaussians, camera, photograph), device, RasterizerConfig())
+    trainer.train_step()  # the first makes what later ones find
+    rehearsed.launches.clear()
+    device.recorder.on = trainer.device.recorder.on = True
+    trainer.train_step()
+    device.recorder.on = False
+    return rehearsed.launches
+
+
+def every(shape: Shape) -> list[dict[str, Any]]:
+    """Every variant that the workload of the check of memory builds, without a repetition, in order."""
+    variants: dict[str, dict[str, Any]] = {}
+    built = Device._built  # noqa: SLF001
+
+    def note(device: Device, stem: str, defines: Mapping[str, object]) -> Any:
+        sizes = {"LANES": device.shape.lanes, "ITEMS": device.shape.items}
+        variant = variant_of(stem, {**sizes, **defines}, OPTIONS)
+        variants.setdefault(variant.digest, noted(variant))
+        return built(device, stem, defines)
+
+    Device._built = note  # type: ignore[method-assign]  # noqa: SLF001
+    device = Device(all_devices()[0], shape)
+    device.kind = "gpu"
+    work = memory_workload
+    for part in (work.training, work.frames, work.sorts, work.limits, work.rendering, work.pictures):
+        part(device)
+    return list(variants.values())
+
+
+def main(arguments: list[str]) -> int:
+    """Print what the arguments ask for."""
+    lanes, items = map(int, arguments[1].split("x"))
+    shape = Shape(lanes, items, chunks=64)
+    if arguments[0] == "all":
+        print(json.dumps(every(shape)))
+    else:
+        print(json.dumps([step(shape, json.loads(frame)) for frame in arguments[2:]]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
