@@ -3,15 +3,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from math import inf, isclose, isfinite
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from clsplat.cli.options import DeviceOptions, Flag, RunOrModel, ScenePath, Verb
-from clsplat.cli.session import Services
+from clsplat.cli.session import Services, load_scene
+from clsplat.config.checks import Rule, check_rules
 from clsplat.config.verbs import TEST_EVERY
+from clsplat.errors import InputError, warn
+from clsplat.files import check_new, is_file, read_document
+from clsplat.progress import StageProgress
+from clsplat.selftest.result import FORWARD
+
+if TYPE_CHECKING:
+    from clsplat.arrays import Float32, Float64
+    from clsplat.camera import Camera
+    from clsplat.gaussians import Gaussians
+    from clsplat.models.formats import Format
+
+    NamedModel = tuple[Path, Gaussians]
+
+QUICK = 2.0
+"""Seconds that writing a file may take without a word."""
+NEAR_SLACK = 0.05
+"""A part of a near plane: where a file has none it follows from positions, which a format may have rounded."""
+MAX_MATRIX = 1 << 16
+"""Bytes of a file with a matrix."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +85,209 @@ class Convert(Verb):
 
 
 def run(verb: Convert, services: Services) -> int:
-    """Read, edit, write, read back."""
-    from clsplat.cli.convert_work import convert
+    """Read, edit, write, read back. What is wrong with the call is found before anything is written."""
+    from clsplat.images import colour
+    from clsplat.models import difference, edit
+    from clsplat.models.formats import format_of, format_of_name, load, save
+    from clsplat.runs.run import model_file
 
-    return convert(verb, services)
+    source, merged = model_file(verb.source), [model_file(path) for path in verb.merge]
+    _check(verb)
+    matrix = _similarity(verb)
+    target_format = format_of_name(verb.target, writable=True)
+    check_new(verb.target, overwrite=verb.overwrite, sources=[source, *merged])
+    for companion in target_format.side_files(verb.target):
+        check_new(companion, overwrite=verb.overwrite)
+    original, space = load(source), colour.recorded_space(source)
+    edited = _edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
+    comments = () if space == colour.SRGB else (colour.comment(space),)
+    save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK))
+    if space != colour.recorded_space(verb.target):
+        warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
+    read = load(verb.target)
+    if not isclose(read.near, edited.near, rel_tol=NEAR_SLACK):
+        warn(
+            f"{verb.target}: {target_format.name} has no place for the near plane, which is {edited.near:.4g}; readers "
+            f"will take {read.near:.4g}"
+        )
+    written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
+    result: dict[str, Any] = {
+        "source": _described(source, format_of(source), original),
+        "target": _described(verb.target, target_format, read),
+        "errors": difference.errors(written, read),
+    }
+    if verb.scene is not None:
+        result["scene"] = _measured(verb, services, original, read, matrix)
+    if verb.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    for model in (result["source"], result["target"]):
+        gaussians = f"{model['gaussians']:,} Gaussians of SH degree {model['sh_degree']}"
+        print(f"{model['path']}: {model['format']}, {gaussians}, {model['bytes']:,} bytes")
+    print(difference.table(result["errors"]))
+    if verb.scene is not None:
+        scene = result["scene"]
+        print(f"{len(scene['views'])} views  PSNR {scene['before']:.2f} dB before, {scene['after']:.2f} after; the "
+              f"renders against each other {scene['between']:.2f}, at least {scene['least_between']:.2f}")  # fmt: skip
+    return 0
+
+
+def _check(verb: Convert) -> None:
+    """Raise InputError for a number out of its range, and for flags that lack their companion."""
+    from clsplat.gaussians import MAX_SH_DEGREE
+
+    rules: tuple[Rule, ...] = (
+        (("scale",), lambda value: value is None or 0 < value < inf, "a number over 0"),
+        (("prune_opacity",), lambda value: value is None or 0 <= value <= 1, "0 to 1"),
+        (("prune_contribution",), lambda value: value is None or 0 < value < inf, "pixels, a number over 0"),
+        (("drop_sh",), lambda value: value is None or 0 <= value <= MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
+        (("test_every", "resolution"), lambda value: value >= 0, "at least 0"),
+    )
+    check_rules(verb, "--", rules)
+    if (verb.prune_contribution is None) != (verb.cameras is None):
+        raise InputError("--prune-contribution and --cameras go together: contributions are to these cameras")
+    defaults = {field.name: field.default for field in fields(verb)}
+    names = [name for name in ("test_every", "resolution", "background") if getattr(verb, name) != defaults[name]]
+    if verb.scene is None and names:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+        raise InputError(f"{flags}: of measuring on a scene, expected --scene with it")
+
+
+def _described(path: Path, form: Format, gaussians: Gaussians) -> dict[str, Any]:
+    from clsplat.models.info import size
+
+    file = {"path": str(path), "format": form.name, "bytes": size(path, form)}
+    return file | {"gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}
+
+
+def _edited(
+    verb: Convert, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
+) -> Gaussians:
+    """The source's Gaussians after all edits, in the order that --help names. Raises InputError where none is left."""
+    from clsplat.models import edit
+
+    gaussians = source[1]
+    if others:
+        for other in others:
+            _warn_of_mismatch(other, source)
+        gaussians = edit.merge([gaussians, *(other for _, other in others)])
+    gaussians = _thinned(verb, services, gaussians)
+    if matrix is not None:
+        gaussians = edit.transform(gaussians, matrix)
+    return gaussians if verb.drop_sh is None else edit.drop_sh(gaussians, verb.drop_sh)
+
+
+def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
+    """Warn where a model that is merged is in another colour space, or far from the source."""
+    import numpy as np
+
+    from clsplat.images import colour
+    from clsplat.models import edit
+
+    (path, other), (first_path, first) = merged, source
+    space, expected = colour.recorded_space(path), colour.recorded_space(first_path)
+    if space != expected:
+        warn(
+            f"--merge {path}: its colours are of {space}, those of {first_path} of {expected}, as which all will count"
+        )
+    distance = float(np.linalg.norm(other.origin - first.origin))
+    if len(other) and distance > edit.FAR * float(other.means.std(axis=0).max()):
+        step = float(np.spacing(np.float32(distance)))
+        warn(
+            f"--merge {path}: counts from a place {distance:.6g} world units from that of {first_path}; its positions "
+            f"are rounded to {step:.2g}. Is only one of the two georeferenced?"
+        )
+
+
+def _similarity(verb: Convert) -> Float64 | None:
+    """--transform, then --scale, as one (4, 4); None without them. Raises InputError."""
+    import numpy as np
+
+    from clsplat.models import edit
+
+    if verb.transform is None and verb.scale is None:
+        return None
+    matrix: Float64 = np.eye(4)
+    if (text := verb.transform) is not None:
+        words = read_document(Path(text), "a text file of 16 numbers", MAX_MATRIX) if is_file(text) else text
+        matrix = np.array(_numbers("transform", words, 16)).reshape(4, 4)
+    try:
+        edit.decompose(matrix)
+    except InputError as error:
+        raise InputError(f"--transform {verb.transform}: {error}") from None
+    return matrix if verb.scale is None else edit.scaling(verb.scale) @ matrix
+
+
+def _numbers(flag: str, text: str, count: int) -> list[float]:
+    """Finite numbers with commas or blanks between them, brackets passed over. Raises InputError."""
+    words = text.translate(str.maketrans("[],;", "    ")).split()
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(isfinite, values)):
+        raise InputError(f"--{flag} {text[:80]}: expected {count} numbers with commas")
+    return values
+
+
+def _thinned(verb: Convert, services: Services, gaussians: Gaussians) -> Gaussians:
+    """Cropped and pruned. Raises InputError where nothing is left."""
+    from clsplat.models import edit
+    from clsplat.rendering.contributions import largest_contributions
+    from clsplat.shots import choose_shot
+
+    def keep(flag: str, rows: Any) -> None:
+        nonlocal gaussians
+        if not rows.any():
+            raise InputError(f"--{flag}: none of the {len(gaussians):,} Gaussians is left")
+        gaussians = gaussians if rows.all() else edit.take(gaussians, rows)
+
+    if verb.crop is not None:
+        corners = _numbers("crop", verb.crop, 6)
+        if any(low > high for low, high in zip(corners[:3], corners[3:], strict=True)):
+            raise InputError(f"--crop {verb.crop}: expected X0 <= X1, Y0 <= Y1 and Z0 <= Z1")
+        keep("crop", edit.in_box(gaussians, corners[:3], corners[3:]))
+    if verb.crop_sphere is not None:
+        *centre, radius = _numbers("crop-sphere", verb.crop_sphere, 4)
+        keep("crop-sphere", edit.in_sphere(gaussians, centre, radius))
+    if verb.prune_opacity is not None:
+        keep("prune-opacity", edit.opaque(gaussians, verb.prune_opacity))
+    if verb.prune_contribution is not None and verb.cameras is not None:
+        shot = choose_shot(verb.cameras)
+        for text in shot.warnings:
+            warn(text)
+        contributions = largest_contributions(gaussians, shot.cameras, verb.device.trusted(services))
+        keep("prune-contribution", contributions >= verb.prune_contribution)
+    return gaussians
+
+
+def _measured(
+    verb: Convert, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
+) -> dict[str, Any]:
+    """PSNR in dB of the model as it was read and of the one that was written, against the photographs and against each
+    other: of each view, and the means. The cameras of the written model move along with it."""
+    import numpy as np
+
+    from clsplat.evaluation.metrics import psnr
+    from clsplat.images.alpha import background_colour, composite
+    from clsplat.models import edit
+
+    device = verb.device.open(services)
+    assert verb.scene is not None
+    scene = load_scene(services, verb.scene, verb.resolution, verb.test_every)
+    renderer = services.renderer(services.require(device, FORWARD))
+    background = background_colour(verb.background)
+
+    def images(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Float32]:
+        return [renderer.render(gaussians, camera, background).image for camera in cameras]
+
+    views = scene.test_views or scene.views
+    cameras = [view.camera for view in views]
+    moved = cameras if matrix is None else [edit.transform_camera(camera, matrix) for camera in cameras]
+    records: list[dict[str, Any]] = []
+    for view, before, after in zip(views, images(original, cameras), images(read, moved), strict=True):
+        photograph = composite(view.load(), background)
+        scores = {"before": psnr(before, photograph), "after": psnr(after, photograph), "between": psnr(before, after)}
+        records.append({"name": view.name, **scores})
+    mean = {key: float(np.mean([record[key] for record in records])) for key in ("before", "after", "between")}
+    return {**mean, "least_between": min(record["between"] for record in records), "views": records}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`clsplat render`: its flags, and a job from the call to the exit status.
 
-A call is checked in `clsplat.cli.render_request`, --dry-run is in `clsplat.cli.render_plan`, the job's loop in
+The job is a `clsplat.cli.render_job.Job`, --dry-run is in `clsplat.cli.render_plan`, the job's loop in
 `clsplat.sequence.workers`, one frame in `clsplat.sequence.frame_renderer`, clusters in `clsplat.sequence.farm`.
 """
 
@@ -11,7 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,27 +19,41 @@ from tyro.conf import arg
 
 from clsplat.cli.options import Flag, Memory, OptionalInt, RunOrModel, Verb, with_given
 from clsplat.cli.session import Services
+from clsplat.config.checks import parse_bytes
 from clsplat.config.pictures import (
     EXR_DEPTH,
     ColourConfig,
     Compression,
     DeepConfig,
+    Encoding,
     ExrDepth,
     FramingConfig,
     Parts,
+    PictureConfig,
     SamplingConfig,
     VideoConfig,
 )
 from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.errors import examples, warn
+from clsplat.errors import InputError, examples, warn
+from clsplat.files import check_new, digest
 from clsplat.process import terminable
 from clsplat.progress import FrameProgress
 
 if TYPE_CHECKING:
-    from clsplat.cli.render_request import Job
+    from clsplat.cli.render_job import Job
     from clsplat.images.video import VideoWriter
-    from clsplat.sequence.task import Record, Task
+    from clsplat.sequence.task import Record, RenderOptions, Task
+    from clsplat.shots import Shot
+
+
+_PICTURES = (".png", ".tif", ".tiff")
+_USED_BY = {
+    **dict.fromkeys(("exr", "parts", "compression"), (".exr",)),
+    "bits": _PICTURES,
+    "quality": (".jpg", ".jpeg"),
+}
+"""The files that each of the encoding's flags is for."""
 
 
 @dataclass(frozen=True)
@@ -147,31 +161,186 @@ class Render(Verb):
 
 def run(verb: Render, services: Services) -> int:
     """Model and cameras to images."""
-    from clsplat.cli.render_request import read_job
-
-    job = read_job(verb)
+    job = _read_job(verb)
     if verb.dry_run:
         from clsplat.cli.render_plan import dry_run
 
-        return dry_run(job)
+        return dry_run(job, as_json=verb.json)
     renderers = []
     if not job.on_farm:
         how: dict[str, Any] = {"memory_limit": job.memory_limit, "profile": verb.profile}
-        model = (job.gaussians, job.options, job.verb.rasterizer)
+        model = (job.gaussians, job.options, job.rasterizer)
         renderers = [services.open_frame_renderer(*model, device=selector, **how) for selector in job.devices]
         for renderer in renderers:
             renderer.check(job.tasks)
     with terminable():  # again, as pycolmap and compilers of kernels install handlers of their own
-        return _write_frames(job, renderers)
+        return _write_frames(verb, job, renderers)
 
 
-def _write_frames(job: Job, renderers: Sequence[Any]) -> int:
-    from clsplat.cli.render_request import check_foreign, frames_there
+def _read_job(verb: Render) -> Job:
+    """All that can be checked without rendering. Raises InputError and DeviceError; writes nothing."""
+    import clsplat
+    from clsplat.cli.render_job import Job, check_pictures, resizer
+    from clsplat.gaussians import Gaussians
+    from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
+    from clsplat.images.frame_files import VIDEO
+    from clsplat.runs.run import model_file
+    from clsplat.sequence import existing
+    from clsplat.sequence.task import digest_of, make_tasks
+    from clsplat.shots import choose_shot
+
+    options = _options(verb)
+    verb.rasterizer.check()
+    limit = parse_bytes(verb.max_device_mem)
+    resize = resizer(verb.width, verb.height, verb.scale)
+    devices = _devices(verb)
+    size = (verb.width, verb.height)
+    whole = choose_shot(verb.cameras, path=verb.path, count=verb.count, size=size, usd_camera=verb.usd_camera)
+    chosen = whole if verb.frames is None else whole.only(verb.frames)
+    sampling = options.pictures.sampling
+    tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
+    check_pictures(tasks, options)
+    existing.check_folders(tasks)
+    if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
+        check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
+    _warn_of_unused(verb, options.channels)
+    for text in chosen.warnings:
+        warn(text)
+    model = model_file(verb.model)
+    gaussians = Gaussians.load(model)
+    tasks = [task.seen_from(gaussians.near) for task in tasks]
+    recorded = recorded_space(model)
+    colours = Colours(options.pictures.colour, recorded)
+    extension = Path(verb.output).suffix.lower()
+    colours.check_file(verb.output, extension, VIDEO)
+    if extension == ".exr" and colours.is_linear(colours.output) and colours.output not in CHROMATICITIES:
+        warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
+    attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
+    attributes["clsplat:colorspace"] = colours.output
+    options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer))
+    spaces = (colours.model, colours.output)
+    video = _video(verb, whole)
+    on_farm = verb.workers is not None or verb.scheduler is not None
+    return Job(
+        options, verb.rasterizer, model, gaussians, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing
+    )
+
+
+def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:
+    """Warn of flags that the files have no use for."""
+    extension, defaults = Path(verb.output).suffix.lower(), {field.name: field.default for field in fields(Render)}
+    unused = [
+        name
+        for name, extensions in _USED_BY.items()
+        if extension not in extensions and getattr(verb, name) != defaults[name] and not (name == "exr" and verb.deep)
+    ]
+    if "rgb" not in channels and verb.background is not None:
+        unused.append("background")
+    if unused:
+        what = extension if "background" not in unused else f"{extension} of these channels"
+        warn(f"not used for {what}: {', '.join(f'--{name}' for name in unused)}")
+
+
+def _video(verb: Render, shot: Shot) -> VideoConfig:
+    """The video's settings, with the rate of the shot where no other is asked for. Raises InputError."""
+    from clsplat.images.frame_files import VIDEO
+
+    video = verb.video if verb.video.fps is not None or shot.fps is None else replace(verb.video, fps=shot.fps)
+    if Path(verb.output).suffix.lower() == VIDEO and video is not verb.video:
+        try:
+            video.check()
+        except InputError:
+            raise InputError(
+                f"{verb.cameras}: has {shot.fps:g} frames a second, expected 0.01 to 1000; give --video.fps"
+            ) from None
+    return video
+
+
+def _options(verb: Render) -> RenderOptions:
+    from clsplat.cli.render_job import for_workers, parse_colour
+    from clsplat.images.frame_files import VIDEO, check_format, parse_channels
+    from clsplat.sequence.task import RenderOptions
+
+    pictures = PictureConfig(for_workers(verb.colour), verb.framing, verb.sampling)
+    pictures.check()
+    video = Path(verb.output).suffix.lower() == VIDEO
+    channels = parse_channels(f"{verb.channels},alpha" if verb.alpha or verb.deep else verb.channels)
+    check_format(verb.output, channels, video=True)
+    if not 1 <= verb.quality <= 100:
+        raise InputError(f"--quality {verb.quality}: expected 1 to 100")
+    if "alpha" in channels and verb.background is not None:
+        flag = "--deep" if verb.deep else "--alpha" if verb.alpha else "--channels alpha"
+        raise InputError(f"{flag} and --background exclude each other: with alpha there is no background")
+    verb.slices.check()
+    verb.video.check()
+    if verb.deep:
+        pictures.check_deep()
+        _check_deep(verb, channels)
+    elif verb.slices != DeepConfig():
+        raise InputError("--deep.bins, --deep.near and --deep.far are of deep EXR, expected --deep with them")
+    if video:
+        _check_video(verb)
+    elif verb.video != VideoConfig():
+        raise InputError(f"-o {verb.output}: --video flags are of videos, expected the name of an {VIDEO} file")
+    encoding = Encoding(verb.exr, verb.parts, verb.compression, verb.bits, verb.quality)
+    colour = parse_colour(verb.background or "black")
+    return RenderOptions(channels, colour, encoding, pictures=pictures, deep=verb.slices if verb.deep else None)
+
+
+def _check_deep(verb: Render, channels: tuple[str, ...]) -> None:
+    if Path(verb.output).suffix.lower() != ".exr":
+        raise InputError(f"--deep: {verb.output} cannot hold deep samples, expected an .exr file")
+    if over := [name for name in channels if name not in ("rgb", "alpha")]:
+        raise InputError(f"--deep: has no {', '.join(over)} beside colour, alpha and depths, expected --channels rgb")
+    if verb.parts != "one":
+        raise InputError("--deep and --parts several exclude each other: a deep file has one part")
+
+
+def _check_video(verb: Render) -> None:
+    from clsplat.images.video import video_missing
+
+    if reason := video_missing():
+        raise InputError(f"{verb.output}: {reason}")
+    if verb.skip_existing:
+        raise InputError(
+            "--skip-existing: a video is written as a whole; leave the flag out, or write a picture for each frame"
+        )
+
+
+def _devices(verb: Render) -> tuple[str | None, ...]:
+    """The selectors in --device."""
+    if verb.workers is not None and verb.workers < 1:
+        raise InputError(f"--workers {verb.workers}: expected at least 1")
+    if verb.workers is not None and verb.scheduler is not None:
+        raise InputError("--workers and --scheduler exclude each other: a new cluster here, or one that is there")
+    words = [word.strip() for word in verb.device.split(",")] if verb.device else []
+    if not words:
+        return (None,)
+    farm = "--workers" if verb.workers is not None else "--scheduler" if verb.scheduler is not None else None
+    if farm and (len(words) > 1 or words == ["all"]):
+        raise InputError(f"--device {verb.device} and {farm} exclude each other: a worker has one device")
+    if farm:
+        return (words[0],)
+    if words == ["all"]:
+        from clsplat.device.context import list_devices
+
+        words = [str(info.index) for info in list_devices()]
+    elif len(words) > 1:
+        from clsplat.device.context import find_device
+
+        if len({find_device(word).index for word in words}) < len(words):
+            raise InputError(f"--device {verb.device}: names a device twice, expected each once")
+    return tuple(words)
+
+
+def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
+    from clsplat.cli.render_job import check_foreign, frames_there
     from clsplat.sequence import existing, workers
 
-    verb, tasks, options = job.verb, job.tasks, job.options
+    tasks, options = job.tasks, job.options
     there = frames_there(job)
-    check_foreign(job, there)
+    if not (verb.overwrite or job.is_video):
+        check_foreign(job, there)
     existing.make_folders(tasks)
     existing.remove_temporaries(tasks)
     records: dict[int, Record] = {}
@@ -192,7 +361,7 @@ def _write_frames(job: Job, renderers: Sequence[Any]) -> int:
                     done(workers.record_of(task, options, skipped=True))
             left = [task for task in tasks if task.number not in there]
             if job.on_farm:
-                _on_farm(job, left, done, video)
+                _on_farm(verb, job, left, done, video)
             else:
                 workers.run_tasks(left, renderers, options, done, video)
     except KeyboardInterrupt as error:
@@ -212,14 +381,15 @@ def _write_frames(job: Job, renderers: Sequence[Any]) -> int:
     return 0
 
 
-def _on_farm(job: Job, tasks: Sequence[Task], done: Callable[[Record], None], video: VideoWriter | None) -> None:
+def _on_farm(
+    verb: Render, job: Job, tasks: Sequence[Task], done: Callable[[Record], None], video: VideoWriter | None
+) -> None:
     from clsplat.sequence.farm import WorkerJob, render_on_farm
 
-    verb = job.verb
     if verb.profile:
         warn("--profile is not used: it is for devices of this process")
     model = str(job.model.absolute())
-    worker_job = WorkerJob(model, job.digest, job.options, job.verb.rasterizer, job.devices[0], job.memory_limit)
+    worker_job = WorkerJob(model, job.digest, job.options, job.rasterizer, job.devices[0], job.memory_limit)
     render_on_farm(tasks, worker_job, done, scheduler=verb.scheduler, workers=verb.workers, video=video)
 
 

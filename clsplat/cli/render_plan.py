@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from clsplat.cli.render_request import Job, frames_there
+from clsplat.cli.render_job import Job, frames_there
 from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import FPS
 from clsplat.device.context import open_device
@@ -37,11 +37,11 @@ class DevicePlan:
     strips: int
 
 
-def dry_run(job: Job) -> int:
+def dry_run(job: Job, *, as_json: bool) -> int:
     """Print the plan. Raises DeviceError, and CapacityError where a frame does not fit."""
     plans = [] if job.on_farm else [_device_plan(job, selector) for selector in job.devices]
     document = _document(job, plans)
-    print(json.dumps(document, indent=2) if job.verb.json else "\n".join(_lines(job, document, plans)))
+    print(json.dumps(document, indent=2) if as_json else "\n".join(_lines(job, document, plans)))
     return 0
 
 
@@ -107,7 +107,7 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
         strips = f"; {device.strips} strips a frame" if device.strips > 1 else ""
         yield f"device    {device.device}: {device.plan}{strips}"
     yield f"host      about {amount(document['host_bytes'])} for frames that wait to be written"
-    if job.verb.skip_existing:
+    if job.skip_existing:
         skipped = sorted(frame["frame"] for frame in frames if frame["skipped"])
         yield f"skipped   {len(skipped)}" + (f": {ranges(skipped)}" if skipped else "")
 
@@ -115,7 +115,7 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
 def _device_plan(job: Job, selector: str | None) -> DevicePlan:
     """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
     device, options = open_device(selector, job.memory_limit), job.options
-    floats = held_sh(job.gaussians, job.verb.rasterizer).floats
+    floats = held_sh(job.gaussians, job.rasterizer).floats
     framing, names = options.pictures.framing, set(options.channels)
     features = feature_floats(names)
     plans = []
@@ -130,7 +130,7 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
         if framing.supersample > 1 and light_and_rest(names)[0]:
             drawn.append((finer(strip, framing), 0))
         for part, floats_beside in drawn:
-            sizes = (on_tiles(part)[0], job.verb.rasterizer, floats_beside, planes)
+            sizes = (on_tiles(part)[0], job.rasterizer, floats_beside, planes)
             plan = plan_frame(device, len(job.gaussians), floats, *sizes)
             plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
     return max(plans, key=lambda device: device.plan.need.total)

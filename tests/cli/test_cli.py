@@ -44,8 +44,9 @@ def test_every_training_flag_has_help(capsys: Capture) -> None:
         assert part in text
 
 
-def test_help_loads_nothing_heavy() -> None:
-    code = "import sys, clsplat, clsplat.cli.main; clsplat.cli.main.main(['train', '--help']); "
+@pytest.mark.parametrize("verb", ["train", "convert", "render"])
+def test_help_loads_nothing_heavy(verb: str) -> None:
+    code = f"import sys, clsplat, clsplat.cli.main; clsplat.cli.main.main(['{verb}', '--help']); "
     code += "heavy = {'pyopencl', 'pycolmap', 'scipy', 'skimage', 'OpenImageIO'} & set(sys.modules); "
     code += "sys.exit(str(heavy) if heavy else 0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

@@ -13,7 +13,7 @@ from fakes import Pipeline, camera
 
 from clsplat.cli.main import main, parse
 from clsplat.cli.render import Render
-from clsplat.cli.render_request import resizer
+from clsplat.cli.render_job import resizer
 from clsplat.config.presets import PRESETS
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import TrainConfig

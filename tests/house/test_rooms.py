@@ -85,12 +85,7 @@ def test_a_planted_import_is_found(copy: Path, module: str, line: str, told: str
     assert told in " ".join(done.stdout.split())
 
 
-LATE = {
-    "clsplat.gaussians": {"clsplat.models.formats"},  # Gaussians.load and save
-    # a verb imports its own work when it is called
-    "clsplat.cli.render": {"clsplat.cli.render_request", "clsplat.cli.render_plan"},
-    "clsplat.cli.convert": {"clsplat.cli.convert_work"},
-}
+LATE = {"clsplat.gaussians": {"clsplat.models.formats"}}  # Gaussians.load and save
 """Imports that a function makes on purpose, against the order of the modules."""
 
 

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A job of `clsplat render`, and those of its checks that ask for no flags."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from clsplat.camera import Camera
+from clsplat.config.pictures import ColourConfig, VideoConfig
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.errors import InputError, examples, warn
+from clsplat.frame.samples import finer
+from clsplat.gaussians import Gaussians
+from clsplat.images.alpha import background_colour
+from clsplat.sequence import existing
+from clsplat.sequence.task import RenderOptions, Task, picture_camera
+
+
+@dataclass(frozen=True)
+class Job:
+    """A call, read and checked. devices: selectors, None for the usual one; spaces: the model's colour space and that
+    of the pictures; video: its encoding, with the rate; on_farm: other processes render, workers or those of a Dask
+    scheduler."""
+
+    options: RenderOptions
+    rasterizer: RasterizerConfig
+    model: Path
+    gaussians: Gaussians
+    tasks: list[Task]
+    devices: tuple[str | None, ...]
+    memory_limit: int | None
+    spaces: tuple[str, str]
+    video: VideoConfig
+    on_farm: bool
+    skip_existing: bool
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the model file."""
+        return str(self.options.attributes["clsplat:model"])
+
+    @property
+    def is_video(self) -> bool:
+        """True if all frames go into one file."""
+        return self.tasks[0].is_video
+
+
+def frames_there(job: Job) -> set[int]:
+    """The numbers of the frames that `--skip-existing` leaves out. Warns of files that do not record the settings they
+    were made with."""
+    if not job.skip_existing:
+        return set()
+    there = existing.complete(job.tasks, job.options)
+    if unknown := existing.untold([task for task in job.tasks if task.number in there]):
+        warn(
+            f"--skip-existing: {len(unknown)} of the frames that are there do not say how they were made, such as "
+            f"{unknown[0]}: they are kept, whatever their cameras, precision and other settings are"
+        )
+    return there
+
+
+def check_foreign(job: Job, there: Collection[int]) -> None:
+    """Raise InputError where a frame that is not `there` would replace another program's picture."""
+    if others := existing.foreign([task for task in job.tasks if task.number not in there]):
+        raise InputError(
+            f"{examples(others)}: there already, and no frames of clsplat; name other files, or give --overwrite to "
+            "replace pictures that it did not make"
+        )
+
+
+def for_workers(colour: ColourConfig) -> ColourConfig:
+    """The colour settings with the absolute path of the OCIO configuration, for processes in other folders."""
+    source = colour.ocio_config or os.environ.get("OCIO", "")
+    if source and "://" not in source:
+        source = str(Path(source).absolute())
+    return replace(colour, ocio_config=source)
+
+
+def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
+    """Raise InputError for a frame that the framing does not suit, and for a video of several sizes."""
+    sizes = set()
+    for task in tasks:
+        camera = picture_camera(task, options)
+        if options.pictures.framing.supersample > 1:
+            finer(camera, options.pictures.framing)
+        sizes.add(f"{camera.width}x{camera.height}")
+    if tasks[0].is_video and len(sizes) > 1:
+        raise InputError(
+            f"{tasks[0].path}: frames are of the sizes {examples(sorted(sizes))}, expected one; give --width and "
+            "--height"
+        )
+    if tasks[0].is_video:
+        from clsplat.images.video import check_size
+
+        check_size(tasks[0].path, camera.width, camera.height)
+
+
+def parse_colour(text: str) -> tuple[float, float, float]:
+    """black, white or three numbers from 0 to 1. Raises InputError."""
+    if text in ("black", "white"):
+        return background_colour(text)
+    try:
+        red, green, blue = (float(word) for word in text.split(","))
+    except ValueError:
+        red = green = blue = -1.0
+    if not (0 <= red <= 1 and 0 <= green <= 1 and 0 <= blue <= 1):
+        raise InputError(f"--background {text}: expected black, white or three numbers from 0 to 1 such as 0.2,0.2,0.3")
+    return red, green, blue
+
+
+def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Camera], Camera]:
+    """A camera's size after --width, --height and --scale. Raises InputError for sizes that make no sense."""
+    for flag, value in (("--width", width), ("--height", height), ("--scale", scale)):
+        if value is not None and not 0 < value < float("inf"):
+            raise InputError(f"{flag} {value}: expected a number above 0")
+    if scale != 1 and (width or height):
+        raise InputError("--scale and --width or --height exclude each other")
+
+    def resize(camera: Camera) -> Camera:
+        across, down = width, height
+        if across is None:
+            across = round(camera.width * (down / camera.height if down else scale))
+        if down is None:
+            down = round(camera.height * (across / camera.width if width else scale))
+        return reshaped(camera, max(1, across), max(1, down))
+
+    return resize
+
+
+def reshaped(camera: Camera, width: int, height: int) -> Camera:
+    """The camera in another size. In another shape, even if only by rounding, it keeps the vertical angle of view and
+    the pixels' proportions: the picture shows more or less to the left and right. So all sizes of one shape show the
+    same. A panorama shows all around in any shape."""
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    if width * camera.height == height * camera.width or camera.projection == "equirectangular":
+        return camera.resized(width, height)
+    scale = height / camera.height
+    middle = 0.5 * width + (camera.cx - 0.5 * camera.width) * scale
+    fx, fy, cy = camera.fx * scale, camera.fy * scale, camera.cy * scale
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=middle, cy=cy)
