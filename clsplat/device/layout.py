@@ -8,9 +8,6 @@ from dataclasses import dataclass
 TILE = 16
 """Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
-PAD = 16
-"""Zero columns on either side of the loss's planes, so that the horizontal window needs no bounds check."""
-
 _TRANSFORM = (
     *(f"R{row}{column}" for row in range(3) for column in range(3)),
     *("T0", "T1", "T2"),
@@ -92,7 +89,7 @@ WIDEST_SLOTS = SlotFields(absolute=True, contributions=True)
 
 def header() -> str:
     """The declarations as OpenCL C."""
-    lines = [f"#define TILE {TILE}", f"#define PAD {PAD}"]
+    lines = [f"#define TILE {TILE}"]
     layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK, "DEEP": DEEP}
     for prefix, fields in layouts.items():
         lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]
