@@ -3,12 +3,12 @@
 // of windows convolves the three partial derivatives, the adjoint of the first.
 //
 // Owner: A group owns blocks of one channel. At ITEMS == 1 it goes down a block row by row, keeps the derivatives of
-//   RING rows, and works out anew those that other blocks have too. Else a block is ROWS x COLUMNS pixels, and the
+//   LOSS_RING rows, and works out anew those that other blocks have too. Else a block is ROWS x COLUMNS pixels, and the
 //   derivatives of the image are written between two launches.
 // Launch: At ITEMS == 1 any number of groups, which share the blocks out; else a group of ITEMS for each block. Blocks
 //   are numbered across, then down, then by channel.
 // Buffers: image, target (3, rows, stride) in colour, padded to whole tiles, zero in the padding; partials at
-//   ITEMS == 1 (groups, RING, 3, field), else (3, 3, height, stride), kind first; gradient
+//   ITEMS == 1 (groups, LOSS_RING, 3, field), else (3, 3, height, stride), kind first; gradient
 //   (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its square: one a block,
 //   at ITEMS == 1 one for each of its rows.
 // Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79).
@@ -36,10 +36,12 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
 #define MARGIN ((REACH + LANES - 1) / LANES * LANES)
 #if ITEMS == 1
 #define ROWS 1
+#define COLUMNS LOSS_COLUMNS // at most
 #define NEAR_MARGIN (2 * MARGIN)
-#define RING_ROW(y) ((y) & (RING - 1))
+#define RING_ROW(y) ((y) & (LOSS_RING - 1))
 #else
 #define ROWS (ITEMS < 32 ? 1 : ITEMS > 256 ? 16 : ITEMS / 16)
+#define COLUMNS LOSS_GROUP_COLUMNS
 #define NEAR_MARGIN MARGIN
 #define RING_ROW(y) (y)
 #endif
@@ -232,7 +234,7 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
   Block block;
   block.width = width, block.height = height, block.stride = stride;
   block.field = field, block.pitch = (size_t)3 * field;
-  block.partials = partials + RING * block.pitch * get_group_id(0);
+  block.partials = partials + LOSS_RING * block.pitch * get_group_id(0);
   for (int index = get_group_id(0); index < 3 * down * across; index += get_num_groups(0)) {
     const int channel = index / (down * across), y0 = index / across % down * block_rows;
     const int y1 = min(y0 + block_rows, height);

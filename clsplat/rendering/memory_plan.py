@@ -87,8 +87,8 @@ class Plan:
 
 
 def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
-    """All at once if the guess of the pairs says so; else the tiles in bands, and when those would be many, the parameters
-    in parts: bands repeat little, parts go over the bus in every step.
+    """All at once if the guess of the pairs says so; else the tiles in bands, and when those would be many, the
+    parameters in parts: bands repeat little, parts go over the bus in every step.
 
     alignment: what the number of rows is a multiple of. Raises CapacityError where not even the smallest pieces fit.
     """

@@ -10,20 +10,14 @@ import numpy as np
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
-from clsplat.device.layout import TILE
+from clsplat.device.layout import LOSS_COLUMNS, LOSS_GROUP_COLUMNS, LOSS_RING, TILE
 from clsplat.device.profile import stage
 
 PIXEL_BYTES = 12
 """Bytes of the image's gradient, of each pixel with its padding."""
 
-_COLUMNS = 1024
-"""Most columns of a block where a group is one item: local memory holds five rows of one with its margins in 32 KiB."""
-_RING = 16
-"""Rows of derivatives that such a group keeps: a power of two, at least the window's 11."""
 _LEAST_ROWS = 32
 """Rows of such a block, at least: ten more are worked out anew."""
-_GROUP_COLUMNS = 32
-"""Columns of a block where a group has several items."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +41,15 @@ def _blocks(device: Device, height: int, stride: int) -> _Blocks:
     shape = device.shape
     if shape.items > 1:
         rows = min(max(shape.items // 16, 1), 16)  # as in loss.cl
-        groups = 3 * -(-height // rows) * -(-stride // _GROUP_COLUMNS)
-        return _Blocks(rows, _GROUP_COLUMNS, groups, 0, partials=9 * height * stride, sums=3 * groups)
-    columns = -(-stride // (-(-stride // _COLUMNS) * TILE)) * TILE
+        groups = 3 * -(-height // rows) * -(-stride // LOSS_GROUP_COLUMNS)
+        return _Blocks(rows, LOSS_GROUP_COLUMNS, groups, 0, partials=9 * height * stride, sums=3 * groups)
+    columns = -(-stride // (-(-stride // LOSS_COLUMNS) * TILE)) * TILE
     across = -(-stride // columns)
     rows = max(-(-height * across // shape.chunks), _LEAST_ROWS)  # so three blocks a piece of work, or fewer
     blocks = 3 * -(-height // rows) * across
     groups = blocks if blocks < 3 * shape.chunks else shape.chunks
     field = 16 * ((columns // 16 + 2) | 1)  # odd: rows that are a power of two apart drive each other out of a cache
-    return _Blocks(rows, columns, groups, field, partials=groups * _RING * 3 * field, sums=9 * height * across)
+    return _Blocks(rows, columns, groups, field, partials=groups * LOSS_RING * 3 * field, sums=9 * height * across)
 
 
 def scratch_bytes(device: Device, height: int, stride: int) -> int:
@@ -98,11 +92,11 @@ def loss(
     sizes, pictures, results = (width, height, stride, rows * stride), (image, target), (partials, gradient, sums)
     weights = ((1 - weight) / samples, weight / samples)
     if items == 1:
-        kernel = device.kernels("loss", COLUMNS=_COLUMNS, RING=_RING).loss
+        kernel = device.kernels("loss").loss
         block = (blocks.columns, blocks.rows, blocks.field)
         launch_groups(device, kernel, blocks.groups, 1, *sizes, *block, *weights, *pictures, *results)
     else:
-        kernels = device.kernels("loss", COLUMNS=_GROUP_COLUMNS)
+        kernels = device.kernels("loss")
         launch_groups(device, kernels.loss_ssim, blocks.groups, items, *sizes, *pictures, partials, sums)
         launch_groups(device, kernels.loss_grad, blocks.groups, items, *sizes, *weights, *pictures, *results)
     return Loss(gradient, sums, samples, weight)
