@@ -62,10 +62,12 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
 typedef struct {
   __global const float *image, *target;
   __global float *partials;
-  size_t pitch, field;
+  size_t field;
+  uint pitch;
   int x_partials, x0, x1, width, height, stride;
 } Block;
-#define PARTIALS_AT(block, x, y) ((block).partials + (block).pitch * RING_ROW(y) + (x) - (block).x_partials)
+#define PIXEL_AT(block, x, y) ((uint)(block).stride * (uint)(y) + (uint)(x))
+#define PARTIALS_AT(block, x, y) ((block).pitch * (uint)RING_ROW(y) + (uint)((x) - (block).x_partials))
 
 // Body for the vectors of ROWS rows that the item owns, with `margin` columns on either side: x, row, and `near_at`.
 #define FOR_VECTORS(block, margin)                                                                                     \
@@ -94,12 +96,12 @@ static inline void moments(const Block block, const int margin, const int y, __l
     float beyond = 0.0f; // what of the window is outside the image, where all is 0
     for (int tap = 0; tap < taps.x; ++tap) beyond += window[tap];
     for (int tap = taps.y; tap < TAPS; ++tap) beyond += window[tap];
-    const size_t here = (size_t)block.stride * (y + row) + x;
+    const uint here = PIXEL_AT(block, x, y + row);
     const floatL p0 = LOADL(block.image + here), q0 = LOADL(block.target + here);
     floatL a = -beyond * p0, b = -beyond * q0;
     floatL aa = -(a * p0), bb = -(b * q0), ab = -(a * q0);
-    for (int tap = taps.x; tap < taps.y; ++tap) {
-      const size_t at = here + (long)(tap - REACH) * block.stride;
+    uint at = PIXEL_AT(block, x, y + row + taps.x - REACH);
+    for (int tap = taps.x; tap < taps.y; ++tap, at += block.stride) {
       const floatL p = LOADL(block.image + at) - p0, q = LOADL(block.target + at) - q0;
       const floatL wp = window[tap] * p, wq = window[tap] * q;
       a += wp;
@@ -123,7 +125,7 @@ static inline float derivatives(const Block block, const int margin, const int y
   FOR_VECTORS(block, margin) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) continue;
-    const size_t here = (size_t)block.stride * (y + row) + x;
+    const uint here = PIXEL_AT(block, x, y + row);
     const floatL p = LOADL(block.image + here), q = LOADL(block.target + here);
     floatL off1 = (floatL)(0.0f), off2 = off1, var1 = off1, var2 = off1, covariance = off1; // off: means from p and q
     for (int tap = 0; tap < TAPS; ++tap) {
@@ -152,7 +154,7 @@ static inline float derivatives(const Block block, const int margin, const int y
     const intL inside = column < (floatL)(block.width);
     const floatL zero = (floatL)(0.0f);
     if (x >= block.x0 && x < block.x1) total += inside ? ssim : zero;
-    __global float *out = PARTIALS_AT(block, x, y + row);
+    __global float *out = block.partials + PARTIALS_AT(block, x, y + row);
     STOREL(inside ? by_mean : zero, out);
     STOREL(inside ? by_variance : zero, out + block.field);
     STOREL(inside ? by_covariance : zero, out + 2 * block.field);
@@ -170,16 +172,18 @@ static inline void adjoint_moments(const Block block, const int margin, const in
       continue;
     }
     const int2 taps = taps_inside(block, y + row);
-    const size_t here = (size_t)block.stride * (y + row) + x;
+    const uint here = PIXEL_AT(block, x, y + row);
     const floatL p0 = LOADL(block.image + here), q0 = LOADL(block.target + here);
     floatL by_mean = (floatL)(0.0f), by_variance = by_mean, by_covariance = by_mean;
-    for (int tap = taps.x; tap < taps.y; ++tap) {
-      __global const float *in = PARTIALS_AT(block, x, y + row + tap - REACH);
-      const size_t at = here + (long)(tap - REACH) * block.stride;
+    __global const float *means = block.partials, *variances = means + block.field,
+                         *covariances = variances + block.field;
+    uint at = PIXEL_AT(block, x, y + row + taps.x - REACH);
+    for (int tap = taps.x; tap < taps.y; ++tap, at += block.stride) {
+      const uint in = PARTIALS_AT(block, x, y + row + tap - REACH);
       const floatL p = LOADL(block.image + at) - p0, q = LOADL(block.target + at) - q0;
       const floatL w = (floatL)(window[tap]);
-      const floatL v = w * LOADL(in + block.field), c = w * LOADL(in + 2 * block.field);
-      by_mean = fmaL(w, LOADL(in), by_mean) - fmaL(2.0f * p, v, q * c);
+      const floatL v = w * LOADL(variances + in), c = w * LOADL(covariances + in);
+      by_mean = fmaL(w, LOADL(means + in), by_mean) - fmaL(2.0f * p, v, q * c);
       by_variance += v;
       by_covariance += c;
     }
@@ -199,7 +203,7 @@ static inline float2 differences(const Block block, const int y, const float l1_
   FOR_VECTORS(block, 0) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) continue;
-    const size_t here = (size_t)block.stride * (y + row) + x;
+    const uint here = PIXEL_AT(block, x, y + row);
     const floatL p = LOADL(block.image + here), q = LOADL(block.target + here);
     floatL ssim = (floatL)(0.0f);
     for (int tap = 0; tap < TAPS; ++tap) {
@@ -233,8 +237,8 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
   const size_t kind = (size_t)3 * height * across;
   Block block;
   block.width = width, block.height = height, block.stride = stride;
-  block.field = field, block.pitch = (size_t)3 * field;
-  block.partials = partials + LOSS_RING * block.pitch * get_group_id(0);
+  block.field = field, block.pitch = 3 * field;
+  block.partials = partials + (size_t)LOSS_RING * block.pitch * get_group_id(0);
   for (int index = get_group_id(0); index < 3 * down * across; index += get_num_groups(0)) {
     const int channel = index / (down * across), y0 = index / across % down * block_rows;
     const int y1 = min(y0 + block_rows, height);
