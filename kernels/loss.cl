@@ -1,20 +1,28 @@
 // The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient. SSIM has the usual 11 x 11 Gaussian window, sigma 1.5,
-// zeros outside the image. The window is separable: vertical first, which needs no margin, into planes with PAD zero
-// columns on either side, then horizontal without bounds checks. A second pair of passes convolves the three partial
-// derivatives, the adjoint of the first.
+// zeros outside the image. The window is separable: vertical first, into local memory, then horizontal. A second pair
+// of windows convolves the three partial derivatives, the adjoint of the first.
 //
-// Owner: A work-item owns every get_global_size(0)-th vector of one row of one channel: a whole row on a CPU.
-// Launch: A grid of strips x height x channels: all three channels at once, or one after the other where memory is
-//   short. `first` is the channel of the image that is the first of the launch's.
-// Buffers: image, target (3, rows, stride) in colour, padded to whole tiles; moments, partials and gradient, whose
-//   shapes are above each kernel; sums (3, 3, height, strips): SSIM, |image - target| and its square.
+// Owner: A group owns blocks of one channel. At ITEMS == 1 it goes down a block row by row, keeps the derivatives of
+//   LOSS_RING rows, and works out anew those that other blocks have too. Else a block is ROWS x COLUMNS pixels, and the
+//   derivatives of the image are written between two launches.
+// Launch: At ITEMS == 1 any number of groups, which share the blocks out; else a group of ITEMS for each block. Blocks
+//   are numbered across, then down, then by channel.
+// Buffers: image, target (3, rows, stride) in colour, padded to whole tiles, zero in the padding; partials at
+//   ITEMS == 1 (groups, LOSS_RING, 3, field), else (3, 3, height, stride), kind first; gradient
+//   (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its square: one a block,
+//   at ITEMS == 1 one for each of its rows.
 // Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79).
 //
 // E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So whatever a window is added up of counts from the
 // pixel in its middle (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is one of
 // differences between a pixel and its neighbours.
+#if ITEMS == 1 && LANES == 8 && defined(FMA_BY_CONTRACTION)
+#undef LANES // Two vectors at once: a window's sums are chains of additions, each of which waits for the one before.
+#define LANES 16
+#endif
 #include "shared/math.h"
 #include "shared/lanes.h"
+#include "shared/group.h"
 
 #define TAPS 11
 #define REACH 5
@@ -24,36 +32,77 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
                                  2.13005538e-1f, 2.66011725e-1f, 2.13005538e-1f, 1.09360690e-1f,
                                  3.60007721e-2f, 7.59875814e-3f, 1.02838008e-3f};
 
-// Zero the margins of one row of a padded plane; row points at its first pixel.
-static inline void clear_margins(__global float *row, int stride) {
-  for (int i = 0; i < PAD; ++i) row[i - PAD] = row[stride + i] = 0.0f;
+// Columns on either side of a block that a window reaches, in whole vectors.
+#define MARGIN ((REACH + LANES - 1) / LANES * LANES)
+#if ITEMS == 1
+#define ROWS 1
+#define COLUMNS LOSS_COLUMNS // at most
+#define NEAR_MARGIN (2 * MARGIN)
+#define RING_ROW(y) ((y) & (LOSS_RING - 1))
+#else
+#define ROWS (ITEMS < 32 ? 1 : ITEMS > 256 ? 16 : ITEMS / 16)
+#define COLUMNS LOSS_GROUP_COLUMNS
+#define NEAR_MARGIN MARGIN
+#define RING_ROW(y) (y)
+#endif
+
+// Local memory `near`: five fields of ROWS rows of a block, with margins.
+#define NEAR_WIDTH (COLUMNS + 2 * NEAR_MARGIN)
+#define NEAR_FIELD (ROWS * NEAR_WIDTH)
+#if LANES == 1
+#define LOAD_NEAR(p) (*(p))
+#define STORE_NEAR(x, p) (*(p) = (x))
+#else
+#define LOAD_NEAR(p) (*(__local const floatU *)(p))
+#define STORE_NEAR(x, p) (*(__local floatU *)(p) = (x))
+#endif
+
+// Columns x0 to x1 of one channel. partials: where its derivatives are, `pitch` floats from row to row, `field` from
+// one to the next, beginning at the column x_partials.
+typedef struct {
+  __global const float *image, *target;
+  __global float *partials;
+  size_t field;
+  uint pitch;
+  int x_partials, x0, x1, width, height, stride;
+} Block;
+#define PIXEL_AT(block, x, y) ((uint)(block).stride * (uint)(y) + (uint)(x))
+#define PARTIALS_AT(block, x, y) ((block).pitch * (uint)RING_ROW(y) + (uint)((x) - (block).x_partials))
+
+// Body for the vectors of ROWS rows that the item owns, with `margin` columns on either side: x, row, and `near_at`.
+#define FOR_VECTORS(block, margin)                                                                                     \
+  const int x_first = (block).x0 - (margin), across = ((block).x1 - (block).x0 + 2 * (margin)) / LANES;                \
+  for (int i = get_local_id(0); i < ROWS * across; i += ITEMS)
+#define VECTOR(block)                                                                                                  \
+  const int row = ROWS == 1 ? 0 : i / across, x = x_first + (i - row * across) * LANES;                                \
+  __local float *near_at = near + row * NEAR_WIDTH + x - (block).x0 + NEAR_MARGIN;
+#define OUTSIDE(block, x, y) ((x) < 0 || (x) >= (block).stride || (y) >= (block).height)
+
+// The taps of a window around the row y that are inside the image, one past the last in y.
+static inline int2 taps_inside(const Block block, const int y) {
+  return (int2)(max(0, REACH - y), min(TAPS, block.height + REACH - y));
 }
 
-#define OWN_ROWS                                                                                                       \
-  const int y = get_global_id(1), channel = get_global_id(2), channels = get_global_size(2);                           \
-  const int step = get_global_size(0) * LANES, x_first = get_global_id(0) * LANES;                                     \
-  const int padded = stride + 2 * PAD;                                                                                 \
-  const size_t row = (size_t)plane * (first + channel) + (size_t)stride * y;                                           \
-  const size_t padded_plane = (size_t)padded * height;                                                                 \
-  const size_t padded_row = padded_plane * channel + (size_t)padded * y + PAD;
-
-// image, target (3, rows, stride) -> moments (5, channels, height, stride + 2 PAD), of vertical windows: means of x and
-// y, variances of x and y, covariance.
-__kernel void loss_vertical(const int first, const int height, const int stride, const int plane,
-                            __global const float *image, __global const float *target, __global float *moments) {
-  OWN_ROWS
-  if (get_global_id(0) == 0)
-    for (int m = 0; m < 5; ++m) clear_margins(moments + channels * padded_plane * m + padded_row, stride);
-  const int tap0 = max(0, REACH - y), tap1 = min(TAPS, height + REACH - y);
-  float beyond = 0.0f; // what of the window is outside the image, where all is 0
-  for (int tap = 0; tap < TAPS; ++tap) beyond += tap < tap0 || tap >= tap1 ? window[tap] : 0.0f;
-  for (int x = x_first; x < stride; x += step) {
-    const floatL p0 = LOADL(image + row + x), q0 = LOADL(target + row + x);
+// near = the vertical windows around y and the rows below: means of x and y, variances of x and y, covariance; 0
+// outside the image.
+static inline void moments(const Block block, const int margin, const int y, __local float *near) {
+  FOR_VECTORS(block, margin) {
+    VECTOR(block)
+    if (OUTSIDE(block, x, y + row)) {
+      for (int field = 0; field < 5; ++field) STORE_NEAR((floatL)(0.0f), near_at + field * NEAR_FIELD);
+      continue;
+    }
+    const int2 taps = taps_inside(block, y + row);
+    float beyond = 0.0f; // what of the window is outside the image, where all is 0
+    for (int tap = 0; tap < taps.x; ++tap) beyond += window[tap];
+    for (int tap = taps.y; tap < TAPS; ++tap) beyond += window[tap];
+    const uint here = PIXEL_AT(block, x, y + row);
+    const floatL p0 = LOADL(block.image + here), q0 = LOADL(block.target + here);
     floatL a = -beyond * p0, b = -beyond * q0;
     floatL aa = -(a * p0), bb = -(b * q0), ab = -(a * q0);
-    for (int tap = tap0; tap < tap1; ++tap) {
-      const size_t at = row + x + (long)(tap - REACH) * stride;
-      const floatL p = LOADL(image + at) - p0, q = LOADL(target + at) - q0;
+    uint at = PIXEL_AT(block, x, y + row + taps.x - REACH);
+    for (int tap = taps.x; tap < taps.y; ++tap, at += block.stride) {
+      const floatL p = LOADL(block.image + at) - p0, q = LOADL(block.target + at) - q0;
       const floatL wp = window[tap] * p, wq = window[tap] * q;
       a += wp;
       b += wq;
@@ -61,37 +110,33 @@ __kernel void loss_vertical(const int first, const int height, const int stride,
       bb = fmaL(wq, q, bb);
       ab = fmaL(wp, q, ab);
     }
-    __global float *out = moments + padded_row + x;
-    STOREL(p0 + a, out);
-    STOREL(q0 + b, out + channels * padded_plane);
-    STOREL(fmaL(-a, a, aa), out + 2 * channels * padded_plane);
-    STOREL(fmaL(-b, b, bb), out + 3 * channels * padded_plane);
-    STOREL(fmaL(-a, b, ab), out + 4 * channels * padded_plane);
+    STORE_NEAR(p0 + a, near_at);
+    STORE_NEAR(q0 + b, near_at + NEAR_FIELD);
+    STORE_NEAR(fmaL(-a, a, aa), near_at + 2 * NEAR_FIELD);
+    STORE_NEAR(fmaL(-b, b, bb), near_at + 3 * NEAR_FIELD);
+    STORE_NEAR(fmaL(-a, b, ab), near_at + 4 * NEAR_FIELD);
   }
 }
 
-// image, target, moments -> partials (3, channels, height, stride): dSSIM by the mean of x as far as it counts from the
-// pixel in the middle, by the variance and by the covariance, 0 right of the image; sums (3, 3, height, strips)[0]:
-// SSIM.
-__kernel void loss_ssim(const int first, const int width, const int height, const int stride, const int plane,
-                        __global const float *image, __global const float *target, __global const float *moments,
-                        __global float *partials, __global float *sums) {
-  OWN_ROWS
-  const size_t out_plane = (size_t)stride * height;
+// near -> partials: dSSIM by the mean of x as far as it counts from the pixel in the middle, by the variance and by the
+// covariance, 0 right of the image. Returns the item's sum of SSIM over the block's own columns.
+static inline float derivatives(const Block block, const int margin, const int y, __local float *near) {
   floatL total = (floatL)(0.0f);
-  for (int x = x_first; x < stride; x += step) {
-    __global const float *in = moments + padded_row;
-    const floatL p = LOADL(image + row + x), q = LOADL(target + row + x);
+  FOR_VECTORS(block, margin) {
+    VECTOR(block)
+    if (OUTSIDE(block, x, y + row)) continue;
+    const uint here = PIXEL_AT(block, x, y + row);
+    const floatL p = LOADL(block.image + here), q = LOADL(block.target + here);
     floatL off1 = (floatL)(0.0f), off2 = off1, var1 = off1, var2 = off1, covariance = off1; // off: means from p and q
     for (int tap = 0; tap < TAPS; ++tap) {
-      __global const float *at = in + x + tap - REACH;
-      const floatL e1 = LOADL(at) - p, e2 = LOADL(at + channels * padded_plane) - q;
+      __local const float *in = near_at + tap - REACH;
+      const floatL e1 = LOAD_NEAR(in) - p, e2 = LOAD_NEAR(in + NEAR_FIELD) - q;
       const floatL w1 = window[tap] * e1, w2 = window[tap] * e2, w = (floatL)(window[tap]);
       off1 += w1;
       off2 += w2;
-      var1 = fmaL(w, LOADL(at + 2 * channels * padded_plane), fmaL(w1, e1, var1));
-      var2 = fmaL(w, LOADL(at + 3 * channels * padded_plane), fmaL(w2, e2, var2));
-      covariance = fmaL(w, LOADL(at + 4 * channels * padded_plane), fmaL(w1, e2, covariance));
+      var1 = fmaL(w, LOAD_NEAR(in + 2 * NEAR_FIELD), fmaL(w1, e1, var1));
+      var2 = fmaL(w, LOAD_NEAR(in + 3 * NEAR_FIELD), fmaL(w2, e2, var2));
+      covariance = fmaL(w, LOAD_NEAR(in + 4 * NEAR_FIELD), fmaL(w1, e2, covariance));
     }
     var1 = fmaL(-off1, off1, var1);
     var2 = fmaL(-off2, off2, var2);
@@ -106,79 +151,164 @@ __kernel void loss_ssim(const int first, const int width, const int height, cons
     const floatL by_mu = 2.0f * b * inverse * fmaL(mu1 / c, apart * apart, apart);
     const floatL by_mean = by_mu - 2.0f * (off1 * by_variance) - off2 * by_covariance;
     const floatL column = (floatL)(x) + LANE_INDEX;
-    const intL inside = column < (floatL)(width);
+    const intL inside = column < (floatL)(block.width);
     const floatL zero = (floatL)(0.0f);
-    total += inside ? ssim : zero;
-    __global float *out = partials + out_plane * channel + (size_t)stride * y + x;
+    if (x >= block.x0 && x < block.x1) total += inside ? ssim : zero;
+    __global float *out = block.partials + PARTIALS_AT(block, x, y + row);
     STOREL(inside ? by_mean : zero, out);
-    STOREL(inside ? by_variance : zero, out + channels * out_plane);
-    STOREL(inside ? by_covariance : zero, out + 2 * channels * out_plane);
+    STOREL(inside ? by_variance : zero, out + block.field);
+    STOREL(inside ? by_covariance : zero, out + 2 * block.field);
   }
-  sums[((size_t)(first + channel) * height + y) * get_global_size(0) + get_global_id(0)] = sumL(total);
+  return sumL(total);
 }
 
-// image, target, partials -> moments (5, channels, height, stride + 2 PAD): the partials' vertical windows, the first
-// with what the pixels differ by from the one in the middle; image and target, with margins.
-__kernel void loss_vertical_grad(const int first, const int height, const int stride, const int plane,
-                                 __global const float *image, __global const float *target,
-                                 __global const float *partials, __global float *moments) {
-  OWN_ROWS
-  const size_t in_plane = (size_t)stride * height;
-  const int tap0 = max(0, REACH - y), tap1 = min(TAPS, height + REACH - y);
-  if (get_global_id(0) == 0)
-    for (int m = 0; m < 5; ++m) clear_margins(moments + channels * padded_plane * m + padded_row, stride);
-  for (int x = x_first; x < stride; x += step) {
-    const floatL p0 = LOADL(image + row + x), q0 = LOADL(target + row + x);
+// near = the partials' vertical windows, the first with what the pixels differ by from the one in the middle; image and
+// target; 0 outside the image.
+static inline void adjoint_moments(const Block block, const int margin, const int y, __local float *near) {
+  FOR_VECTORS(block, margin) {
+    VECTOR(block)
+    if (OUTSIDE(block, x, y + row)) {
+      for (int field = 0; field < 5; ++field) STORE_NEAR((floatL)(0.0f), near_at + field * NEAR_FIELD);
+      continue;
+    }
+    const int2 taps = taps_inside(block, y + row);
+    const uint here = PIXEL_AT(block, x, y + row);
+    const floatL p0 = LOADL(block.image + here), q0 = LOADL(block.target + here);
     floatL by_mean = (floatL)(0.0f), by_variance = by_mean, by_covariance = by_mean;
-    for (int tap = tap0; tap < tap1; ++tap) {
-      __global const float *in = partials + in_plane * channel + x + (size_t)stride * (y + tap - REACH);
-      const size_t at = row + x + (long)(tap - REACH) * stride;
-      const floatL p = LOADL(image + at) - p0, q = LOADL(target + at) - q0;
+    __global const float *means = block.partials, *variances = means + block.field,
+                         *covariances = variances + block.field;
+    uint at = PIXEL_AT(block, x, y + row + taps.x - REACH);
+    for (int tap = taps.x; tap < taps.y; ++tap, at += block.stride) {
+      const uint in = PARTIALS_AT(block, x, y + row + tap - REACH);
+      const floatL p = LOADL(block.image + at) - p0, q = LOADL(block.target + at) - q0;
       const floatL w = (floatL)(window[tap]);
-      const floatL v = w * LOADL(in + channels * in_plane), c = w * LOADL(in + 2 * channels * in_plane);
-      by_mean = fmaL(w, LOADL(in), by_mean) - fmaL(2.0f * p, v, q * c);
+      const floatL v = w * LOADL(variances + in), c = w * LOADL(covariances + in);
+      by_mean = fmaL(w, LOADL(means + in), by_mean) - fmaL(2.0f * p, v, q * c);
       by_variance += v;
       by_covariance += c;
     }
-    __global float *out = moments + padded_row + x;
-    STOREL(by_mean, out);
-    STOREL(by_variance, out + channels * padded_plane);
-    STOREL(by_covariance, out + 2 * channels * padded_plane);
-    STOREL(p0, out + 3 * channels * padded_plane);
-    STOREL(q0, out + 4 * channels * padded_plane);
+    STORE_NEAR(by_mean, near_at);
+    STORE_NEAR(by_variance, near_at + NEAR_FIELD);
+    STORE_NEAR(by_covariance, near_at + 2 * NEAR_FIELD);
+    STORE_NEAR(p0, near_at + 3 * NEAR_FIELD);
+    STORE_NEAR(q0, near_at + 4 * NEAR_FIELD);
   }
 }
 
-// moments, image, target -> gradient (3, rows, stride), sums[1]: |image - target|, sums[2]: its square.
-// l1_scale and ssim_scale are the weights over the number of pixels and channels.
-__kernel void loss_grad(const int first, const int width, const int height, const int stride, const int plane,
-                        const float l1_scale, const float ssim_scale, __global const float *moments,
-                        __global const float *image, __global const float *target, __global float *gradient,
-                        __global float *sums) {
-  OWN_ROWS
+// near -> gradient, a plane. Returns the item's sums of |image - target| and of its square. l1_scale and ssim_scale are
+// the weights over the number of pixels and channels.
+static inline float2 differences(const Block block, const int y, const float l1_scale, const float ssim_scale,
+                                 __local float *near, __global float *gradient) {
   floatL absolute = (floatL)(0.0f), squares = absolute;
-  for (int x = x_first; x < stride; x += step) {
-    __global const float *in = moments + padded_row;
-    const floatL p = LOADL(image + row + x), q = LOADL(target + row + x);
+  FOR_VECTORS(block, 0) {
+    VECTOR(block)
+    if (OUTSIDE(block, x, y + row)) continue;
+    const uint here = PIXEL_AT(block, x, y + row);
+    const floatL p = LOADL(block.image + here), q = LOADL(block.target + here);
     floatL ssim = (floatL)(0.0f);
     for (int tap = 0; tap < TAPS; ++tap) {
-      __global const float *at = in + x + tap - REACH;
-      const floatL by_p = 2.0f * (p - LOADL(at + 3 * channels * padded_plane));
-      const floatL by_q = q - LOADL(at + 4 * channels * padded_plane);
-      const floatL here = fmaL(by_q, LOADL(at + 2 * channels * padded_plane), LOADL(at));
-      ssim = fmaL((floatL)(window[tap]), fmaL(by_p, LOADL(at + channels * padded_plane), here), ssim);
+      __local const float *in = near_at + tap - REACH;
+      const floatL by_p = 2.0f * (p - LOAD_NEAR(in + 3 * NEAR_FIELD));
+      const floatL by_q = q - LOAD_NEAR(in + 4 * NEAR_FIELD);
+      const floatL both = fmaL(by_q, LOAD_NEAR(in + 2 * NEAR_FIELD), LOAD_NEAR(in));
+      ssim = fmaL((floatL)(window[tap]), fmaL(by_p, LOAD_NEAR(in + NEAR_FIELD), both), ssim);
     }
     const floatL difference = p - q;
     const floatL sign =
         difference > 0.0f ? (floatL)(l1_scale) : (difference < 0.0f ? (floatL)(-l1_scale) : (floatL)(0.0f));
     const floatL column = (floatL)(x) + LANE_INDEX;
     const floatL g = fmaL((floatL)(-ssim_scale), ssim, sign);
-    STOREL(column < (floatL)(width) ? g : (floatL)(0.0f), gradient + row + x);
-    absolute += fabs(difference);
+    STOREL(column < (floatL)(block.width) ? g : (floatL)(0.0f), gradient + here);
+    absolute += AS_FLOATL(AS_INTL(difference) & 0x7fffffff); // fabs is a call in PoCL 3.0
     squares = fmaL(difference, difference, squares);
   }
-  const size_t count = (size_t)3 * height * get_global_size(0);
-  const size_t at = ((size_t)(first + channel) * height + y) * get_global_size(0) + get_global_id(0);
-  sums[count + at] = sumL(absolute);
-  sums[2 * count + at] = sumL(squares);
+  return (float2)(sumL(absolute), sumL(squares));
 }
+
+#if ITEMS == 1
+// image, target -> gradient, sums; blocks of block_rows x columns, at most COLUMNS; field: at least
+// columns + 2 MARGIN.
+GROUP __kernel void loss(const int width, const int height, const int stride, const int plane, const int columns,
+                         const int block_rows, const int field, const float l1_scale, const float ssim_scale,
+                         __global const float *image, __global const float *target, __global float *partials,
+                         __global float *gradient, __global float *sums) {
+  __local float near[5 * NEAR_FIELD];
+  const int across = (stride + columns - 1) / columns, down = (height + block_rows - 1) / block_rows;
+  const size_t kind = (size_t)3 * height * across;
+  Block block;
+  block.width = width, block.height = height, block.stride = stride;
+  block.field = field, block.pitch = 3 * field;
+  block.partials = partials + (size_t)LOSS_RING * block.pitch * get_group_id(0);
+  for (int index = get_group_id(0); index < 3 * down * across; index += get_num_groups(0)) {
+    const int channel = index / (down * across), y0 = index / across % down * block_rows;
+    const int y1 = min(y0 + block_rows, height);
+    block.image = image + (size_t)plane * channel, block.target = target + (size_t)plane * channel;
+    block.x0 = index % across * columns, block.x1 = min(block.x0 + columns, stride);
+    block.x_partials = block.x0 - MARGIN;
+    __global float *ssims = sums + (size_t)height * across * channel + index % across;
+    int next = max(0, y0 - REACH); // the row whose derivatives come next
+    for (int y = y0; y < y1; ++y) {
+      for (; next < min(height, y + REACH + 1); ++next) {
+        moments(block, 2 * MARGIN, next, near);
+        const float ssim = derivatives(block, MARGIN, next, near);
+        if (next >= y0 && next < y1) ssims[(size_t)across * next] = ssim;
+      }
+      adjoint_moments(block, MARGIN, y, near);
+      const float2 errors = differences(block, y, l1_scale, ssim_scale, near, gradient + (size_t)plane * channel);
+      ssims[kind + (size_t)across * y] = errors.x;
+      ssims[2 * kind + (size_t)across * y] = errors.y;
+    }
+  }
+}
+#else
+// The sum of a value over the group, in a fixed tree, for its first item.
+static inline float group_sum(const float value, __local float *scratch) {
+  const int item = get_local_id(0);
+  barrier(CLK_LOCAL_MEM_FENCE);
+  scratch[item] = value;
+  for (int step = ITEMS / 2; step > 0; step /= 2) {
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item < step) scratch[item] += scratch[item + step];
+  }
+  return scratch[0];
+}
+
+#define BLOCK_OF_GROUP                                                                                                 \
+  const int across = (stride + COLUMNS - 1) / COLUMNS, down = (height + ROWS - 1) / ROWS, group = get_group_id(0);     \
+  const int channel = group / (down * across), y = group / across % down * ROWS;                                       \
+  Block block;                                                                                                         \
+  block.width = width, block.height = height, block.stride = stride;                                                   \
+  block.image = image + (size_t)plane * channel, block.target = target + (size_t)plane * channel;                      \
+  block.pitch = stride, block.field = (size_t)3 * stride * height, block.x_partials = 0;                               \
+  block.partials = partials + (size_t)stride * height * channel;                                                       \
+  block.x0 = group % across * COLUMNS, block.x1 = block.x0 + COLUMNS;
+
+// image, target -> partials, sums[0].
+GROUP __kernel void loss_ssim(const int width, const int height, const int stride, const int plane,
+                              __global const float *image, __global const float *target, __global float *partials,
+                              __global float *sums) {
+  __local float near[5 * NEAR_FIELD], scratch[ITEMS];
+  BLOCK_OF_GROUP
+  moments(block, MARGIN, y, near);
+  barrier(CLK_LOCAL_MEM_FENCE);
+  const float ssim = group_sum(derivatives(block, 0, y, near), scratch);
+  if (get_local_id(0) == 0) sums[group] = ssim;
+}
+
+// image, target, partials -> gradient, sums[1], sums[2].
+GROUP __kernel void loss_grad(const int width, const int height, const int stride, const int plane,
+                              const float l1_scale, const float ssim_scale, __global const float *image,
+                              __global const float *target, __global float *partials, __global float *gradient,
+                              __global float *sums) {
+  __local float near[5 * NEAR_FIELD], scratch[ITEMS];
+  BLOCK_OF_GROUP
+  adjoint_moments(block, MARGIN, y, near);
+  barrier(CLK_LOCAL_MEM_FENCE);
+  const float2 errors = differences(block, y, l1_scale, ssim_scale, near, gradient + (size_t)plane * channel);
+  const float absolute = group_sum(errors.x, scratch), squares = group_sum(errors.y, scratch);
+  if (get_local_id(0) == 0) {
+    sums[get_num_groups(0) + group] = absolute;
+    sums[2 * get_num_groups(0) + group] = squares;
+  }
+}
+#endif

@@ -8,8 +8,12 @@ from dataclasses import dataclass
 TILE = 16
 """Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
-PAD = 16
-"""Zero columns on either side of the loss's planes, so that the horizontal window needs no bounds check."""
+LOSS_COLUMNS, LOSS_GROUP_COLUMNS = 1024, 32
+"""Most columns of a block of the loss, where a group is one item and where it has several: local memory holds five of
+its rows, or of as many as sixteen, in 32 KiB."""
+
+LOSS_RING = 16
+"""Rows of derivatives that a group of one item keeps: a power of two, at least the window's 11."""
 
 _TRANSFORM = (
     *(f"R{row}{column}" for row in range(3) for column in range(3)),
@@ -92,7 +96,8 @@ WIDEST_SLOTS = SlotFields(absolute=True, contributions=True)
 
 def header() -> str:
     """The declarations as OpenCL C."""
-    lines = [f"#define TILE {TILE}", f"#define PAD {PAD}"]
+    lines = [f"#define TILE {TILE}", f"#define LOSS_RING {LOSS_RING}"]
+    lines += [f"#define LOSS_COLUMNS {LOSS_COLUMNS}", f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}"]
     layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK, "DEEP": DEEP}
     for prefix, fields in layouts.items():
         lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]

@@ -53,11 +53,10 @@ def plan_step(
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted. Raises
     CapacityError."""
-    planes = scratch = 0
+    planes = 0
     for camera in cameras:
         pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES)
-        planes = max(planes, pixels + loss.sums_bytes(device, camera.height))
-        scratch = max(scratch, loss.scratch_bytes(camera.height, tiles_of(camera)[0] * TILE))
+        planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
     screen = project.SCREEN_BYTES + 4 * fields.contributions
     statistics = density.gaussian_bytes(agreement=agreement, contributions=fields.contributions)
@@ -68,8 +67,6 @@ def plan_step(
         model=_MODELS * frame.model,
         pair=frame.pair + blend.gradient_pair_bytes(fields),
         most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS),
-        planes=planes + scratch,
-        loss=scratch,
     )
     return _plan(device, step)
 
@@ -105,7 +102,6 @@ def _frame_need(device: Device, gaussians: int, floats: int, planes: int, config
         pair=pair,
         most_pairs=min(device.max_allocation // 4, MAX_PAIRS),
         planes=planes,
-        loss=0,
         scratch=scratch_bytes(device, max(gaussians, device.budget // pair)) + _SMALL,
     )
 

@@ -20,7 +20,7 @@ class Need:
     gaussians: their number; model: each one's parameters, in a step with gradients and moments; widest: each one's part
     of the widest of these arrays; row: of each, all the rest; banded: of each, what several bands of tiles add; pair:
     of each pair; most_pairs: their number at which the widest of their arrays is full; planes: all that is as large as
-    the image; loss: the loss's scratch memory, a part of that; scratch: whatever is left over.
+    the image; scratch: whatever is left over.
     """
 
     gaussians: int
@@ -31,7 +31,6 @@ class Need:
     pair: int
     most_pairs: int
     planes: int
-    loss: int
     scratch: int
 
     @property
@@ -54,7 +53,7 @@ class Plan:
     """Division of the work, so that it fits the memory.
 
     rows: Gaussians whose parameters, gradients and moments are on the device at once; streamed: not all of them; pairs:
-    most (tile, Gaussian) pairs at once; channels: of the loss, at once; gathers: rows move on the device; allowed:
+    most (tile, Gaussian) pairs at once; gathers: rows move on the device; allowed:
     bytes; groups: of tiles, estimated.
     """
 
@@ -62,15 +61,14 @@ class Plan:
     rows: int
     streamed: bool
     pairs: int
-    channels: int
     gathers: bool
     allowed: int
     groups: int
 
     @property
-    def pieces(self) -> tuple[bool, bool, bool]:
-        """True for each that is done in pieces: parameters, image, loss."""
-        return self.streamed, self.groups > 1, self.channels < 3
+    def pieces(self) -> tuple[bool, bool]:
+        """True for each that is done in pieces: parameters, image."""
+        return self.streamed, self.groups > 1
 
     @property
     def tight(self) -> bool:
@@ -84,27 +82,23 @@ class Plan:
             how.append(f"parameters are streamed, {self.rows:,} Gaussians at a time")
         if self.groups > 1:
             how.append(f"the image is done in about {self.groups} groups of tiles")
-        if self.channels < 3:
-            how.append("the loss is done by channel")
         needed, allowed = mebibytes(self.need.total), mebibytes(self.allowed)
         return f"about {needed} of device memory needed, {allowed} allowed: " + (", ".join(how) or "all at once")
 
 
 def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
-    """All at once if the guess of the pairs says so; else the loss by channel, then the tiles in bands, and when those
-    would be many, the parameters in parts: bands repeat little, parts go over the bus in every step.
+    """All at once if the guess of the pairs says so; else the tiles in bands, and when those would be many, the
+    parameters in parts: bands repeat little, parts go over the bus in every step.
 
     alignment: what the number of rows is a multiple of. Raises CapacityError where not even the smallest pieces fit.
     """
-    channels = 3 if need.total <= budget and need.loss * 4 // 5 <= max_allocation else 1
-    planes = need.planes - (need.loss * 2 // 3 if channels == 1 else 0)
-    room = budget - planes - need.scratch - need.gaussians * (need.row + need.banded)
+    room = budget - need.planes - need.scratch - need.gaussians * (need.row + need.banded)
 
     def made(rows: int, *, streamed: bool) -> Plan:
         pairs = min((room - rows * need.model) // need.pair, need.most_pairs)
         gathers = not streamed and need.total + need.gaussians * need.model * 3 // 4 <= budget
         groups = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > need.most_pairs else 1
-        return Plan(need, rows, streamed, pairs, channels, gathers, budget, groups)
+        return Plan(need, rows, streamed, pairs, gathers, budget, groups)
 
     whole = made(need.gaussians, streamed=False)
     enough = min(need.pairs // 8, need.gaussians) + 1

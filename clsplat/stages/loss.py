@@ -9,31 +9,53 @@ import numpy as np
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
-from clsplat.device.launch import launch_grid
-from clsplat.device.layout import PAD
+from clsplat.device.launch import launch_groups
+from clsplat.device.layout import LOSS_COLUMNS, LOSS_GROUP_COLUMNS, LOSS_RING, TILE
 from clsplat.device.profile import stage
-
-_STRIPS = 64
-"""Strips of a row, on devices that are not CPUs."""
-
 
 PIXEL_BYTES = 12
 """Bytes of the image's gradient, of each pixel with its padding."""
 
-
-def strips(device: Device) -> int:
-    """Work-items a row."""
-    return 1 if device.shape.items == 1 else _STRIPS
+_LEAST_ROWS = 32
+"""Rows of such a block, at least: ten more are worked out anew."""
 
 
-def scratch_bytes(height: int, stride: int, channels: int = 3) -> int:
-    """Bytes of the moments and partial derivatives."""
-    return 4 * channels * height * (5 * (stride + 2 * PAD) + 3 * stride)
+@dataclass(frozen=True)
+class _Blocks:
+    """Blocks of pixels that the groups work on.
+
+    rows, columns: of a block; groups: their number; field: floats from one derivative of a row that a group keeps to
+    the next, if it keeps any; partials, sums: floats of these arrays. The sums have one order for a number of columns,
+    and nothing else depends on what the blocks are.
+    """
+
+    rows: int
+    columns: int
+    groups: int
+    field: int
+    partials: int
+    sums: int
 
 
-def sums_bytes(device: Device, height: int) -> int:
-    """Bytes of the partial sums."""
-    return 4 * 3 * 3 * height * strips(device)
+def _blocks(device: Device, height: int, stride: int) -> _Blocks:
+    shape = device.shape
+    if shape.items > 1:
+        rows = min(max(shape.items // 16, 1), 16)  # as in loss.cl
+        groups = 3 * -(-height // rows) * -(-stride // LOSS_GROUP_COLUMNS)
+        return _Blocks(rows, LOSS_GROUP_COLUMNS, groups, 0, partials=9 * height * stride, sums=3 * groups)
+    columns = -(-stride // (-(-stride // LOSS_COLUMNS) * TILE)) * TILE
+    across = -(-stride // columns)
+    rows = max(-(-height * across // shape.chunks), _LEAST_ROWS)  # so three blocks a piece of work, or fewer
+    blocks = 3 * -(-height // rows) * across
+    groups = blocks if blocks < 3 * shape.chunks else shape.chunks
+    field = 16 * ((columns // 16 + 2) | 1)  # odd: rows that are a power of two apart drive each other out of a cache
+    return _Blocks(rows, columns, groups, field, partials=groups * LOSS_RING * 3 * field, sums=9 * height * across)
+
+
+def scratch_bytes(device: Device, height: int, stride: int) -> int:
+    """Bytes of the partial derivatives and the partial sums."""
+    blocks = _blocks(device, height, stride)
+    return 4 * (blocks.partials + blocks.sums)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,29 +82,21 @@ def loss(
     width: int,
     height: int,
     weight: float,
-    channels: int = 3,
 ) -> Loss:
-    """(1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero right of and below the image.
-
-    channels: 3, or 1 to work on one after the other in a third of the scratch memory.
-    """
+    """(1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero right of and below the image."""
     _, rows, stride = image.shape
-    plane, padded = rows * stride, stride + 2 * PAD
-    across = strips(device)
-    grid = (across, height, channels)
-    samples = 3 * width * height
-    moments = work.array("loss_moments", (5, channels, height, padded))
-    partials = work.array("loss_partials", (3, channels, height, stride))
+    samples, blocks, items = 3 * width * height, _blocks(device, height, stride), device.shape.items
+    partials = work.array("loss_partials", (blocks.partials,))
     gradient = work.array("image_gradient", (3, rows, stride))
-    sums = work.array("loss_sums", (3, 3 * height * across))
-    kernels = device.kernels("loss")
-    pictures, rows_of = (image, target), (height, stride, plane)
+    sums = work.array("loss_sums", (3, blocks.sums // 3))
+    sizes, pictures, results = (width, height, stride, rows * stride), (image, target), (partials, gradient, sums)
     weights = ((1 - weight) / samples, weight / samples)
-    for first in range(0, 3, channels):
-        launch_grid(device, kernels.loss_vertical, grid, first, *rows_of, *pictures, moments)
-        launch_grid(device, kernels.loss_ssim, grid, first, width, *rows_of, *pictures, moments, partials, sums)
-        launch_grid(device, kernels.loss_vertical_grad, grid, first, *rows_of, *pictures, partials, moments)
-        launch_grid(
-            device, kernels.loss_grad, grid, first, width, *rows_of, *weights, moments, *pictures, gradient, sums
-        )
+    if items == 1:
+        kernel = device.kernels("loss").loss
+        block = (blocks.columns, blocks.rows, blocks.field)
+        launch_groups(device, kernel, blocks.groups, 1, *sizes, *block, *weights, *pictures, *results)
+    else:
+        kernels = device.kernels("loss")
+        launch_groups(device, kernels.loss_ssim, blocks.groups, items, *sizes, *pictures, partials, sums)
+        launch_groups(device, kernels.loss_grad, blocks.groups, items, *sizes, *weights, *pictures, *results)
     return Loss(gradient, sums, samples, weight)

@@ -60,7 +60,7 @@ class StepProbe:
 class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in the memory of a rasterizer.
 
-    fields: the fields of a slot that the step fills; channels: as of `loss`.
+    fields: the fields of a slot that the step fills.
     """
 
     device: Device
@@ -69,7 +69,6 @@ class GradientStep:
     step: int
     rates: Mapping[str, float]
     fields: SlotFields
-    channels: int = 3
 
     def run(
         self,
@@ -87,7 +86,7 @@ class GradientStep:
         frame = rasterizer.forward(model[0], camera, background)
         probe.forward(frame)
         size = (camera.width, camera.height)
-        result = loss(device, work, frame.blended.image, planes, *size, self.config.dssim_weight, self.channels)
+        result = loss(device, work, frame.blended.image, planes, *size, self.config.dssim_weight)
         probe.loss(result)
         slots = rasterizer.pair_gradients(frame, result.gradient, fields=self.fields)
         probe.pair_gradients(slots)

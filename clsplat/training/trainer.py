@@ -233,9 +233,7 @@ class Trainer:
         camera = self.local(self.views[view].camera.resized(image.shape[1], image.shape[0]))
         self.background.set(colour := self._background_colour())
         needs = self.strategy.needs(self.step)
-        step = GradientStep(
-            self.device, self.rasterizer, config, self.step, self.rates(), slot_fields(needs), self.plan.channels
-        )
+        step = GradientStep(self.device, self.rasterizer, config, self.step, self.rates(), slot_fields(needs))
         probe = _Watched(self, step, view, camera, colour, needs)
         model = (self.parameters, self.first, self.second)
         result = step.run(model, self.gradients, image, camera, self.background, probe)
