@@ -48,7 +48,7 @@ class Photographs:
             )
             levels = np.rint(image * 255)
             exact = (
-                np.array_equal((levels / np.float32(255)).astype(np.float32), image)
+                np.array_equal(levels * np.float32(1 / 255), image)  # as target.cl has it
                 and 0 <= levels.min() <= levels.max() <= 255
             )
             self._held[index] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
