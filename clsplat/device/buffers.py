@@ -192,12 +192,16 @@ class Workspace:
         self.tight = device.memory.limit is not None
         self._poison = _poison()
         self._arrays: dict[str, DeviceArray] = {}
+        self._latest: dict[str, tuple[DeviceArray, DTypeLike]] = {}
 
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
         """An array of which the contents are not to be read before they are written; kept: it was handed out before in
         this shape, and has what was left there."""
+        latest = self._latest.get(name)
+        if latest is not None and latest[0].shape == shape and latest[1] is dtype and self._poison is None:
+            return latest[0]  # as in nearly every step
         kind = np.dtype(dtype)
         elements = prod(shape)
         held = self._arrays.get(name)
@@ -205,12 +209,16 @@ class Workspace:
             roomy = held is not None and not self.tight
             spare = min(elements * 3 // 2, self._device.max_allocation // kind.itemsize) if roomy else 0
             held = self._arrays.pop(name, None)
-            del held  # before its successor is made: there need not be room for both
+            latest = self._latest.pop(name, None)
+            del held, latest  # before their successor is made: there need not be room for both
             held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
         if self._poison is not None and not kept:
             _fill_bytes(self._device, held.buffer, self._poison, elements * kind.itemsize)
-        return DeviceArray(self._device, held.buffer, shape, kind)
+        array = DeviceArray(self._device, held.buffer, shape, kind)
+        self._latest[name] = array, dtype
+        return array
 
     def clear(self) -> None:
         """Let go of every buffer."""
         self._arrays.clear()
+        self._latest.clear()

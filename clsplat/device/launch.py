@@ -59,7 +59,8 @@ def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None
     """
     if not device.compiles_by_size:
         return ""
-    return " of any groups" * (local is None) + " of many items" * (max(size) >= _MANY)
+    groups = "" if local else " of any groups"
+    return groups if max(size) < _MANY else groups + " of many items"
 
 
 def _first(

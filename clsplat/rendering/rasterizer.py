@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +84,7 @@ class Rasterizer:
             for name, kind in PROJECTIONS.items()
         }
         self.work = work or Workspace(device)
+        self._packs: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
         aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
         self._view = allocate(device, (aligned + 3,), np.float32)
         self._camera, self._background = self._view.reshaped(len(CAMERA)), self._view.rows(aligned, aligned + 3)
@@ -100,7 +102,9 @@ class Rasterizer:
 
     def _send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Camera and background on the device, where a background on the host goes up with the camera, in one copy."""
-        pack = pack_camera(camera)
+        pack = self._packs.get(camera)
+        if pack is None:
+            pack = self._packs[camera] = pack_camera(camera)
         if isinstance(background, DeviceArray):
             self._camera.send(pack)
             return self._camera, background

@@ -155,6 +155,7 @@ class Trainer:
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.origin, self.near = initial.origin, self.scene.near
+        self._cameras: dict[int, Camera] = {}
         self._make_plan(len(initial))
         if self.plan.streamed:
             self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
@@ -232,7 +233,7 @@ class Trainer:
         self._raise_sh_degree()
         view, factor = self._next_view(), self.sizes.factor(self.step)
         image = self.photographs.bring(view, factor)
-        camera = self.local(self.views[view].camera.resized(image.shape[1], image.shape[0]))
+        camera = self._camera(view, image.shape[1], image.shape[0])
         self.background = self._background_colour()
         needs = self.strategy.needs(self.step)
         step = GradientStep(
@@ -365,6 +366,13 @@ class Trainer:
     def local(self, camera: Camera) -> Camera:
         """A camera in the world as one for the model in training: see `Gaussians.local`."""
         return camera.from_origin(self.origin).before(self.near)
+
+    def _camera(self, view: int, width: int, height: int) -> Camera:
+        """A training view's camera at the size of its photograph, the same object while that stays."""
+        camera = self._cameras.get(view)
+        if camera is None or (camera.width, camera.height) != (width, height):
+            camera = self._cameras[view] = self.local(self.views[view].camera.resized(width, height))
+        return camera
 
     def gaussians(self) -> Gaussians:
         """The model so far, on the host, with room for the SH degree it is trained to."""
