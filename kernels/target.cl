@@ -9,7 +9,7 @@
 
 #ifdef BYTES
 typedef uchar source_t;
-#define SAMPLE(x) ((float)(x) / 255.0f)
+#define SAMPLE(x) ((float)(x) * (1.0f / 255.0f)) // as OpenImageIO does, to the bit
 #else
 typedef float source_t;
 #define SAMPLE(x) (x)

@@ -21,7 +21,7 @@ from clsplat.bench.subject import Subject
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
-from clsplat.device.profile import StageRecord
+from clsplat.device.profile import Calls, StageRecord
 from clsplat.gaussians import GROUPS, floats_of
 from clsplat.progress import Progress, aligned, no_progress
 from clsplat.rendering.rasterizer import Frame
@@ -73,8 +73,10 @@ def bench(
         added, looked_at = count_pairs(rasterizer.device, rasterizer.work, *drawn)
         contributing, evaluated = contributing + added, evaluated + looked_at
     frame_ms, in_frame, by_wall = _measure(device, draw, repeat)
+    frame_calls = calls_of(device, draw)
     say("training step", None)
     iteration_ms, in_step, _ = _measure(device, trainer.train_step, repeat)
+    iteration_calls = calls_of(device, trainer.train_step)
 
     stages = {name: record for name, record in in_frame.items() if name in FORWARD}
     stages.update({name: record for name, record in in_step.items() if name not in stages})
@@ -103,10 +105,19 @@ def bench(
         "timer": "wall" if by_wall else "events",
         "frame_ms": frame_ms,
         "iteration_ms": iteration_ms,
+        "frame_calls": asdict(frame_calls),
+        "iteration_calls": asdict(iteration_calls),
         "stages": table,
         "pairs": {"listed": listed, "contributing": contributing, "evaluated": evaluated},
         "limit": asdict(limits),
     }
+
+
+def calls_of(device: Device, work: Callable[[], object]) -> Calls:
+    """Counts of what `work` gives the device's queue; it has been done before, so that all is built and allocated."""
+    before = replace(device.calls)
+    work()
+    return device.calls.since(before)
 
 
 def _measure(device: Device, work: Callable[[], object], repeat: int) -> tuple[float, dict[str, StageRecord], bool]:
@@ -152,7 +163,7 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
         mirrored = Renderer(device, config=config).render(subject.gaussians, camera).image[:, ::-1]
         photograph = np.rint(255 * np.clip(mirrored, 0, 1)).astype(np.uint8)
     lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
-    pixels = (photograph / np.float32(255)).astype(np.float32)
+    pixels = photograph * np.float32(1 / 255)
     view = _Picture("bench", camera, Path("bench"), "train", lens, pixels=pixels)
     scene = Scene("bench", [view], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (np.zeros(3), np.ones(3)))
     still = {group.rate: 0.0 for group in GROUPS.values()}
@@ -216,4 +227,7 @@ def table(result: dict[str, Any]) -> str:
     note = "ms by events" if result["timer"] == "events" else "ms by wall time: the driver's events have none"
     times = f"frame {result['frame_ms']:.2f} ms, training step {result['iteration_ms']:.2f} ms"
     load = f"load average {result['load_average'] or 0:.1f}"
-    return "\n".join([*lines, "", f"{times}: medians of {result['repeat']}; {note}; {load}"])
+    counts = [("queue", *(name.replace("_", " ") for name in result["frame_calls"]))]
+    for what, key in (("frame", "frame_calls"), ("training step", "iteration_calls")):
+        counts.append((what, *(str(count) for count in result[key].values())))
+    return "\n".join([*lines, "", *aligned(counts), "", f"{times}: medians of {result['repeat']}; {note}; {load}"])

@@ -9,7 +9,9 @@ show.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,7 @@ class DeviceArray:
     @property
     def size(self) -> int:
         """Number of elements."""
-        return int(np.prod(self.shape, dtype=np.int64))
+        return prod(self.shape)
 
     @property
     def nbytes(self) -> int:
@@ -46,16 +48,32 @@ class DeviceArray:
         return host
 
     def set(self, values: NDArray[Any]) -> None:
-        """Copy from the host. Raises ValueError where shape or dtype differ."""
-        if values.shape != self.shape or values.dtype != self.dtype:
-            raise ValueError(f"got {values.dtype}{values.shape}, expected {self.dtype}{self.shape}")
+        """Copy from the host; waits for the device. Raises ValueError where shape or dtype differ."""
+        self._check(values)
         if values.size:
+            self.device.calls.blocking_writes += 1
             event = cl.enqueue_copy(self.device.queue, self.buffer, np.ascontiguousarray(values), is_blocking=True)
             self._note("write", event)
+            self.device.under_way.clear()
+
+    def send(self, values: NDArray[Any]) -> None:
+        """Copy from the host, without waiting: `values` must not change before the device is waited for. Raises
+        ValueError where shape or dtype differ, or the array is not C-contiguous."""
+        self._check(values)
+        if values.size:
+            self.device.calls.writes += 1
+            event = cl.enqueue_copy(self.device.queue, self.buffer, values, is_blocking=False)
+            self._note("write", event)
+            self.device.under_way.append(event)  # without a reference it waits for itself
+
+    def _check(self, values: NDArray[Any]) -> None:
+        if values.shape != self.shape or values.dtype != self.dtype:
+            raise ValueError(f"got {values.dtype}{values.shape}, expected {self.dtype}{self.shape}")
 
     def fill(self, value: float) -> None:
         """Set every element."""
         if self.size:
+            self.device.calls.fills += 1
             pattern = np.asarray(value, self.dtype)
             event = cl.enqueue_fill_buffer(self.device.queue, self.buffer, pattern, 0, self.nbytes)
             self._note("fill", event)
@@ -67,8 +85,24 @@ class DeviceArray:
     def read_into(self, host: NDArray[Any]) -> None:
         """Copy to a C-contiguous array of the same shape on the host; waits for the device."""
         if host.size:
+            self.device.calls.blocking_reads += 1
             event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=True)
             self._note("read", event)
+            self.device.under_way.clear()  # the queue is in order: all that came before is done
+
+    def begin_get(self) -> Callable[[], NDArray[Any]]:
+        """Start a copy to the host behind what is on the queue now. The result waits for no more than that, and returns
+        the copy."""
+        host = np.empty(self.shape, self.dtype)
+        self.device.calls.reads += 1
+        event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False)
+        self._note("read", event)
+
+        def finish() -> NDArray[Any]:
+            event.wait()
+            return host
+
+        return finish
 
     def rows(self, start: int, stop: int) -> DeviceArray:
         """The rows [start, stop) in place. `start` has to be a multiple of `Device.row_alignment`."""
@@ -113,7 +147,7 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
     Raises CapacityError over the device's limit of one buffer, the limit of all (`Device.memory`), or what it has.
     """
     kind = np.dtype(dtype)
-    elements = max(int(np.prod(shape, dtype=np.int64)), capacity, 1)
+    elements = max(prod(shape), capacity, 1)
     nbytes = elements * kind.itemsize
     limit = device.max_allocation
     if nbytes > limit:
@@ -142,6 +176,13 @@ def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
     return array
 
 
+def shared(device: Device, values: NDArray[Any]) -> DeviceArray:
+    """A C-contiguous array on the host, to be read in place by a device that shares the host's memory: it takes none of
+    the device's. It must not change for as long as the result lives."""
+    buffer = cl.Buffer(device.context, cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR, hostbuf=values)
+    return DeviceArray(device, buffer, values.shape, values.dtype)
+
+
 class Workspace:
     """Scratch arrays by name. A name's buffer is kept from call to call, and grows by half when it is too small, or
     where memory is `tight` to just what is needed."""
@@ -151,25 +192,33 @@ class Workspace:
         self.tight = device.memory.limit is not None
         self._poison = _poison()
         self._arrays: dict[str, DeviceArray] = {}
+        self._latest: dict[str, tuple[DeviceArray, DTypeLike]] = {}
 
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
         """An array of which the contents are not to be read before they are written; kept: it was handed out before in
         this shape, and has what was left there."""
+        latest = self._latest.get(name)
+        if latest is not None and latest[0].shape == shape and latest[1] is dtype and self._poison is None:
+            return latest[0]  # as in nearly every step
         kind = np.dtype(dtype)
-        elements = int(np.prod(shape, dtype=np.int64))
+        elements = prod(shape)
         held = self._arrays.get(name)
         if held is None or held.buffer.size < elements * kind.itemsize:
             roomy = held is not None and not self.tight
             spare = min(elements * 3 // 2, self._device.max_allocation // kind.itemsize) if roomy else 0
             held = self._arrays.pop(name, None)
-            del held  # before its successor is made: there need not be room for both
+            latest = self._latest.pop(name, None)
+            del held, latest  # before their successor is made: there need not be room for both
             held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
         if self._poison is not None and not kept:
             _fill_bytes(self._device, held.buffer, self._poison, elements * kind.itemsize)
-        return DeviceArray(self._device, held.buffer, shape, kind)
+        array = DeviceArray(self._device, held.buffer, shape, kind)
+        self._latest[name] = array, dtype
+        return array
 
     def clear(self) -> None:
         """Let go of every buffer."""
         self._arrays.clear()
+        self._latest.clear()

@@ -18,7 +18,7 @@ from clsplat.device.account import Memory
 from clsplat.device.child import TIMEOUT, patience
 from clsplat.device.known import tell_once
 from clsplat.device.processor import name_processor
-from clsplat.device.profile import Recorder
+from clsplat.device.profile import Calls, Recorder
 from clsplat.device.program import Kernel, Kernels, build, variant_of
 from clsplat.device.quirks import compiles_by_size, kind_of, no_device, title
 from clsplat.device.rehearsal import Rehearsal
@@ -103,7 +103,9 @@ class Device:
     """A device with its context, in-order queue, kernel shape and built kernels.
 
     why: the warning that this is not the wanted shape, given when the device is used; only_tries: a launch is
-    rehearsed, if it has to be, and not made (`launch.only_tried`); waits: for each kernel, as SYNC asks.
+    rehearsed, if it has to be, and not made (`launch.only_tried`); waits: for each kernel, as SYNC asks; shares_memory:
+    its memory is the host's; calls: what its queue was given; under_way: events and buffers that keep arrays on the
+    host alive, which the device may still have to read.
     """
 
     def __init__(self, device: cl.Device, shape: Shape | None = None, *, profile: bool = False, why: str = "") -> None:
@@ -114,6 +116,7 @@ class Device:
         self.shape, self._why_another = (shape, why) if shape else shape_of(device)
         self.only_tries = False
         self.waits = switched_on(SYNC)
+        self.shares_memory = self.kind == "cpu"
         self.compiles_by_size = compiles_by_size(device)
         self.max_allocation = int(device.max_mem_alloc_size)
         self.max_group = int(device.max_work_group_size)
@@ -122,6 +125,8 @@ class Device:
         self.profile = profile
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
         self.queue = cl.CommandQueue(self.context, device, properties)
+        self.calls = Calls()
+        self.under_way: list[object] = []
         self._options = "-cl-std=CL1.2"
         if device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
@@ -138,7 +143,7 @@ class Device:
         if self._switches:
             text = kernel_source(stem)
             defines = {**{name: value for name, value in self._switches.items() if name in text}, **defines}
-        key = (stem, tuple(sorted(defines.items())))
+        key = (stem, tuple(sorted(defines.items())) if defines else ())
         kernels = self._kernels.get(key)
         if kernels is None:
             if not self._fma:
@@ -203,6 +208,7 @@ class Device:
         """Put a kernel on the queue, and wait for it if asked to, or with CLSPLAT_SYNC=1. Raises DriverError."""
         try:
             event = kernel.cl_kernel(self.queue, size, local, *values)
+            self.calls.launches += 1
             if self.waits:
                 self._wait_for(event, kernel)
             elif wait:  # so that the last kernel that was named is the one that fails
@@ -231,6 +237,7 @@ class Device:
     def finish(self) -> None:
         """Wait until the device has nothing to do."""
         self.queue.finish()
+        self.under_way.clear()
 
     def timed(self, work: Callable[[], T]) -> tuple[T, float]:
         """The result of `work` and its milliseconds, from an idle device to an idle device."""

@@ -33,11 +33,14 @@ def only_tried(device: Device) -> Iterator[None]:
         device.only_tries = False
 
 
-def _value(argument: Any) -> Any:
-    """The argument that the kernel gets: whole numbers as their 32 bits, with or without a sign."""
-    if isinstance(argument, DeviceArray):
-        return argument.buffer
-    return argument & _WORD if isinstance(argument, int) else argument
+def _values(arguments: tuple[Any, ...]) -> list[Any]:
+    """The arguments that the kernel gets: whole numbers as their 32 bits, with or without a sign."""
+    return [
+        argument.buffer
+        if (kind := type(argument)) is DeviceArray
+        else (argument & _WORD if kind is int or kind is bool else argument)
+        for argument in arguments
+    ]
 
 
 def _type(value: Any) -> Any:
@@ -56,7 +59,8 @@ def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None
     """
     if not device.compiles_by_size:
         return ""
-    return " of any groups" * (local is None) + " of many items" * (max(size) >= _MANY)
+    groups = "" if local else " of any groups"
+    return groups if max(size) < _MANY else groups + " of many items"
 
 
 def _first(
@@ -95,8 +99,8 @@ _UPDATED = {
 def _enqueue(
     device: Device, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: tuple[Any, ...]
 ) -> None:
-    values = [_value(argument) for argument in arguments]
-    form = form_of(device, size, local)
+    values = _values(arguments)
+    form = form_of(device, size, local) if device.compiles_by_size else ""
     first = form not in kernel.tried
     if first:
         _first(device, kernel, size, local, values, form)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
@@ -29,6 +29,26 @@ class StageRecord:
     wall_ms: float = 0.0
     launches: int = 0
     bytes: int = 0
+
+
+@dataclass
+class Calls:
+    """Counts of what a device's queue was given, from its opening on.
+
+    launches: kernels; fills, writes, reads: of buffers, where the host does not wait; blocking_writes, blocking_reads:
+    those that it waits for.
+    """
+
+    launches: int = 0
+    fills: int = 0
+    writes: int = 0
+    reads: int = 0
+    blocking_writes: int = 0
+    blocking_reads: int = 0
+
+    def since(self, earlier: Calls) -> Calls:
+        """The counts less those of a copy that was made earlier."""
+        return Calls(*(now - then for now, then in zip(astuple(self), astuple(earlier), strict=True)))
 
 
 class Recorder:

@@ -50,9 +50,10 @@ def plan_step(
     *,
     fields: SlotFields,
     agreement: bool,
+    photographs: int = 0,
 ) -> Plan:
-    """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted. Raises
-    CapacityError."""
+    """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
+    photographs: pixels of all that may stay on the device. Raises CapacityError."""
     planes = 0
     for camera in cameras:
         pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES)
@@ -67,6 +68,7 @@ def plan_step(
         model=_MODELS * frame.model,
         pair=frame.pair + blend.gradient_pair_bytes(fields),
         most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS),
+        photographs=0 if device.shares_memory else target.SOURCE_BYTES * photographs,
     )
     return _plan(device, step)
 

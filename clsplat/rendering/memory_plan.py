@@ -20,7 +20,8 @@ class Need:
     gaussians: their number; model: each one's parameters, in a step with gradients and moments; widest: each one's part
     of the widest of these arrays; row: of each, all the rest; banded: of each, what several bands of tiles add; pair:
     of each pair; most_pairs: their number at which the widest of their arrays is full; planes: all that is as large as
-    the image; scratch: whatever is left over.
+    the image; scratch: whatever is left over; photographs: those that the device may keep from step to step, as far as
+    there is room.
     """
 
     gaussians: int
@@ -32,6 +33,7 @@ class Need:
     most_pairs: int
     planes: int
     scratch: int
+    photographs: int = 0
 
     @property
     def pairs(self) -> int:
@@ -40,8 +42,13 @@ class Need:
 
     @property
     def total(self) -> int:
-        """Bytes with everything on the device at once."""
+        """Bytes with everything on the device at once, but for photographs."""
         return self.planes + self.scratch + self.gaussians * (self.row + self.model) + self.pairs * self.pair
+
+    @property
+    def moving(self) -> int:
+        """Bytes of a second copy of parameters and moments, while rows move."""
+        return self.gaussians * self.model * 3 // 4
 
 
 PAIRS_EACH = 8
@@ -53,8 +60,8 @@ class Plan:
     """Division of the work, so that it fits the memory.
 
     rows: Gaussians whose parameters, gradients and moments are on the device at once; streamed: not all of them; pairs:
-    most (tile, Gaussian) pairs at once; gathers: rows move on the device; allowed:
-    bytes; groups: of tiles, estimated.
+    most (tile, Gaussian) pairs at once; gathers: rows move on the device; allowed: bytes; groups: of tiles, estimated;
+    photographs: bytes of those that stay on the device.
     """
 
     need: Need
@@ -64,6 +71,7 @@ class Plan:
     gathers: bool
     allowed: int
     groups: int
+    photographs: int = 0
 
     @property
     def pieces(self) -> tuple[bool, bool]:
@@ -92,13 +100,14 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
 
     alignment: what the number of rows is a multiple of. Raises CapacityError where not even the smallest pieces fit.
     """
-    room = budget - need.planes - need.scratch - need.gaussians * (need.row + need.banded)
+    photographs = min(max(budget - need.total - need.moving, 0) // 2, need.photographs)
+    room = budget - need.planes - need.scratch - need.gaussians * (need.row + need.banded) - photographs
 
     def made(rows: int, *, streamed: bool) -> Plan:
         pairs = min((room - rows * need.model) // need.pair, need.most_pairs)
-        gathers = not streamed and need.total + need.gaussians * need.model * 3 // 4 <= budget
+        gathers = not streamed and need.total + need.moving + photographs <= budget
         groups = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > need.most_pairs else 1
-        return Plan(need, rows, streamed, pairs, gathers, budget, groups)
+        return Plan(need, rows, streamed, pairs, gathers, budget, groups, photographs)
 
     whole = made(need.gaussians, streamed=False)
     enough = min(need.pairs // 8, need.gaussians) + 1

@@ -6,14 +6,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.camera import PROJECTIONS, Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
-from clsplat.device.layout import PLAIN_SLOTS, READBACK, WIDEST_SLOTS, SlotFields
+from clsplat.device.layout import CAMERA, PLAIN_SLOTS, READBACK, WIDEST_SLOTS, SlotFields
 from clsplat.errors import InputError
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
@@ -82,6 +84,10 @@ class Rasterizer:
             for name, kind in PROJECTIONS.items()
         }
         self.work = work or Workspace(device)
+        self._packs: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
+        aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
+        self._view = allocate(device, (aligned + 3,), np.float32)
+        self._camera, self._background = self._view.reshaped(len(CAMERA)), self._view.rows(aligned, aligned + 3)
         self.readback = allocate(device, (len(READBACK),), np.uint32)
         self.readback.fill(0)
         self._all_bits = self._switches.key_bits == "all"
@@ -94,16 +100,34 @@ class Rasterizer:
             self.work.clear()
         self.capacity = plan.pairs
 
+    def _send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
+        """Camera and background on the device, where a background on the host goes up with the camera, in one copy."""
+        pack = self._packs.get(camera)
+        if pack is None:
+            pack = self._packs[camera] = pack_camera(camera)
+        if isinstance(background, DeviceArray):
+            self._camera.send(pack)
+            return self._camera, background
+        values = np.zeros(self._view.shape, np.float32)
+        values[: len(pack)], values[-3:] = pack, background
+        self._view.send(values)
+        return self._camera, self._background
+
     def forward(
-        self, gaussians: AnyGaussians, camera: Camera, background: DeviceArray, *, backward: bool = True
+        self,
+        gaussians: AnyGaussians,
+        camera: Camera,
+        background: NDArray[np.float32] | DeviceArray,
+        *,
+        backward: bool = True,
     ) -> Frame:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
-        backward: True if the gradient will be asked for. Without it, what only that needs is left out.
+        background: (3,) float32, on the host or the device; backward: True if the gradient will be asked for. Without
+        it, what only that needs is left out.
         """
         device, work = self.device_of(camera), self.work
-        camera_array = work.array("camera", (len(pack := pack_camera(camera)),))
-        camera_array.set(pack)
+        camera_array, background = self._send(camera, background)
         projected = project(device, work, gaussians, camera, camera_array)
         counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
         bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)

@@ -14,7 +14,7 @@ from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.config.checks import parse_bytes
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device.buffers import allocate, upload
+from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
@@ -65,7 +65,6 @@ class Renderer:
         self.device = device or open_device()
         self._rasterizer = rasterizer or Rasterizer(self.device, config)
         self._rows = 0
-        self._background = allocate(self.device, (3,), np.float32)
         self._sh: tuple[Gaussians, ShStorage] | None = None
         self._held: AnyGaussians | None = None
         self._planned: tuple[object, ...] | None = None
@@ -141,8 +140,7 @@ class Renderer:
             colour = np.asarray(background, np.float32)
         if colour.shape != (3,) or not np.isfinite(colour).all():
             raise InputError(f"background {background}: expected three finite numbers")
-        self._background.set(colour)
-        return self._rasterizer.forward(gaussians, camera, self._background, backward=False)
+        return self._rasterizer.forward(gaussians, camera, colour, backward=False)
 
     def _result(self, frame: Frame, *, contiguous: bool) -> RenderResult:
         height, width = frame.camera.height, frame.camera.width

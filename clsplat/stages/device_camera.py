@@ -10,6 +10,11 @@ from clsplat.camera import Camera, Window
 from clsplat.device.layout import CAMERA, TILE
 from clsplat.errors import InputError
 
+_NAMES = tuple(name for name in CAMERA if not name.endswith("_LOW"))
+assert CAMERA[len(_NAMES) :] == tuple(f"{name}_LOW" for name in _NAMES[: len(CAMERA) - len(_NAMES)])
+_TRANSLATION, _POSITION = ("T0", "T1", "T2"), ("PX", "PY", "PZ")
+_ROTATION = tuple(tuple(f"R{row}{column}" for column in range(3)) for row in range(3))
+
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
     """A camera in the order of `layout.CAMERA`: its values rounded to float32, and as _LOW what that left of them.
@@ -35,14 +40,16 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "WINDOW_X": window.x,
         "WINDOW_Y": window.y,
     }
+    position = camera.position
     for row in range(3):
-        values[f"T{row}"] = float(camera.translation[row])
-        values["P" + "XYZ"[row]] = float(camera.position[row])
+        values[_TRANSLATION[row]] = camera.translation[row]
+        values[_POSITION[row]] = position[row]
         for column in range(3):
-            values[f"R{row}{column}"] = float(camera.rotation[row, column])
-    rounded = {name: np.float32(value) for name, value in values.items()}
-    rounded.update({f"{name}_LOW": np.float32(value - float(rounded[name])) for name, value in values.items()})
-    return np.array([rounded[name] for name in CAMERA], np.float32)
+            values[_ROTATION[row][column]] = camera.rotation[row, column]
+    exact = np.array([values[name] for name in _NAMES], np.float64)
+    rounded = exact.astype(np.float32)
+    low = (exact - rounded).astype(np.float32)
+    return np.concatenate([rounded, low[: len(CAMERA) - len(_NAMES)]])
 
 
 def padded_size(width: int, height: int) -> tuple[int, int]:

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
@@ -60,16 +63,23 @@ def scratch_bytes(device: Device, height: int, stride: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """gradient (3, rows, stride); sums (3, ...): partial sums of SSIM, of |x - y| and of its square."""
+    """gradient (3, rows, stride); sums (3, ...): partial sums of SSIM, of |x - y| and of its square; copy: the sums
+    where a copy to the host is under way."""
 
     gradient: DeviceArray
     sums: DeviceArray
     samples: int
     weight: float
+    copy: Callable[[], NDArray[Any]] | None = None
+
+    def fetched(self) -> Loss:
+        """The same, its sums on their way to the host: `read` then does not wait for what comes behind them."""
+        return replace(self, copy=self.sums.begin_get())
 
     def read(self) -> tuple[float, float]:
         """(loss, mean squared error); waits for the device."""
-        ssim, absolute, squared = self.sums.get().reshape(3, -1).sum(axis=1, dtype=np.float64) / self.samples
+        sums = self.copy() if self.copy is not None else self.sums.get()
+        ssim, absolute, squared = sums.reshape(3, -1).sum(axis=1, dtype=np.float64) / self.samples
         return float((1 - self.weight) * absolute + self.weight * (1 - ssim)), float(squared)
 
 

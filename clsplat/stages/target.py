@@ -14,19 +14,28 @@ from clsplat.device.launch import launch_grid
 from clsplat.device.profile import stage
 from clsplat.stages.device_camera import padded_size
 
-PIXEL_BYTES = 12 + 16
-"""Bytes of each pixel with its padding: three planes, and the photograph, at most RGBA in floats."""
+SOURCE_BYTES = 16
+"""Bytes of each pixel of a photograph: at most RGBA in floats."""
+PIXEL_BYTES = 12 + SOURCE_BYTES
+"""Bytes of each pixel with its padding: three planes, and the photograph."""
 
 
 @stage("target")
-def target(device: Device, work: Workspace, image: NDArray[Any], background: DeviceArray) -> DeviceArray:
-    """image (H, W, 3 or 4), uint8 or float32, straight alpha -> planes (3, rows, stride) over the background."""
+def target(device: Device, work: Workspace, image: NDArray[Any] | DeviceArray, background: DeviceArray) -> DeviceArray:
+    """image (H, W, 3 or 4), uint8 or float32, straight alpha -> planes (3, rows, stride) over the background.
+
+    An image on the host goes up without waiting: it must not change before the device is waited for.
+    """
     height, width, channels = image.shape
     rows, stride = padded_size(width, height)
-    source = work.array("target_source", image.shape, image.dtype)
-    source.set(image)
+    if isinstance(image, DeviceArray):
+        source = image
+    else:
+        source = work.array("target_source", image.shape, image.dtype)
+        source.send(np.ascontiguousarray(image))
     planes = work.array("target", (3, rows, stride))
     kernels = device.kernels("target", **({"BYTES": True} if image.dtype == np.uint8 else {}))
     sizes = (width, height, channels, stride, rows * stride)
     launch_grid(device, kernels.target, (stride, rows), *sizes, source, background, planes)
+    device.under_way.append(source.buffer)  # it may be the host's memory
     return planes

@@ -41,7 +41,7 @@ from clsplat.training.repro import write_bundle
 from clsplat.training.trainer import Trainer, unusable
 
 REPORT_EVERY = 10
-"""Steps between readings of the loss, which make host and device wait for each other."""
+"""Steps between readings of the loss, for which the host waits; the device goes on with the rest of the step."""
 
 
 Between = Callable[[Trainer, Callable[[], bool]], None]
@@ -258,14 +258,23 @@ class Session:
             return False
         return step == config.iterations or (step % config.stages_every == 0 and step % REPORT_EVERY == 0)
 
+    def evaluates(self, step: int) -> bool:
+        """True if the held-out views are rendered after the step."""
+        return step in self.trainer.config.eval_at and bool(self.trainer.scene.test_views)
+
+    def reports(self, step: int) -> bool:
+        """True if the step's loss is read."""
+        return step % REPORT_EVERY == 0 or step == self.trainer.config.iterations or self.evaluates(step)
+
     def step(self) -> None:
         """One step, and what is due after it."""
         trainer, config = self.trainer, self.trainer.config
         start, stages = time.perf_counter(), None
+        reports = self.reports(trainer.step + 1)
         if self.run is not None and self.times_stages(trainer.step + 1):
-            result, stages = telemetry.timed(trainer.device, trainer.train_step)
+            result, stages = telemetry.timed(trainer.device, lambda: trainer.train_step(reads_loss=reports))
         else:
-            result = trainer.train_step()
+            result = trainer.train_step(reads_loss=reports)
         self.seconds += time.perf_counter() - start
         self.tell_plan()
         if trainer.step == config.iterations:
@@ -275,8 +284,8 @@ class Session:
         step = trainer.step
         if step == doubts.LOOK_AT and step < config.iterations:
             self.doubt()
-        evaluating = step in config.eval_at and bool(trainer.scene.test_views)
-        if step % REPORT_EVERY == 0 or step == config.iterations or evaluating:
+        if self.reports(step):
+            evaluating = self.evaluates(step)
             report = self.report(result)
             if report is not None:
                 self.record(report, evaluating=evaluating, stages=stages)

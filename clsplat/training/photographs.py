@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training views' pixels."""
+"""The training views' pixels, on the host and on the device."""
 
 from __future__ import annotations
 
@@ -8,23 +8,39 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.device.buffers import DeviceArray, allocate, shared
+from clsplat.device.context import Device
+from clsplat.errors import CapacityError
+
 if TYPE_CHECKING:
     from clsplat.scenes.scene import View
 
 
 class Photographs:
-    """The training views' pixels at one resolution, decoded once each; uint8 where that holds them exactly."""
+    """The training views' pixels at one resolution, decoded once each; uint8 where that holds them exactly.
 
-    def __init__(self, views: list[View]) -> None:
-        self._views = views
+    allowed: bytes that they may take on the device.
+    """
+
+    def __init__(self, views: list[View], device: Device) -> None:
+        self._views, self._device = views, device
         self._factor = 0.0
         self._held: dict[int, NDArray[Any]] = {}
+        self._on_device: dict[int, DeviceArray] = {}
+        self._taken = self.allowed = 0
+
+    def follow(self, allowed: int) -> None:
+        """Take at most so many bytes on the device from here on."""
+        self.allowed = allowed
+        if self._taken > allowed:
+            self._leave_device()
 
     def load(self, index: int, factor: float) -> NDArray[Any]:
-        """View `index` at 1/factor of its size, (H, W, 3 or 4), straight alpha."""
+        """View `index` at 1/factor of its size, (H, W, 3 or 4), straight alpha; not to be written to."""
         if factor != self._factor:
             self._factor = factor
             self._held.clear()
+            self._leave_device()
         if index not in self._held:
             camera = self._views[index].camera
             image: NDArray[np.float32] = self._views[index].load(
@@ -32,8 +48,30 @@ class Photographs:
             )
             levels = np.rint(image * 255)
             exact = (
-                np.array_equal((levels / np.float32(255)).astype(np.float32), image)
+                np.array_equal(levels * np.float32(1 / 255), image)  # as target.cl has it
                 and 0 <= levels.min() <= levels.max() <= 255
             )
             self._held[index] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
         return self._held[index]
+
+    def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
+        """The same, on the device where there is room for it: it goes up once, and stays. A device that shares the
+        host's memory reads it there."""
+        image = self.load(index, factor)
+        if index not in self._on_device:
+            if self._device.shares_memory:
+                self._on_device[index] = shared(self._device, image)
+            elif self._taken + image.nbytes <= self.allowed:
+                try:
+                    array = allocate(self._device, image.shape, image.dtype)
+                except CapacityError:  # another program may have taken what the plan counted on
+                    self.allowed = self._taken
+                    return image
+                array.send(image)
+                self._on_device[index] = array
+                self._taken += image.nbytes
+        return self._on_device.get(index, image)
+
+    def _leave_device(self) -> None:
+        self._on_device.clear()
+        self._taken = 0

@@ -26,7 +26,6 @@ import clsplat
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
-from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
 from clsplat.device.layout import REFUSED, SPLAT
 from clsplat.errors import ClsplatError, InputError
@@ -200,8 +199,8 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     probe.counts["parameters"] = _wrong_in(parameters)
     fields = slot_fields(Adaptive(config).needs(record["step"]))
     step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
-    background = upload(device, bundle.background)
-    step.run((parameters, first, second), gradients, bundle.photograph, bundle.camera, background, probe)
+    pixels = (bundle.photograph, bundle.camera, bundle.background)
+    step.run((parameters, first, second), gradients, *pixels, probe)
     return {**probe.counts, "adam": int(rasterizer.readback.get()[-len(REFUSED) :].sum())}
 
 

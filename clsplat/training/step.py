@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
@@ -74,19 +75,24 @@ class GradientStep:
         self,
         model: tuple[AnyGaussians, AnyGaussians, AnyGaussians],
         gradients: DeviceGaussians,
-        photograph: NDArray[Any],
+        photograph: NDArray[Any] | DeviceArray,
         camera: Camera,
-        background: DeviceArray,
+        background: NDArray[np.float32],
         probe: StepProbe,
+        *,
+        reads_loss: bool = False,
     ) -> Loss:
         """Update the model (parameters, first and second moments) by a photograph (H, W, 3 or 4) of the camera's size.
-        gradients: room for the rows that are on the device at once, zeros before and after."""
+        gradients: room for the rows that are on the device at once, zeros before and after; reads_loss: the loss will
+        be read."""
         device, rasterizer, work = self.device, self.rasterizer, self.rasterizer.work
-        planes = target(device, work, photograph, background)
         frame = rasterizer.forward(model[0], camera, background)
         probe.forward(frame)
+        planes = target(device, work, photograph, frame.background)
         size = (camera.width, camera.height)
         result = loss(device, work, frame.blended.image, planes, *size, self.config.dssim_weight)
+        if reads_loss:
+            result = result.fetched()
         probe.loss(result)
         slots = rasterizer.pair_gradients(frame, result.gradient, fields=self.fields)
         probe.pair_gradients(slots)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
-from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.errors import InputError
@@ -134,11 +133,11 @@ class Trainer:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
         self.rasterizer = Rasterizer(device, config.rasterizer)
-        self.photographs = Photographs(self.views)
+        self.photographs = Photographs(self.views, device)
         self.sizes = sizes_of(
             config.warmup, config.frequency_steps, len(self.views), lambda index: self.views[index].load()
         )
-        self.background = allocate(device, (3,), np.float32)
+        self.background: NDArray[np.float32] = np.zeros(3, np.float32)
         self.given = initial
         self.watch = Watch(self.rasterizer.readback, [view.name for view in self.views])
         self._start()
@@ -156,6 +155,7 @@ class Trainer:
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.origin, self.near = initial.origin, self.scene.near
+        self._cameras: dict[int, Camera] = {}
         self._make_plan(len(initial))
         if self.plan.streamed:
             self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
@@ -173,8 +173,10 @@ class Trainer:
             self.config.rasterizer,
             fields=slot_fields(needs),
             agreement=needs.agreement,
+            photographs=sum(view.camera.width * view.camera.height for view in self.views),
         )
         self.rasterizer.follow(self.plan)
+        self.photographs.follow(self.plan.photographs)
 
     def _set_parameters(
         self, parameters: AnyGaussians, first: AnyGaussians | None = None, second: AnyGaussians | None = None
@@ -213,8 +215,9 @@ class Trainer:
             return replace(model, rows=self.plan.rows) if self.plan.streamed else to_device(self.device, model)
         return model
 
-    def train_step(self) -> Loss:
-        """Density control as the last step left it to do, then one view: forward, loss, backward, Adam.
+    def train_step(self, *, reads_loss: bool = False) -> Loss:
+        """Density control as the last step left it to do, then one view: forward, loss, backward, Adam. reads_loss: the
+        loss will be read, which then waits for no more than the loss.
 
         Kerbl et al. 2023, algorithm 1, but for where the loop is cut: a model is looked at, kept or finished before
         its Gaussians are split or made transparent, not just after.
@@ -229,14 +232,14 @@ class Trainer:
         self.step += 1
         self._raise_sh_degree()
         view, factor = self._next_view(), self.sizes.factor(self.step)
-        image = self.photographs.load(view, factor)
-        camera = self.local(self.views[view].camera.resized(image.shape[1], image.shape[0]))
-        self.background.set(colour := self._background_colour())
+        image = self.photographs.bring(view, factor)
+        camera = self._camera(view, image.shape[1], image.shape[0])
+        self.background = self._background_colour()
         needs = self.strategy.needs(self.step)
         step = GradientStep(self.device, self.rasterizer, config, self.step, self.rates(), slot_fields(needs))
-        probe = _Watched(self, step, view, camera, colour, needs)
+        probe = _Watched(self, step, view, camera, self.background, needs)
         model = (self.parameters, self.first, self.second)
-        result = step.run(model, self.gradients, image, camera, self.background, probe)
+        result = step.run(model, self.gradients, image, camera, self.background, probe, reads_loss=reads_loss)
         self.controlled = False
         self._note()
         self._rearrange(self.strategy.after_gradient(self._state()))
@@ -361,6 +364,13 @@ class Trainer:
     def local(self, camera: Camera) -> Camera:
         """A camera in the world as one for the model in training: see `Gaussians.local`."""
         return camera.from_origin(self.origin).before(self.near)
+
+    def _camera(self, view: int, width: int, height: int) -> Camera:
+        """A training view's camera at the size of its photograph, the same object while that stays."""
+        camera = self._cameras.get(view)
+        if camera is None or (camera.width, camera.height) != (width, height):
+            camera = self._cameras[view] = self.local(self.views[view].camera.resized(width, height))
+        return camera
 
     def gaussians(self) -> Gaussians:
         """The model so far, on the host, with room for the SH degree it is trained to."""

@@ -204,6 +204,30 @@ def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
     assert adam["bytes"] == 300 * 59 * 4 * 4 * 2
 
 
+MOST_LAUNCHES = 79
+"""Kernels of a training step in the shape 1x64, with the radix sort. 40 are aimed at."""
+
+
+@pytest.mark.parametrize(("shape", "launches"), [((1, 64), MOST_LAUNCHES), (None, MOST_LAUNCHES)], ids=str)
+@pytest.mark.parametrize("count", [300, 6000])
+def test_what_a_step_gives_the_queue(device: Device, shape: tuple[int, int] | None, launches: int, count: int) -> None:
+    """A step waits for one number, and for no copy to the device, whichever sort its size asks for."""
+    if shape:
+        device = device.with_shape(lanes=shape[0], items=shape[1])
+    subject = bench_subject.synthetic(count, 320, 200)
+    trainer = bench_stages.trainer_of(subject, device, RasterizerConfig())
+
+    def frame() -> object:
+        return trainer.rasterizer.forward(trainer.parameters, subject.camera, trainer.background, backward=False)
+
+    for work in (trainer.train_step, frame):
+        work()
+        calls = bench_stages.calls_of(device, work)
+        assert calls.blocking_reads <= 1
+        assert calls.blocking_writes == 0
+        assert 0 < calls.launches <= launches
+
+
 def test_wall_time_where_events_have_none(default_device: Device) -> None:
     result = bench_stages.bench(
         bench_subject.synthetic(200, 40, 30), default_device, repeat=1, limits=Limits(1e9, 5e8, 1e10, 8, 1)
@@ -246,6 +270,8 @@ def test_json_has_the_contract(capsys: Capture) -> None:
     )
     assert (result["gaussians"], result["width"], result["height"]) == (400, 70, 50)
     assert all("ms" in stage for stage in result["stages"].values())
+    assert result["frame_calls"]["launches"] < result["iteration_calls"]["launches"]
+    assert result["iteration_calls"]["blocking_reads"] == 1
     assert {"contributing", "evaluated"} <= set(result["pairs"])
     assert 0 < result["pairs"]["contributing"] <= result["pairs"]["evaluated"]
     assert result["limit"]["pairs_per_second"] > 0
@@ -260,6 +286,9 @@ def test_table(capsys: Capture) -> None:
     lines = capsys.readouterr().out.splitlines()
     assert {line.split()[0] for line in lines if line} >= FRAME | STEP
     assert "synthetic: 400 Gaussians" in "\n".join(lines)
+    queue = [line.split() for line in lines if line.startswith(("queue", "training step  "))]
+    assert queue[0][-4:] == ["blocking", "writes", "blocking", "reads"]
+    assert queue[1][-2:] == ["0", "1"]
 
 
 @pytest.mark.usefixtures("_quick")

@@ -82,3 +82,19 @@ def test_a_workspace_needs_no_room_for_what_it_replaces(default_device: Device) 
     assert device.memory.used == device.memory.peak == 8000
     work.clear()
     assert device.memory.used == 0
+
+
+def test_a_workspace_hands_out_what_it_has(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    work = Workspace(default_device)
+    first = work.array("a", (6, 2))
+    assert work.array("a", (6, 2)) is first
+    assert work.array("a", (6, 2), np.uint32).dtype == np.uint32
+    assert work.array("a", (12,)).buffer is first.buffer
+    assert work.array("a", (100,)).buffer is not first.buffer
+    assert work.array("a", (6, 2)).buffer is not first.buffer, "a buffer that was replaced is not handed out"
+    monkeypatch.setenv("CLSPLAT_POISON", "1")
+    work = Workspace(default_device)
+    for _ in range(2):
+        array = work.array("a", (3,))
+        assert np.isnan(array.get()).all()
+        array.fill(0.0)

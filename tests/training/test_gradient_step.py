@@ -9,7 +9,6 @@ from compare import assert_same_bits
 from tiny import write_scene
 
 from clsplat.config.training import TrainConfig
-from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.gaussians import GROUPS
 from clsplat.rendering.rasterizer import Frame, Rasterizer
@@ -64,7 +63,7 @@ def test_a_trainer_s_step_is_a_gradient_step(scene: Scene, default_device: Devic
     model = (by_hand.parameters, by_hand.first, by_hand.second)
     gradients = allocate_gaussians(default_device, by_hand.parameters.count, by_hand.parameters.coefficients, zero=True)
     photograph, witness = by_hand.photographs.load(view, 1.0), Witness()
-    background = upload(default_device, np.zeros(3, np.float32))
+    background = np.zeros(3, np.float32)
     camera = by_hand.local(by_hand.views[view].camera)
     result = step.run(model, gradients, photograph, camera, background, witness)
     assert witness.stages == ["forward", "loss", "pair_gradients", "row_gradients"]

@@ -53,12 +53,12 @@ def spoilt(due: Due, group: str = "means", row: int = 5, value: float = np.nan) 
     """Before a step that is due a parameter turns bad, as in a memory that forgets."""
     real = Trainer.train_step
 
-    def step(self: Trainer) -> object:
+    def step(self: Trainer, **options: bool) -> object:
         if due(self):
             values = self.parameters[group].get()
             values.reshape(len(values), -1)[row, 0] = value
             self.parameters[group].set(values)
-        return real(self)
+        return real(self, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Trainer, "train_step", step)
@@ -213,10 +213,10 @@ def test_a_model_that_is_mostly_broken_is_not_mended(scene: Scene, default_devic
     run = Run.create(tmp_path / "run", CHECKED)
     real = Trainer.train_step
 
-    def step(self: Trainer) -> object:
+    def step(self: Trainer, **options: bool) -> object:
         if self.step == 17 and self.watch.patience.rate_factor == 1.0:
             self.parameters["sh_dc"].fill(np.nan)
-        return real(self)
+        return real(self, **options)
 
     with heard() as lines, pytest.MonkeyPatch.context() as patch:
         patch.setattr(Trainer, "train_step", step)

@@ -271,7 +271,7 @@ def test_pictures_and_render_have_one_background(
         for _ in range(4):
             trainer._set_parameters(upload_gaussians(default_device, hidden_model()))
             value = trainer.train_step().read()[0]
-            seen.add(tuple(trainer.background.get().tolist()))
+            seen.add(tuple(trainer.background.tolist()))
             # 8 bits: 1/510 at most in colour and in alpha, and what that makes of SSIM; else a background is off
             assert value < 0.008 if fits else value > 0.05
     colours = {"black": {(0.0, 0.0, 0.0)}, "white": {(1.0, 1.0, 1.0)}}.get(background)
