@@ -21,26 +21,56 @@ static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, in
   *x1 = max(*x0, min(*x1, end_tile - ty * tiles_x));
 }
 
-// shown (n), ranks (n): scan of the visible, visible and pairs (1): totals -> gaussian_from_visible, depth_keys
-// (visible); the first four of readback, zeroed before: both totals, the complement of the smallest key, the largest.
-// A positive float's bits sort as it does. A group owns a chunk.
+// shown, tile_counts (n) -> sums (2, groups): how many Gaussians of the chunk are visible, and their pairs, at most
+// 0xffffffff; the first four of readback become zero. A group owns a chunk.
+GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const uint *shown,
+                                 __global const uint *tile_counts, __global uint *sums, __global uint *readback) {
+  __local uint scratch[ITEMS];
+  const uint item = get_local_id(0), group = get_group_id(0);
+  const uint begin = group * chunk, end = min(begin + chunk, n);
+  uint visible = 0, all;
+  for (uint i = begin + item; i < end; i += ITEMS) visible += shown[i] != 0;
+  group_exclusive_scan(visible, scratch, &all);
+  const uint pairs = group_sum(tile_counts + begin, end - begin, scratch);
+  if (item != 0) return;
+  sums[group] = all;
+  sums[get_num_groups(0) + group] = pairs;
+  if (group != 0) return;
+  readback[READBACK_VISIBLE] = readback[READBACK_PAIRS] = 0;
+  readback[READBACK_KEY_COMPLEMENT] = readback[READBACK_LARGEST_KEY] = 0;
+}
+
+// shown, tile_counts (n), sums (2, groups) -> slots (n): scan of the tile counts; gaussian_from_visible, depth_keys
+// (visible); the first four of readback, zero before: numbers of the visible and of pairs, the complement of the
+// smallest key, the largest. A positive float's bits sort as it does. A group owns a chunk.
 GROUP __kernel void compact_visible(const uint n, const uint chunk, __global const uint *shown,
-                                    __global const uint *ranks, __global const float *splats,
-                                    __global const uint *visible, __global const uint *pairs,
+                                    __global const uint *tile_counts, __global const float *splats,
+                                    __global const uint *sums, __global uint *slots,
                                     __global uint *gaussian_from_visible, __global uint *depth_keys,
                                     __global uint *readback) {
-  __local uint extremes[2];
+  __local uint scratch[ITEMS], extremes[2];
   if (get_local_id(0) == 0) extremes[0] = extremes[1] = 0;
   BARRIER_LOCAL();
-  const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
+  const uint group = get_group_id(0), groups = get_num_groups(0);
+  const uint begin = group * chunk, end = min(begin + chunk, n);
+  uint visible = group_sum(sums, group, scratch), pairs = group_sum(sums + groups, group, scratch);
   uint complement = 0, largest = 0;
-  for (uint i = begin + get_local_id(0); i < end; i += ITEMS) {
-    if (shown[i] == 0) continue;
-    const uint key = as_uint(splats[(size_t)SPLAT_SIZE * i + SPLAT_DEPTH]);
-    gaussian_from_visible[ranks[i]] = i;
-    depth_keys[ranks[i]] = key;
-    complement = max(complement, ~key);
-    largest = max(largest, key);
+  for (uint first = begin; first < end; first += ITEMS) {
+    const uint i = first + get_local_id(0);
+    const uint is_shown = i < end && shown[i] != 0, count = i < end ? tile_counts[i] : 0;
+    uint all_shown, all_pairs;
+    const uint rank = visible + group_exclusive_scan(is_shown, scratch, &all_shown);
+    const uint slot = pairs + group_exclusive_scan(count, scratch, &all_pairs);
+    visible += all_shown;
+    pairs = add_sat(pairs, all_pairs);
+    if (i < end) slots[i] = slot;
+    if (is_shown) {
+      const uint key = as_uint(splats[(size_t)SPLAT_SIZE * i + SPLAT_DEPTH]);
+      gaussian_from_visible[rank] = i;
+      depth_keys[rank] = key;
+      complement = max(complement, ~key);
+      largest = max(largest, key);
+    }
   }
   atomic_max(extremes, complement);
   atomic_max(extremes + 1, largest);
@@ -48,9 +78,9 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   if (get_local_id(0) != 0) return;
   atomic_max(readback + READBACK_KEY_COMPLEMENT, extremes[0]);
   atomic_max(readback + READBACK_LARGEST_KEY, extremes[1]);
-  if (get_group_id(0) == 0) {
-    readback[READBACK_VISIBLE] = visible[0];
-    readback[READBACK_PAIRS] = pairs[0];
+  if (group + 1 == groups) {
+    readback[READBACK_VISIBLE] = visible;
+    readback[READBACK_PAIRS] = pairs;
   }
 }
 

@@ -1,10 +1,14 @@
-// One pass of a stable least-significant-digit radix sort: digit histogram of each chunk, (scan.cl over the digit-major
-// histograms), scatter. Reduce-then-scan: it needs no forward progress between groups.
+// One pass of a stable least-significant-digit radix sort in three launches: the histogram of each chunk, the scan of
+// each digit's counts over the chunks, the scatter. It needs no forward progress between groups.
 //
-// Owner: A group owns a chunk and an item a contiguous run of it, so that order within a digit is order of position.
-// Launch: One group of ITEMS work-items for each chunk.
-// Buffers: keys, values (n), histograms (digits, groups) -> keys_out, values_out (n); counters (digits, ITEMS) in local
-//   memory.
+// Owner: A group owns a chunk; in radix_offsets some digits. In the scatter a group of one item takes its keys one
+// after
+//   the other; a larger one takes tiles of TILE keys, sorts each by its digit in local memory, and writes a digit's
+//   keys side by side.
+// Launch: One group of ITEMS work-items for each chunk, or for each `rows` digits.
+// Buffers: keys, values (n), histograms (digits, groups), totals (digits) -> keys_out, values_out (n); counters
+// (digits)
+//   in local memory.
 // Equations: none; docs/decisions/0001-split-sort.md.
 #include "shared/math.h"
 #include "shared/group.h"
@@ -12,55 +16,160 @@
 // Keys count from `base`, which is no larger than any of them.
 #define DIGIT(key) ((((key) - base) >> shift) & (digits - 1))
 
-// counters[digit * ITEMS + item]: how many of the item's keys have the digit.
-static inline void count_digits(uint begin, uint end, uint base, uint shift, uint digits, __global const uint *keys,
-                                __local uint *counters) {
-  const uint item = get_local_id(0);
-  for (uint i = item; i < digits * ITEMS; i += ITEMS) counters[i] = 0;
-  BARRIER_LOCAL();
-  for (uint i = begin; i < end; ++i) counters[DIGIT(keys[i]) * ITEMS + item] += 1;
-  BARRIER_LOCAL();
-}
-
-#define RUN(begin, end)                                                                                                \
-  const uint run = (chunk + ITEMS - 1) / ITEMS;                                                                        \
-  const uint chunk_end = min((uint)(get_group_id(0) + 1) * chunk, n);                                                  \
-  const uint begin = min((uint)get_group_id(0) * chunk + (uint)get_local_id(0) * run, chunk_end);                      \
-  const uint end = min(begin + run, chunk_end);
+#if ITEMS == 1
+#define COUNT(counter) (counter) += 1
+#else
+#define COUNT(counter) atomic_inc(&(counter))
+#endif
 
 // keys (n) -> histograms (digits, groups)
 GROUP __kernel void radix_histogram(const uint n, const uint chunk, const uint base, const uint shift,
                                     const uint digits, __global const uint *keys, __global uint *histograms,
                                     __local uint *counters) {
-  RUN(begin, end)
-  count_digits(begin, end, base, shift, digits, keys, counters);
-  for (uint digit = get_local_id(0); digit < digits; digit += ITEMS) {
-    uint sum = 0;
-    for (uint item = 0; item < ITEMS; ++item) sum += counters[digit * ITEMS + item];
-    histograms[digit * get_num_groups(0) + get_group_id(0)] = sum;
+  const uint item = get_local_id(0);
+  const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
+  for (uint digit = item; digit < digits; digit += ITEMS) counters[digit] = 0;
+  BARRIER_LOCAL();
+  for (uint i = begin + item; i < end; i += ITEMS) COUNT(counters[DIGIT(keys[i])]);
+  BARRIER_LOCAL();
+  for (uint digit = item; digit < digits; digit += ITEMS) {
+    histograms[digit * get_num_groups(0) + get_group_id(0)] = counters[digit];
   }
 }
 
-// keys, values (n), scanned histograms -> keys_out, values_out (n); identity != 0 takes positions for values.
-GROUP __kernel void radix_scatter(const uint n, const uint chunk, const uint base, const uint shift, const uint digits,
-                                  const int identity, __global const uint *keys, __global const uint *values,
-                                  __global const uint *histograms, __global uint *keys_out, __global uint *values_out,
-                                  __local uint *counters) {
-  RUN(begin, end)
-  count_digits(begin, end, base, shift, digits, keys, counters);
-  for (uint digit = get_local_id(0); digit < digits; digit += ITEMS) {
-    uint place = histograms[digit * get_num_groups(0) + get_group_id(0)];
-    for (uint item = 0; item < ITEMS; ++item) {
-      const uint count = counters[digit * ITEMS + item];
-      counters[digit * ITEMS + item] = place;
-      place += count;
+// histograms (digits, groups): each digit's counts become how many keys with it are in the chunks before; totals
+// (digits): how many there are in all. A group owns `rows` digits.
+GROUP __kernel void radix_offsets(const uint groups, const uint digits, const uint rows, __global uint *histograms,
+                                  __global uint *totals) {
+  __local uint scratch[ITEMS];
+  const uint end = min((uint)(get_group_id(0) + 1) * rows, digits);
+  for (uint digit = get_group_id(0) * rows; digit < end; ++digit) {
+    __global uint *row = histograms + digit * groups;
+    uint running = 0;
+    for (uint first = 0; first < groups; first += ITEMS) {
+      const uint group = first + get_local_id(0);
+      uint all;
+      const uint before = group_exclusive_scan(group < groups ? row[group] : 0, scratch, &all);
+      if (group < groups) row[group] = running + before;
+      running += all;
     }
+    if (get_local_id(0) == 0) totals[digit] = running;
   }
-  BARRIER_LOCAL();
+}
+
+#define SCATTER                                                                                                        \
+  const uint n, const uint chunk, const uint base, const uint shift, const uint digits, const int identity,            \
+      __global const uint *keys, __global const uint *values, __global const uint *histograms,                         \
+      __global const uint *totals, __global uint *keys_out, __global uint *values_out, __local uint *places
+
+// The chunk's keys, values (n), histograms and totals as radix_offsets leaves them -> keys_out, values_out (n);
+// identity != 0 takes positions for values. places[digit]: where the next key with the digit goes.
+#if ITEMS == 1
+GROUP __kernel void radix_scatter(SCATTER) {
+  const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
+  uint before = 0;
+  for (uint digit = 0; digit < digits; ++digit) {
+    places[digit] = before + histograms[digit * get_num_groups(0) + get_group_id(0)];
+    before += totals[digit];
+  }
   for (uint i = begin; i < end; ++i) {
     const uint key = keys[i];
-    const uint place = counters[DIGIT(key) * ITEMS + get_local_id(0)]++;
+    const uint place = places[DIGIT(key)]++;
     keys_out[place] = key;
     values_out[place] = identity ? i : values[i];
   }
 }
+#else
+// RUN: keys of a tile that an item ranks, neighbours in it. WORDS: an item's counters of 16 values of four bits, two to
+// a word. Arrays of local memory have a gap after each 32 words, so that 32 items that read 8 or 16 words apart find
+// them in 32 banks.
+#define RUN 16
+#define WORDS 8
+#define TILE (RUN * ITEMS)
+#define GAPPED(i) ((i) + ((i) >> 5))
+
+// Stable sort of the tile by the four bits from `shift` on.
+static inline void sort_tile(uint shift, __local uint *tile, __local uint *counters, __local uint *scratch) {
+  const uint item = get_local_id(0);
+  uint entries[RUN], ranks[RUN], words[WORDS], all;
+#pragma unroll
+  for (uint word = 0; word < WORDS; ++word) counters[GAPPED(word * ITEMS + item)] = 0;
+#pragma unroll
+  for (uint k = 0; k < RUN; ++k) {
+    entries[k] = tile[GAPPED(item * RUN + k)];
+    const uint value = (entries[k] >> shift) & 15, lift = value / WORDS * 16;
+    __local uint *counter = counters + GAPPED(value % WORDS * ITEMS + item);
+    ranks[k] = (*counter >> lift) & 0xffff;
+    *counter += 1u << lift;
+  }
+  BARRIER_LOCAL();
+  uint sum = 0;
+#pragma unroll
+  for (uint word = 0; word < WORDS; ++word) {
+    words[word] = counters[GAPPED(item * WORDS + word)];
+    sum += words[word];
+  }
+  uint before = group_exclusive_scan(sum, scratch, &all);
+  before += all << 16; // keys of the upper eight values follow those of the lower
+#pragma unroll
+  for (uint word = 0; word < WORDS; ++word) {
+    counters[GAPPED(item * WORDS + word)] = before;
+    before += words[word];
+  }
+  BARRIER_LOCAL();
+#pragma unroll
+  for (uint k = 0; k < RUN; ++k) {
+    const uint value = (entries[k] >> shift) & 15;
+    const uint first = counters[GAPPED(value % WORDS * ITEMS + item)] >> (value / WORDS * 16);
+    tile[GAPPED((first & 0xffff) + ranks[k])] = entries[k];
+  }
+  BARRIER_LOCAL();
+}
+
+// Digits of at most 8 bits.
+GROUP __kernel void radix_scatter(SCATTER) {
+  __local uint tile[GAPPED(TILE)]; // digit << 16 | position in the tile
+  __local uint counters[GAPPED(WORDS * ITEMS)];
+  __local uint scratch[ITEMS];
+  const uint item = get_local_id(0);
+  const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
+  uint running = 0;
+  for (uint first = 0; first < digits; first += ITEMS) {
+    const uint digit = first + item;
+    uint all;
+    const uint before = group_exclusive_scan(digit < digits ? totals[digit] : 0, scratch, &all);
+    if (digit < digits) {
+      places[digit] = running + before + histograms[digit * get_num_groups(0) + get_group_id(0)];
+    }
+    running += all;
+  }
+  for (uint tile_begin = begin; tile_begin < end; tile_begin += TILE) {
+    const uint count = min((uint)TILE, end - tile_begin);
+    // What lies beyond the last key has the largest digit, and so stays behind all keys.
+    for (uint i = item; i < TILE; i += ITEMS) {
+      tile[GAPPED(i)] = (i < count ? DIGIT(keys[tile_begin + i]) : digits - 1) << 16 | i;
+    }
+    BARRIER_LOCAL();
+    for (uint bits = 0; digits >> bits > 1; bits += 4) sort_tile(16 + bits, tile, counters, scratch);
+    // While the tile is written, places[digit] is less by the position of the digit's first key in it.
+    for (uint i = item; i < count; i += ITEMS) {
+      const uint digit = tile[GAPPED(i)] >> 16;
+      if (i == 0 || tile[GAPPED(i - 1)] >> 16 != digit) places[digit] -= i;
+    }
+    BARRIER_LOCAL();
+    for (uint i = item; i < count; i += ITEMS) {
+      const uint entry = tile[GAPPED(i)];
+      const uint place = places[entry >> 16] + i;
+      const uint from = tile_begin + (entry & 0xffff);
+      keys_out[place] = keys[from];
+      values_out[place] = identity ? from : values[from];
+    }
+    BARRIER_LOCAL();
+    for (uint i = item; i < count; i += ITEMS) {
+      const uint digit = tile[GAPPED(i)] >> 16;
+      if (i + 1 == count || tile[GAPPED(i + 1)] >> 16 != digit) places[digit] += i + 1;
+    }
+    BARRIER_LOCAL();
+  }
+}
+#endif

@@ -42,13 +42,22 @@ class Shape:
 
     @property
     def digit_bits(self) -> int:
-        """Radix sort digit: a counter per digit and item has to fit local memory."""
-        return 11 if self.items == 1 else 4
+        """Bits of the radix sort's digit: its counters have to fit local memory."""
+        return 11 if self.items == 1 else 8
+
+    @property
+    def sort_items(self) -> int:
+        """Work-items of the radix sort's groups: what it sorts in local memory fits 32 KiB with up to 256 of them."""
+        return min(self.items, 256)
 
     @property
     def local_bytes(self) -> int:
-        """Local memory that a group needs at most: the sort's counters, and 32 KiB, which every device has to have."""
-        return max(4 * self.items << self.digit_bits, 32 << 10) if self.items > 1 else 32 << 10
+        """Local memory that a group needs at most. With one item it is the sort's counters of wide digits; else a tile
+        of 16 keys an item, 16 counters of 16 bits and a sum for each, gaps between them, and a counter a digit."""
+        if self.items == 1:
+            return 32 << 10
+        words = 24 * self.sort_items
+        return 4 * (words + words // 32 + self.sort_items + (1 << self.digit_bits))
 
 
 def default_shape(device: cl.Device) -> Shape:
@@ -62,9 +71,10 @@ def default_shape(device: cl.Device) -> Shape:
 
 def most_items(device: cl.Device) -> int:
     """Work-items that a group of our kernels can have: by the device's limit, and by its local memory."""
-    groups: int = device.max_work_group_size
-    by_memory: int = device.local_mem_size // (4 << Shape(1, 2, 1).digit_bits)
-    return min(groups, by_memory)
+    most: int = device.max_work_group_size
+    while most > 1 and Shape(1, most, 1).local_bytes > device.local_mem_size:
+        most //= 2
+    return most
 
 
 def candidates(device: cl.Device) -> list[Shape]:

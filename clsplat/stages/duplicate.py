@@ -21,8 +21,8 @@ MAX_PAIRS = 2**31 - 1024
 """Most pairs in one band: what `stops` count is signed, and read a little ahead of."""
 
 
-GAUSSIAN_BYTES = 4 * 4 + SORT_BYTES + 3 * 4
-"""Bytes of each Gaussian: ranks, first slots, the visible with their keys; these sorted, with counts and offsets."""
+GAUSSIAN_BYTES = 3 * 4 + SORT_BYTES + 3 * 4
+"""Bytes of each Gaussian: first slots, the visible with their keys; these sorted, with counts and offsets."""
 BAND_BYTES = 4
 """Bytes of each Gaussian more where there are several bands: its tiles in one of them."""
 TILE_BYTES = 4
@@ -89,20 +89,16 @@ def count(
     tile_counts = projected.tile_counts
     (n,) = tile_counts.shape
     shown = projected.shown or tile_counts
-    ranks = work.array("visible_ranks", (n,), np.uint32)
-    visible_total = work.array("visible_total", (1,), np.uint32)
-    pairs_total = work.array("pairs_total", (1,), np.uint32)
-    scan(device, work, shown, ranks, visible_total, as_flags=True)
     first_slots = work.array("first_slots", (n,), np.uint32)
-    scan(device, work, tile_counts, first_slots, pairs_total)
     gaussian_from_visible = work.array("gaussian_from_visible", (n,), np.uint32)
     depth_keys = work.array("depth_keys", (n,), np.uint32)
     readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
-    readback.reshaped(len(COUNTED)).fill(0)
     groups, chunk = chunking(device, n)
-    arrays = (shown, ranks, projected.splats, visible_total, pairs_total, gaussian_from_visible, depth_keys, readback)
-    kernel = device.kernels("duplicate").compact_visible
-    launch_groups(device, kernel, groups, device.shape.items, n, chunk, *arrays)
+    sums = work.array("visible_sums", (2, groups), np.uint32)
+    kernels, chunks = device.kernels("duplicate"), (groups, device.shape.items, n, chunk)
+    launch_groups(device, kernels.visible_sums, *chunks, shown, tile_counts, sums, readback)
+    arrays = (shown, tile_counts, projected.splats, sums, first_slots, gaussian_from_visible, depth_keys, readback)
+    launch_groups(device, kernels.compact_visible, *chunks, *arrays)
     visible, pairs, complement, largest, *refused = (int(value) for value in readback.get())
     least = 0 if all_bits else 2**32 - 1 - complement
     return Counted(

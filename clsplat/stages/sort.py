@@ -9,13 +9,13 @@ from clsplat.device import cl
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
-from clsplat.stages.scan import chunking, scan
+from clsplat.stages.scan import chunking
 
-BITONIC_MAX = 4096
-"""Number of keys that, with their positions, fill the 32 KiB of local memory that every device has."""
+BITONIC_MAX = 2048
+"""Number of keys that, with their positions, fill 16 KiB of local memory: half of what every device has."""
 
-BITONIC_WINS = {"cpu": 512, "gpu": BITONIC_MAX, "other": BITONIC_MAX}
-"""Up to this many keys one launch of bitonic sort beats the radix sort's dozen."""
+BITONIC_WINS = {"cpu": 512, "gpu": 1024, "other": 1024}
+"""Up to this many keys one launch of bitonic sort beats the radix sort's three a pass."""
 
 
 SORT_BYTES = 16
@@ -32,10 +32,8 @@ def _widest_digit(device: Device, n: int) -> int:
 
 def scratch_bytes(device: Device, n: int) -> int:
     """Upper bound of the bytes that sorts and scans of up to `n` elements need, beside the arrays under their names."""
-    shape = device.shape
-    groups = min(shape.chunks, -(-n // 1024)) if shape.items == 1 else -(-n // (16 * shape.items))
-    histograms = 4 * (1 << _widest_digit(device, n)) * max(groups, 1)
-    return histograms + 8 * max(groups, shape.chunks)  # and sums of scans
+    groups = max(chunking(device, n, device.shape.sort_items)[0], device.shape.chunks)
+    return 4 * (1 << _widest_digit(device, n)) * (groups + 1) + 8 * groups  # histograms, totals; sums of scans
 
 
 def radix_sort(
@@ -45,24 +43,25 @@ def radix_sort(
 
     As few passes as the widest digit allows, and their digits of even width.
     """
-    n = keys.shape[0]
-    groups, chunk = chunking(device, n)
-    items = device.shape.items
-    kernels = device.kernels("sort_radix")
+    n, items = keys.shape[0], device.shape.sort_items
+    groups, chunk = chunking(device, n, items)
+    kernels = device.kernels("sort_radix", ITEMS=items)
     passes = max(-(-bits // _widest_digit(device, n)), 1)
     digit_bits = -(-bits // passes) or 1
     digits = 1 << digit_bits
+    rows = 1 if items > 1 else -(-digits // device.shape.chunks)
     histograms = work.array("radix_histograms", (digits * groups,), np.uint32)
-    total = work.array("radix_total", (1,), np.uint32)
-    counters = cl.LocalMemory(4 * digits * items)
+    totals = work.array("radix_totals", (digits,), np.uint32)
+    counters = cl.LocalMemory(4 * digits)
     positions = keys
     for index in range(passes):
         chunks = (groups, items, n, chunk, base, index * digit_bits, digits)
         keys_out = work.array(f"{name}_keys{index % 2}", (n,), np.uint32)
         positions_out = work.array(f"{name}_positions{index % 2}", (n,), np.uint32)
         launch_groups(device, kernels.radix_histogram, *chunks, keys, histograms, counters)
-        scan(device, work, histograms, histograms, total)
-        arrays = (keys, positions, histograms, keys_out, positions_out)
+        offsets = (groups, digits, rows, histograms, totals)
+        launch_groups(device, kernels.radix_offsets, -(-digits // rows), items, *offsets)
+        arrays = (keys, positions, histograms, totals, keys_out, positions_out)
         launch_groups(device, kernels.radix_scatter, *chunks, index == 0, *arrays, counters)
         keys, positions = keys_out, positions_out
     return keys, positions

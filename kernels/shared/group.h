@@ -25,7 +25,8 @@
   value = group_max;
 #endif
 
-// The sum of the values of the items before this one; *total gets the sum of all. scratch holds ITEMS elements.
+// The sum of the values of the items before this one; *total gets the sum of all. Sums stop at 0xffffffff, which is so
+// in every order of addition. scratch holds ITEMS elements.
 static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint *total) {
 #if ITEMS == 1
   *total = value;
@@ -37,7 +38,7 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
   for (uint step = 1; step < ITEMS; step *= 2) {
     const uint add = item >= step ? scratch[item - step] : 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    scratch[item] += add;
+    scratch[item] = add_sat(scratch[item], add);
     barrier(CLK_LOCAL_MEM_FENCE);
   }
   *total = scratch[ITEMS - 1];
@@ -55,3 +56,11 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
   const int begin = ranges[2 * get_group_id(0)], end = ranges[2 * get_group_id(0) + 1];                                \
   const size_t stride = (size_t)tiles_x * TILE;                                                                        \
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
+
+// The sum of values (count), for every item; it stops at 0xffffffff. scratch holds ITEMS elements.
+static inline uint group_sum(__global const uint *values, uint count, __local uint *scratch) {
+  uint sum = 0, total;
+  for (uint i = get_local_id(0); i < count; i += ITEMS) sum = add_sat(sum, values[i]);
+  group_exclusive_scan(sum, scratch, &total);
+  return total;
+}

@@ -223,7 +223,7 @@ def test_the_table(capsys: Capture) -> None:
     quick(
         [
             "blend: before * alpha => before + alpha",
-            "scan: sum += VALUE => sum += 2 * VALUE",
+            "scan: out[i] = running + before => out[i] = before",
             "loss: mu1 => this is no C",
         ],
         "loss: mu1 => this is no C",

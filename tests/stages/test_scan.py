@@ -5,25 +5,36 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pipeline import shaped
+from quick import quick
 
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.stages.scan import scan
+from clsplat.stages.scan import MOST_GROUPS, PER_ITEM, scan
 
-SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 8 * 1024 + 1, 100_003)
+SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 4096, 4097, 8 * 1024 + 1, 100_003)
+
+
+def check(device: Device, n: int) -> None:
+    values = np.random.default_rng(n).integers(0, 4, n).astype(np.uint32)
+    out = upload(device, np.full(n, 0xFFFFFFFF, np.uint32))
+    sum_array = allocate(device, (1,), np.uint32)
+    scan(device, Workspace(device), upload(device, values), out, sum_array)
+    np.testing.assert_array_equal(out.get(), np.concatenate([[0], np.cumsum(values)[:-1]]))
+    assert sum_array.get()[0] == values.sum()
 
 
 @pytest.mark.parametrize("n", SIZES)
-@pytest.mark.parametrize("as_flags", [False, True])
-def test_exclusive_prefix_sum(shaped_device: Device, n: int, as_flags: bool) -> None:
-    values = np.random.default_rng(n).integers(0, 4, n).astype(np.uint32)
-    work = Workspace(shaped_device)
-    out = upload(shaped_device, np.full(n, 0xFFFFFFFF, np.uint32))
-    sum_array = allocate(shaped_device, (1,), np.uint32)
-    scan(shaped_device, work, upload(shaped_device, values), out, sum_array, as_flags=as_flags)
-    counted = (values > 0).astype(np.uint32) if as_flags else values
-    np.testing.assert_array_equal(out.get(), np.concatenate([[0], np.cumsum(counted)[:-1]]))
-    assert sum_array.get()[0] == counted.sum()
+def test_exclusive_prefix_sum(shaped_device: Device, n: int) -> None:
+    check(shaped_device, n)
+
+
+@pytest.mark.parametrize("items", quick((16, 32, 128, 256), 16))
+def test_scan_in_every_size_of_group(device: Device, items: int) -> None:
+    """One launch up to a chunk, two beyond it, and chunks of several times the usual size."""
+    chunk = PER_ITEM * items
+    for n in (chunk, chunk + 1, 2 * MOST_GROUPS * chunk + 1 if items == 16 else 3 * chunk - 1):
+        check(shaped(device, 1, items), n)
 
 
 def test_scan_in_place(shaped_device: Device) -> None:

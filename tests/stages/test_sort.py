@@ -6,13 +6,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pipeline import shaped
+from quick import quick
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
+from clsplat.stages import scan as stages_scan
+from clsplat.stages.scan import PER_ITEM
 from clsplat.stages.sort import BITONIC_MAX, BITONIC_WINS, WIDE_FROM, bitonic_sort, radix_sort, sort
 
-SIZES = (0, 1, 2, 63, 64, 65, 127, 128, 129, 1023, 1024, 1025, 4096)
-RADIX_SIZES = (*SIZES, 8 * 1024 + 1, 70_001)
+SIZES = (0, 1, 2, 63, 64, 65, 127, 128, 129, 1023, 1024, 1025, 2048)
+RADIX_SIZES = (*SIZES, 4095, 4096, 4097, 8 * 1024 + 1, 70_001)
 
 
 def check(keys: NDArray[np.uint32], result: tuple[NDArray[np.uint32], NDArray[np.uint32]]) -> None:
@@ -65,6 +69,28 @@ def test_radix_of_keys_that_begin_at_a_base(shaped_device: Device, base: int, bi
 def test_radix_by_wide_digits(shaped_device: Device, n: int, bits: int) -> None:
     keys = np.uint32(12345) + np.random.default_rng(n).integers(0, 2**bits, n, dtype=np.uint32)
     check(keys, radix(shaped_device, keys, bits, 12345))
+
+
+GROUPS = (16, 32, 64, 128, 256)
+"""Items of a group: what a GPU may have."""
+
+
+@pytest.mark.parametrize("items", quick(GROUPS, 256))
+def test_radix_at_the_seams_of_a_group_s_tiles(device: Device, items: int) -> None:
+    """One key less and one more than a tile, and a second pass over tiles that are not full; digits of 1 to 8 bits."""
+    shaped_device, tile = shaped(device, 1, items), PER_ITEM * items
+    for n, bits in ((tile - 1, 1), (tile, 4), (tile + 1, 5), (2 * tile, 8), (3 * tile + 7, 13), (5 * tile - 1, 32)):
+        keys = np.random.default_rng(n).integers(0, 2**bits, n, dtype=np.uint32)
+        check(keys, radix(shaped_device, keys, bits))
+
+
+def test_radix_of_several_tiles_a_group(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More keys than MOST_GROUPS tiles hold: a group goes over two or three tiles, the last of them cut."""
+    monkeypatch.setattr(stages_scan, "MOST_GROUPS", 4)
+    items = 16
+    for n in (5 * PER_ITEM * items, 12 * PER_ITEM * items - 3):
+        keys = np.random.default_rng(n).integers(0, 2**12, n, dtype=np.uint32)
+        check(keys, radix(shaped(device, 1, items), keys, 12))
 
 
 @pytest.mark.smoke

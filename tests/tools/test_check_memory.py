@@ -29,7 +29,7 @@ Uninitialized value written to global memory address 0x8000000000000
 \t  ranges[2 * tile] = i;
 
 Write-write data race at global memory address 0x1000000000000
-\tKernel: scan_top
+\tKernel: scan_chunks
 
 """
 TEXT = "if (i >= pairs) return;"
@@ -45,7 +45,7 @@ def test_findings_name_the_kernels_line() -> None:
     line = next(i for i, each in enumerate((kernel_root() / "ranges.cl").read_text().splitlines(), 1) if TEXT in each)
     written = "Uninitialized value written to global memory address 0x..."
     raced = "Write-write data race at global memory address 0x..."
-    assert set(found) == {Finding(written, "ranges", f"kernels/ranges.cl:{line}"), Finding(raced, "scan_top")}
+    assert set(found) == {Finding(written, "ranges", f"kernels/ranges.cl:{line}"), Finding(raced, "scan_chunks")}
     assert sum(accepted.values()) == 1
 
 
@@ -66,17 +66,17 @@ def test_places_are_those_of_the_text(stem: str) -> None:
 def test_whatever_is_logged_is_a_finding(log: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert not report(Result("1x64 races", 0, "", log.replace("LINE", "9"), 1.0), kernels())
     assert report(Result("1x64 races", 0, "", "", 1.0), kernels())
-    assert not report(Result("1x64 races", -11, "scan_top", "", 1.0), kernels())
-    assert "the last kernel was scan_top" in capsys.readouterr().out
+    assert not report(Result("1x64 races", -11, "scan_chunks", "", 1.0), kernels())
+    assert "the last kernel was scan_chunks" in capsys.readouterr().out
 
 
 def test_a_kernel_that_never_ran_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    ran = " ".join(sorted(set(kernels()) - {"scan_top"}))
+    ran = " ".join(sorted(set(kernels()) - {"scan_chunks"}))
     monkeypatch.setattr(check_memory, "library", lambda: Path("driver"))
     monkeypatch.setattr(check_memory, "run", lambda shape, check, *_: Result(f"{shape} {check}", 0, ran, "", 0.0))
     monkeypatch.setattr(check_memory, "report_planted", lambda *_: True)
     assert check_memory.main(["--shapes", "8x1"]) == 1
-    assert "never ran: scan_top" in capsys.readouterr().out
+    assert "never ran: scan_chunks" in capsys.readouterr().out
 
 
 def test_without_oclgrind(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
