@@ -17,7 +17,7 @@ def mebibytes(nbytes: int) -> str:
 class Need:
     """Device memory that a frame, or a training step, needs, in bytes unless said otherwise.
 
-    gaussians: their number; model: each one's parameters, in a step with gradients and moments; widest: each one's part
+    gaussians: their number; model: each one's parameters, in a step with moments; widest: each one's part
     of the widest of these arrays; row: of each, all the rest; banded: of each, what several bands of tiles add; pair:
     of each pair; most_pairs: their number at which the widest of their arrays is full; planes: all that is as large as
     the image; loss: the loss's scratch memory, a part of that; scratch: whatever is left over.
@@ -53,7 +53,7 @@ PAIRS_EACH = 8
 class Plan:
     """Division of the work, so that it fits the memory.
 
-    rows: Gaussians whose parameters, gradients and moments are on the device at once; streamed: not all of them; pairs:
+    rows: Gaussians whose parameters and moments are on the device at once; streamed: not all of them; pairs:
     most (tile, Gaussian) pairs at once; channels: of the loss, at once; gathers: rows move on the device; allowed:
     bytes; groups: of tiles, estimated.
     """
@@ -102,7 +102,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
 
     def made(rows: int, *, streamed: bool) -> Plan:
         pairs = min((room - rows * need.model) // need.pair, need.most_pairs)
-        gathers = not streamed and need.total + need.gaussians * need.model * 3 // 4 <= budget
+        gathers = not streamed and need.total + need.gaussians * need.model <= budget
         groups = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > need.most_pairs else 1
         return Plan(need, rows, streamed, pairs, channels, gathers, budget, groups)
 
