@@ -1,21 +1,31 @@
 // The gradient of projection: sums a Gaussian's slots in the order of its tiles, then the chain rule back to its
-// parameters.
+// parameters. project_step takes Adam's step with it at once: no gradient is in memory.
 //
-// Owner: A work-item owns LANES Gaussians, of which it leaves those that are not visible; in add_slots one.
+// Owner: A work-item owns LANES Gaussians, of which project_grad leaves those that are not visible; in add_slots one.
+// In
+//   project_step a group owns ROWS of them, so that it walks each of the model's arrays in order.
 // Launch: One work-item for each LANES Gaussians, or for each one, in groups of 64; those beyond the last do nothing.
+//   project_step: groups of one item, or with one lane of ROWS.
 // Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE);
-//   tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project.cl -> gradients of the
-//   parameters, of the same shapes, in loss per unit of each; rows of Gaussians that are not visible are left as they
-//   are. screen (n, 2): of the mean on the image, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n):
-//   what each adds to the image, sums of its blending weights over all pixels.
-// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55).
+//   tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project.cl -> screen (n, 2): of the
+//   mean on the image, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): what each adds to the image,
+//   sums of its blending weights over all pixels. project_grad: gradients of the parameters, of the same shapes, in
+//   loss per unit of each. Rows of Gaussians that are not visible are left as they are. project_step, built with ADAM:
+//   the parameters and their moments `first` and `second`, of the same shapes; `readback` (READBACK_SIZE) counts, and
+//   the scalars are those of Step, one a group where they differ. The gradient of a Gaussian that is not visible is
+//   zero, or with SPARSE its row stays as it is.
+// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/splat.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
+#ifdef ADAM
+#include "shared/adam.h"
+#endif
 
+#ifndef ADAM
 // Sums that band after band of tiles goes on with: tile_counts, first_slots (n), slots (pairs) of one band
 // -> sums (n, SLOT_STRIDE). From the first band to the last these are the additions that project_grad makes by itself.
 __kernel void add_slots(const uint n, __global const uint *tile_counts, __global const uint *first_slots,
@@ -31,6 +41,7 @@ __kernel void add_slots(const uint n, __global const uint *tile_counts, __global
     for (int field = 0; field < SLOT_STRIDE; ++field) own[field] += slot[field];
   for (int field = 0; field < SLOT_STRIDE; ++field) sums[(size_t)SLOT_STRIDE * i + field] = own[field];
 }
+#endif
 
 // s1 - s2, their logarithms `x` apart: near each other by the series of exp(x) - 1, as what rounding leaves of two
 // equal scales' difference would turn every ball.
@@ -43,27 +54,54 @@ static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
   return x * x < 0.0625f ? series : s1 - s2;
 }
 
-__kernel void project_grad(const uint n, const int coefficients, __constant float *camera,
-                           __global const uint *tile_counts, __global const uint *first_slots,
-                           __global const float *slots, __global const float *splats, __global const float *means,
-                           __global const float *quaternions, __global const float *log_scales,
-                           __global const float *opacity_logits, __global const float *sh_dc,
-                           __global const float *sh_rest, __global float *d_means, __global float *d_quaternions,
-                           __global float *d_log_scales, __global float *d_opacity_logits, __global float *d_sh_dc,
-                           __global float *d_sh_rest, __global float *screen
-#ifdef CONTRIBUTIONS
-                           ,
-                           __global float *contributions
+// Memory that the gradients of the higher SH bands are written to: all Gaussians', or a work-item's own. With one lane
+// project_step makes them of basis and colour.
+#if !defined(ADAM)
+#define SH_GRADIENT __global float
+#elif LANES > 1
+#define SH_GRADIENT float
 #endif
-) {
-  ROWS_OF_ITEM(n)
+
+// The SH coefficients after the first one, of so many that are used.
+#define SH_HIGHER 15
+#if LANES == 1
+#define FOR_HIGHER(k, used) UNROLL for (int k = 1; k <= SH_HIGHER; ++k) if (k < (used))
+#else
+#define FOR_HIGHER(k, used) for (int k = 1; k < (used); ++k)
+#endif
+
+// Gradients of LANES Gaussians by their parameters. That by an SH coefficient is the basis there times colour's; colour
+// is a row's red, green and blue, each zero where it is clamped.
+typedef struct {
+  Lanes mean[3], quaternion[4], scale[3], opacity, colour[3], basis[16];
+} Gradients;
+
+// What the visible ones of the rows from first_row on have; returns 0 if none is visible. `shown` (LANES) is 1 where
+// one is. Fills screen and contributions, and of visible rows d_sh_rest, which is row first_row's.
+static inline int gradients_of(const uint n, const uint first_row, const int coefficients, __constant float *camera,
+                               __global const uint *tile_counts, __global const uint *first_slots,
+                               __global const float *slots, __global const float *splats, __global const float *means,
+                               __global const float *quaternions, __global const float *log_scales,
+                               __global const float *opacity_logits, __global const float *sh_rest,
+                               __global float *screen,
+#ifdef CONTRIBUTIONS
+                               __global float *contributions,
+#endif
+#ifdef SH_GRADIENT
+                               SH_GRADIENT *d_sh_rest,
+#endif
+                               int *shown, Gradients *d) {
+  uint row[LANES];
+  for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < n ? first_row + lane : n - 1;
+  const uint lanes_used = n - first_row < LANES ? n - first_row : LANES;
   Lanes m[SLOT_STRIDE];
   int any = 0;
   for (int field = 0; field < SLOT_STRIDE; ++field) m[field].all = (floatL)(0.0f);
   Lanes whitening[3]; // nobody has written the splats of Gaussians that are not visible
   for (int k = 0; k < 3; ++k) whitening[k].all = (floatL)(0.0f);
-  for (uint lane = 0; lane < lanes_used; ++lane) {
-    const uint count = tile_counts[first_row + lane];
+  for (uint lane = 0; lane < LANES; ++lane) {
+    const uint count = lane < lanes_used ? tile_counts[first_row + lane] : 0;
+    shown[lane] = count > 0;
     if (count == 0) continue;
     any = 1;
 #ifdef ADDED_UP
@@ -84,13 +122,13 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
     whitening[2].lane[lane] = splat[SPLAT_L22];
   }
   Projection p;
-  if (!any || !project_gaussians(row, means, quaternions, log_scales, camera, &p)) return;
+  if (!any || !project_gaussians(row, means, quaternions, log_scales, camera, &p)) return 0;
   const floatL l11 = whitening[0].all, l12 = whitening[1].all, l22 = whitening[2].all;
   const floatL m_g = m[SLOT_G].all, m_gu = m[SLOT_GU].all, m_gv = m[SLOT_GV].all;
 
   // Opacity, (29) and (41): sum of g is o dL/do, and do/dlogit = o (1 - o).
-  Lanes d_opacity, d_screen[2], d_mean[3], d_scale[3], d_quaternion[4];
-  d_opacity.all = m_g * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also where o is next to 1
+  Lanes d_screen[2];
+  d->opacity.all = m_g * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also where o is next to 1
 
   // (50). Mean on the image: -W^T (sum of g w).
   const floatL d_mx = -INVERSE_WHITEN2 * (l11 * m_gu);
@@ -108,7 +146,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   const floatL uu = unwhiten * m[SLOT_GUU].all, uv = unwhiten * m[SLOT_GUV].all, vv = unwhiten * m[SLOT_GVV].all;
   floatL wu[3], wv[3];
   const floatL lean = l11 / p.syy;
-  for (int k = 0; k < 3; ++k) {
+  FOR_AXES(k) {
     const int l = (k + 1) % 3, n = (k + 2) % 3;
     const floatL minors = fmaL(p.s[l] * p.b2[l], p.s[l] * p.c[n], -(p.s[n] * p.b2[n] * (p.s[n] * p.c[l])));
     wu[k] = lean * fmaL((floatL)(LOW_PASS), p.b1[k], minors);
@@ -117,12 +155,12 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 
   // (59) to (61): log scales, the turn in the Gaussian's own frame, and what the Jacobian takes of the gradient.
   floatL d_size = (floatL)(0.0f), along_u = d_size, along_v = d_size, turned[3];
-  for (int k = 0; k < 3; ++k) {
+  FOR_AXES(k) {
     const int l = (k + 1) % 3, n = (k + 2) % 3;
     const floatL nu = p.s[k] * wu[k], nv = p.s[k] * wv[k];
     const floatL tu = fmaL(uu, nu, uv * nv), tv = fmaL(uv, nu, vv * nv);
-    d_scale[k].all = fmaL(nu, tu, nv * tv);
-    d_size += d_scale[k].all;
+    d->scale[k].all = fmaL(nu, tu, nv * tv);
+    d_size += d->scale[k].all;
     const floatL depth = p.s[k] * p.a2[k];
     along_u = fmaL(tu, depth, along_u);
     along_v = fmaL(tv, depth, along_v);
@@ -132,10 +170,10 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   }
   const floatL w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
   const floatL turn = 2.0f / p.length;
-  d_quaternion[0].all = turn * -fmaL(x, turned[0], fmaL(y, turned[1], z * turned[2]));
-  d_quaternion[1].all = turn * fmaL(w, turned[0], fmaL(y, turned[2], -(z * turned[1])));
-  d_quaternion[2].all = turn * fmaL(w, turned[1], fmaL(z, turned[0], -(x * turned[2])));
-  d_quaternion[3].all = turn * fmaL(w, turned[2], fmaL(x, turned[1], -(y * turned[0])));
+  d->quaternion[0].all = turn * -fmaL(x, turned[0], fmaL(y, turned[1], z * turned[2]));
+  d->quaternion[1].all = turn * fmaL(w, turned[0], fmaL(y, turned[2], -(z * turned[1])));
+  d->quaternion[2].all = turn * fmaL(w, turned[1], fmaL(z, turned[0], -(x * turned[2])));
+  d->quaternion[3].all = turn * fmaL(w, turned[2], fmaL(x, turned[1], -(y * turned[0])));
 
   // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, J moves with
   // z alone.
@@ -152,51 +190,250 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
   vx /= length;
   vy /= length;
   vz /= length;
-  Lanes basis[16], weight[16];
-  sh_basis(SH_USED(coefficients), vx, vy, vz, &basis[0].all);
+  Lanes weight[16];
+  sh_basis(SH_USED(coefficients), vx, vy, vz, &d->basis[0].all);
   for (uint lane = 0; lane < lanes_used; ++lane) {
     const size_t i = first_row + lane;
-    if (tile_counts[i] == 0) continue;
+    if (!shown[lane]) continue;
     __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
     const float4 d_colour = (float4)(splat[SPLAT_RED] > 0.0f ? m[SLOT_RED].lane[lane] : 0.0f,
                                      splat[SPLAT_GREEN] > 0.0f ? m[SLOT_GREEN].lane[lane] : 0.0f,
                                      splat[SPLAT_BLUE] > 0.0f ? m[SLOT_BLUE].lane[lane] : 0.0f, 0.0f);
-    d_sh_dc[3 * i] = SH_CONSTANT * d_colour.x;
-    d_sh_dc[3 * i + 1] = SH_CONSTANT * d_colour.y;
-    d_sh_dc[3 * i + 2] = SH_CONSTANT * d_colour.z;
+    d->colour[0].lane[lane] = d_colour.x;
+    d->colour[1].lane[lane] = d_colour.y;
+    d->colour[2].lane[lane] = d_colour.z;
     __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
-    __global float *d_f = d_sh_rest + (size_t)3 * (coefficients - 1) * i;
-    for (int k = 1; k < SH_USED(coefficients); ++k, f += 3, d_f += 3) {
-      const float along = basis[k].lane[lane];
-#ifndef NO_SH_REST // OptimiserConfig.sh_rest_every
+#ifdef SH_GRADIENT
+    SH_GRADIENT *d_f = d_sh_rest + 3 * (coefficients - 1) * lane;
+#endif
+    FOR_HIGHER(k, SH_USED(coefficients)) {
+#if defined(SH_GRADIENT) && !defined(NO_SH_REST) // OptimiserConfig.sh_rest_every
+      const float along = d->basis[k].lane[lane];
       d_f[0] = along * d_colour.x;
       d_f[1] = along * d_colour.y;
       d_f[2] = along * d_colour.z;
+      d_f += 3;
 #endif
       weight[k].lane[lane] = fma1(d_colour.x, f[0], fma1(d_colour.y, f[1], d_colour.z * f[2]));
+      f += 3;
     }
   }
   floatL d_v[3];
   sh_direction_gradient(SH_USED(coefficients), vx, vy, vz, &weight[0].all, d_v);
   const floatL along = d_v[0] * vx + d_v[1] * vy + d_v[2] * vz;
-  for (int k = 0; k < 3; ++k) {
+  FOR_AXES(k) {
     const floatL v = k == 0 ? vx : (k == 1 ? vy : vz);
     const floatL by_colour = (d_v[k] - along * v) / length;
     const floatL above = by_colour < 1e37f ? by_colour : (floatL)(0.0f);
-    d_mean[k].all = camera[CAMERA_R00 + k] * d_x + camera[CAMERA_R10 + k] * d_y + camera[CAMERA_R20 + k] * d_z +
-                    (by_colour > -1e37f ? above : (floatL)(0.0f));
+    d->mean[k].all = camera[CAMERA_R00 + k] * d_x + camera[CAMERA_R10 + k] * d_y + camera[CAMERA_R20 + k] * d_z +
+                     (by_colour > -1e37f ? above : (floatL)(0.0f));
   }
 
   for (uint lane = 0; lane < lanes_used; ++lane) {
     const size_t i = first_row + lane;
-    if (tile_counts[i] == 0) continue;
-    for (int k = 0; k < 3; ++k) d_means[3 * i + k] = d_mean[k].lane[lane];
-    for (int k = 0; k < 4; ++k) d_quaternions[4 * i + k] = d_quaternion[k].lane[lane];
-    for (int k = 0; k < 3; ++k) d_log_scales[3 * i + k] = d_scale[k].lane[lane];
-    d_opacity_logits[i] = d_opacity.lane[lane];
+    if (!shown[lane]) continue;
     for (int k = 0; k < 2; ++k) screen[2 * i + k] = d_screen[k].lane[lane];
 #ifdef CONTRIBUTIONS
     contributions[i] = m[SLOT_WEIGHT].lane[lane];
 #endif
   }
+  return 1;
 }
+
+#ifdef CONTRIBUTIONS
+#define VIEW_ARRAYS screen, contributions
+#else
+#define VIEW_ARRAYS screen
+#endif
+
+#ifndef ADAM
+__kernel void project_grad(const uint n, const int coefficients, __constant float *camera,
+                           __global const uint *tile_counts, __global const uint *first_slots,
+                           __global const float *slots, __global const float *splats, __global const float *means,
+                           __global const float *quaternions, __global const float *log_scales,
+                           __global const float *opacity_logits, __global const float *sh_dc,
+                           __global const float *sh_rest, __global float *d_means, __global float *d_quaternions,
+                           __global float *d_log_scales, __global float *d_opacity_logits, __global float *d_sh_dc,
+                           __global float *d_sh_rest, __global float *screen
+#ifdef CONTRIBUTIONS
+                           ,
+                           __global float *contributions
+#endif
+) {
+  const uint first_row = get_global_id(0) * LANES;
+  if (first_row >= n) return;
+  int shown[LANES];
+  Gradients d;
+  if (!gradients_of(n, first_row, coefficients, camera, tile_counts, first_slots, slots, splats, means, quaternions,
+                    log_scales, opacity_logits, sh_rest, VIEW_ARRAYS,
+                    d_sh_rest + (size_t)3 * (coefficients - 1) * first_row, shown, &d))
+    return;
+  for (uint lane = 0; lane < LANES; ++lane) {
+    const size_t i = first_row + lane;
+    if (!shown[lane]) continue;
+    for (int k = 0; k < 3; ++k) d_means[3 * i + k] = d.mean[k].lane[lane];
+    for (int k = 0; k < 4; ++k) d_quaternions[4 * i + k] = d.quaternion[k].lane[lane];
+    for (int k = 0; k < 3; ++k) d_log_scales[3 * i + k] = d.scale[k].lane[lane];
+    d_opacity_logits[i] = d.opacity.lane[lane];
+    for (int k = 0; k < 3; ++k) d_sh_dc[3 * i + k] = SH_CONSTANT * d.colour[k].lane[lane];
+  }
+}
+#else
+
+#define BLOCKS (ROWS / LANES)
+#define ROW_ALIGNED __attribute__((aligned(4 * LANES)))
+#define SH_FLOATS (3 * SH_HIGHER) // of a Gaussian's higher SH bands
+
+#if LANES > 1
+// Adam's step of LANES rows, or of those up to n: gradients (LANES, width), zero in rows that are not `shown`.
+static inline void step_rows(const uint n, const uint first_row, const uint width, const int *shown,
+                             const float *gradients, Step s, Stepped model) {
+  const size_t begin = (size_t)first_row * width, end = (size_t)n * width;
+#ifdef SPARSE
+  int some = 0;
+  for (uint lane = 0; lane < LANES; ++lane) some |= shown[lane];
+  if (!some) return;
+  IntLanes taken[SH_FLOATS];
+  for (uint lane = 0; lane < LANES; ++lane)
+    for (uint k = 0; k < width; ++k) taken[0].lane[lane * width + k] = -shown[lane];
+#endif
+  for (uint k = 0; k < width; ++k) {
+    const size_t i = begin + k * LANES;
+    const floatL g = *(const floatL *)(gradients + k * LANES);
+#ifdef SPARSE
+    if (n - first_row >= LANES && step_vector(i, g, taken[k].all, s, model)) continue;
+#else
+    if (i + LANES <= end && step_vector(i, g, (intL)(-1), s, model)) continue;
+#endif
+    for (uint lane = 0; lane < LANES && i + lane < end; ++lane) {
+#ifdef SPARSE
+      if (!taken[k].lane[lane]) continue;
+#endif
+      step_element(i + lane, gradients[k * LANES + lane], s, model);
+    }
+  }
+}
+#endif
+
+__kernel void
+project_step(const uint n, const int coefficients, __constant float *camera, __global const uint *tile_counts,
+             __global const uint *first_slots, __global const float *slots, __global const float *splats,
+             __global float *screen,
+#ifdef CONTRIBUTIONS
+             __global float *contributions,
+#endif
+             const float beta1, const float beta2, const float epsilon, const float root, const float root_sh_rest,
+             const float rate_means, const float rate_quaternions, const float rate_log_scales,
+             const float rate_opacity_logits, const float rate_sh_dc, const float rate_sh_rest, const float limit2,
+             const float limit2_sh, __global uint *readback, __global float *means, __global float *quaternions,
+             __global float *log_scales, __global float *opacity_logits, __global float *sh_dc, __global float *sh_rest,
+             __global float *first_means, __global float *first_quaternions, __global float *first_log_scales,
+             __global float *first_opacity_logits, __global float *first_sh_dc, __global float *first_sh_rest,
+             __global float *second_means, __global float *second_quaternions, __global float *second_log_scales,
+             __global float *second_opacity_logits, __global float *second_sh_dc, __global float *second_sh_rest) {
+#define STEP_OF(group, root, limit2)                                                                                   \
+  const Stepped model = {group, first_##group, second_##group};                                                        \
+  const Step s = {rate_##group, root, beta1, beta2, epsilon, limit2, readback};
+  Gradients d;
+  const uint sh_width = 3 * (coefficients - 1);
+#if LANES > 1
+  // A group of the model's arrays after the other, each in runs that are long enough for a processor to fetch ahead.
+  const uint begin = get_global_id(0) * BLOCKS * LANES;
+  if (begin >= n) return;
+  int shown[ROWS];
+  const uint blocks = min((n - begin - 1) / LANES + 1, (uint)BLOCKS);
+  float by_mean[3 * ROWS] ROW_ALIGNED, by_quaternion[4 * ROWS] ROW_ALIGNED, by_log_scale[3 * ROWS] ROW_ALIGNED;
+  float by_opacity[ROWS] ROW_ALIGNED, by_sh_dc[3 * ROWS] ROW_ALIGNED, by_sh_rest[SH_FLOATS * ROWS] ROW_ALIGNED;
+#ifndef NO_SH_REST
+  for (uint k = 0; k < sh_width * blocks; ++k) *(floatL *)(by_sh_rest + k * LANES) = (floatL)(0.0f);
+#endif
+  for (uint block = 0; block < blocks; ++block) {
+    int *seen = shown + block * LANES;
+    const int any = gradients_of(n, begin + block * LANES, coefficients, camera, tile_counts, first_slots, slots,
+                                 splats, means, quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS,
+                                 by_sh_rest + block * LANES * sh_width, seen, &d);
+    for (uint lane = 0; lane < LANES; ++lane) {
+      const uint i = block * LANES + lane;
+      const int one = any && seen[lane];
+      for (int k = 0; k < 3; ++k) by_mean[3 * i + k] = one ? d.mean[k].lane[lane] : 0.0f;
+      for (int k = 0; k < 4; ++k) by_quaternion[4 * i + k] = one ? d.quaternion[k].lane[lane] : 0.0f;
+      for (int k = 0; k < 3; ++k) by_log_scale[3 * i + k] = one ? d.scale[k].lane[lane] : 0.0f;
+      by_opacity[i] = one ? d.opacity.lane[lane] : 0.0f;
+      for (int k = 0; k < 3; ++k) by_sh_dc[3 * i + k] = one ? SH_CONSTANT * d.colour[k].lane[lane] : 0.0f;
+    }
+  }
+#define STEP_GROUP(group, width, gradients, root, limit2)                                                              \
+  {                                                                                                                    \
+    STEP_OF(group, root, limit2)                                                                                       \
+    for (uint block = 0; block < blocks; ++block)                                                                      \
+      step_rows(n, begin + block * LANES, width, shown + block * LANES, gradients + block * LANES * (width), s,        \
+                model);                                                                                                \
+  }
+  STEP_GROUP(means, 3, by_mean, root, limit2)
+  STEP_GROUP(quaternions, 4, by_quaternion, root, limit2)
+  STEP_GROUP(log_scales, 3, by_log_scale, root, limit2)
+  STEP_GROUP(opacity_logits, 1, by_opacity, root, limit2)
+  STEP_GROUP(sh_dc, 3, by_sh_dc, root, limit2_sh)
+#ifndef NO_SH_REST
+  STEP_GROUP(sh_rest, sh_width, by_sh_rest, root_sh_rest, limit2_sh)
+#endif
+
+#else // LANES == 1
+  // What a group's items have of their Gaussians, row by row; then they walk the model's arrays side by side.
+  __local float by_mean[3 * ROWS], by_quaternion[4 * ROWS], by_log_scale[3 * ROWS];
+  __local float by_opacity[ROWS], by_colour[3 * ROWS], basis[SH_HIGHER * ROWS];
+  __local int in_view[ROWS];
+  const uint me = get_local_id(0), items = get_local_size(0), first_row = get_global_id(0) - me;
+  const uint rows = first_row < n ? min(items, n - first_row) : 0;
+  int any = 0, shown[1] = {0};
+  if (me < rows)
+    any = gradients_of(n, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,
+                       quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS, shown, &d);
+  in_view[me] = shown[0];
+  UNROLL for (int k = 0; k < 3; ++k) by_mean[3 * me + k] = any ? d.mean[k].all : 0.0f;
+  UNROLL for (int k = 0; k < 4; ++k) by_quaternion[4 * me + k] = any ? d.quaternion[k].all : 0.0f;
+  UNROLL for (int k = 0; k < 3; ++k) by_log_scale[3 * me + k] = any ? d.scale[k].all : 0.0f;
+  by_opacity[me] = any ? d.opacity.all : 0.0f;
+  UNROLL for (int k = 0; k < 3; ++k) by_colour[3 * me + k] = any ? d.colour[k].all : 0.0f;
+#ifndef NO_SH_REST
+  FOR_HIGHER(k, SH_USED(coefficients)) basis[SH_HIGHER * me + k - 1] = any ? d.basis[k].all : 0.0f;
+#endif
+  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); // a row is read by one item and written by others
+#ifdef SPARSE
+#define TAKEN(row) in_view[row]
+#else
+#define TAKEN(row) 1
+#endif
+#define STEP_GROUP(group, width, gradient, limit2)                                                                     \
+  {                                                                                                                    \
+    STEP_OF(group, root, limit2)                                                                                       \
+    for (uint k = me; k < width * rows; k += items)                                                                    \
+      if (TAKEN(k / width)) step_element((size_t)(width) * first_row + k, gradient, s, model);                         \
+  }
+  STEP_GROUP(means, 3, by_mean[k], limit2)
+  STEP_GROUP(quaternions, 4, by_quaternion[k], limit2)
+  STEP_GROUP(log_scales, 3, by_log_scale[k], limit2)
+  STEP_GROUP(opacity_logits, 1, by_opacity[k], limit2)
+  STEP_GROUP(sh_dc, 3, SH_CONSTANT * by_colour[k], limit2_sh)
+#ifndef NO_SH_REST
+  if (sh_width == 0) return;
+  STEP_OF(sh_rest, root_sh_rest, limit2_sh)
+  uint row = me / sh_width, column = me % sh_width;
+  const uint rows_on = items / sh_width, columns_on = items % sh_width;
+  for (uint k = me; k < sh_width * rows; k += items) {
+    const uint coefficient = column / 3;
+    const float g = in_view[row] && (int)coefficient + 1 < SH_USED(coefficients)
+                        ? basis[SH_HIGHER * row + coefficient] * by_colour[3 * row + column - 3 * coefficient]
+                        : 0.0f;
+    if (TAKEN(row)) step_element((size_t)sh_width * first_row + k, g, s, model);
+    row += rows_on;
+    column += columns_on;
+    if (column >= sh_width) {
+      column -= sh_width;
+      ++row;
+    }
+  }
+#endif
+#endif
+}
+#endif

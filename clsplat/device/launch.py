@@ -15,7 +15,7 @@ from clsplat.device.context import Device
 from clsplat.device.program import Kernel
 from clsplat.device.quirks import tells_group_sizes
 
-_LOCAL = 64
+LOCAL = 64
 """Work-items a group where they do not co-operate: enough for a GPU's wave, short enough for a CPU's chunk."""
 _WORD = 0xFFFFFFFF
 _MANY = 1 << 16
@@ -88,6 +88,7 @@ def _first(
 
 _UPDATED = {
     "adam": 4,
+    "project_step": 18,
     "density_statistics": 3,
     "view_agreement": 1,
     "contribution_statistics": 2,
@@ -118,8 +119,8 @@ def _enqueue(
 def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) -> None:
     """One work-item for each of `items`; the kernel guards the rounding up. Nothing for 0 items."""
     if items > 0:
-        size = -(-items // _LOCAL) * _LOCAL
-        local = (_LOCAL,) if device.max_group >= _LOCAL else None
+        size = -(-items // LOCAL) * LOCAL
+        local = (LOCAL,) if device.max_group >= LOCAL else None
         _enqueue(device, kernel, (size,), local, arguments)
 
 

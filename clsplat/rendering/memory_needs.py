@@ -19,8 +19,8 @@ from clsplat.stages.sort import scratch_bytes
 
 _CHANNEL_PLANES = 4
 """Planes of a frame with channels beside those of its features: median, first, count and index."""
-_MODELS = 4
-"""Arrays of a training step for each parameter: itself, its gradient and two moments."""
+_MODELS = 3
+"""Arrays of a training step for each parameter: itself and two moments."""
 _SMALL = 4096
 """Bytes of camera, background, totals and the like."""
 

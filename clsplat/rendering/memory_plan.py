@@ -17,7 +17,7 @@ def mebibytes(nbytes: int) -> str:
 class Need:
     """Device memory that a frame, or a training step, needs, in bytes unless said otherwise.
 
-    gaussians: their number; model: each one's parameters, in a step with gradients and moments; widest: each one's part
+    gaussians: their number; model: each one's parameters, in a step with moments; widest: each one's part
     of the widest of these arrays; row: of each, all the rest; banded: of each, what several bands of tiles add; pair:
     of each pair; most_pairs: their number at which the widest of their arrays is full; planes: all that is as large as
     the image; scratch: whatever is left over; photographs: those that the device may keep from step to step, as far as
@@ -48,7 +48,7 @@ class Need:
     @property
     def moving(self) -> int:
         """Bytes of a second copy of parameters and moments, while rows move."""
-        return self.gaussians * self.model * 3 // 4
+        return self.gaussians * self.model
 
 
 PAIRS_EACH = 8
@@ -59,8 +59,8 @@ PAIRS_EACH = 8
 class Plan:
     """Division of the work, so that it fits the memory.
 
-    rows: Gaussians whose parameters, gradients and moments are on the device at once; streamed: not all of them; pairs:
-    most (tile, Gaussian) pairs at once; gathers: rows move on the device; allowed: bytes; groups: of tiles, estimated;
+    rows: Gaussians whose parameters and moments are on the device at once; streamed: not all of them; pairs: most
+    (tile, Gaussian) pairs at once; gathers: rows move on the device; allowed: bytes; groups: of tiles, estimated;
     photographs: bytes of those that stay on the device.
     """
 

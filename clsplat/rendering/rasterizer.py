@@ -194,27 +194,15 @@ class Rasterizer:
     ) -> Screen:
         """Fill the visible rows of `gradients`; returns what density control has of the view, as `fields` wants it."""
         slots = self.pair_gradients(frame, image_gradient, fields=fields)
-        return self.row_gradients(gaussians, frame, frame.projected, slots, gradients, fields=fields)
-
-    def row_gradients(
-        self,
-        gaussians: DeviceGaussians,
-        frame: Frame,
-        projected: Projected,
-        slots: Slots,
-        gradients: DeviceGaussians,
-        *,
-        fields: SlotFields = PLAIN_SLOTS,
-        sh_rest: bool = True,
-    ) -> Screen:
-        """The gradient of projection, for some rows or all, from the gradient of blending. sh_rest: with that of the
-        higher SH bands."""
-        device, n, work = self.device, gaussians.count, self.work
-        contributions = work.array("contributions", (n,)) if fields.contributions else None
-        screen = Screen(work.array("screen", (n, 2)), contributions)
-        arrays = (gaussians, frame.camera_array, projected, slots, gradients, screen)
-        project_grad(device, *arrays, fields=fields, sh_rest=sh_rest)
+        screen = self.screen(gaussians.count, fields)
+        arrays = (gaussians, frame.camera_array, frame.projected, slots, gradients, screen)
+        project_grad(self.device, *arrays, fields=fields)
         return screen
+
+    def screen(self, count: int, fields: SlotFields) -> Screen:
+        """Room for what density control has of `count` Gaussians in a view, as `fields` wants it."""
+        contributions = self.work.array("contributions", (count,)) if fields.contributions else None
+        return Screen(self.work.array("screen", (count, 2)), contributions)
 
     def pair_gradients(
         self,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches adam.cl on every parameter group."""
+"""Launches adam.cl on every parameter group. A step of training has Adam in `stages.project.project_step`."""
 
 from __future__ import annotations
 
@@ -20,6 +20,12 @@ from clsplat.stages.device_gaussians import DeviceGaussians
 def updates_sh_rest(config: OptimiserConfig, step: int) -> bool:
     """True if step number `step` (from 1) updates the higher SH bands."""
     return step % config.sh_rest_every == 0
+
+
+def corrected(config: OptimiserConfig, step: int, group: str, rate: float) -> tuple[float, float]:
+    """rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) of a group's t-th update, in step number `step` (from 1)."""
+    updates = step // config.sh_rest_every if group == "sh_rest" else step
+    return rate / (1.0 - config.beta1**updates), (1.0 - config.beta2**updates) ** -0.5
 
 
 @stage("adam")
@@ -45,12 +51,9 @@ def adam(
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     lanes = device.shape.lanes
     for group, about in GROUPS.items():
-        updates = step
-        if group == "sh_rest":
-            if not updates_sh_rest(config, step):
-                continue
-            updates = step // config.sh_rest_every
-        rate, root = rates[group] / (1.0 - beta1**updates), (1.0 - beta2**updates) ** -0.5
+        if group == "sh_rest" and not updates_sh_rest(config, step):
+            continue
+        rate, root = corrected(config, step, group, rates[group])
         constants = (rate, root, beta1, beta2, epsilon, about.limit**2, counts)
         arrays = (parameters[group], gradients[group], first[group], second[group])
         size, rows = parameters[group].size, parameters.count

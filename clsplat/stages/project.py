@@ -3,19 +3,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from clsplat.camera import Camera
+from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
-from clsplat.device.launch import launch_items
+from clsplat.device.launch import LOCAL, launch_groups, launch_items
 from clsplat.device.layout import PLAIN_SLOTS, SPLAT, SlotFields
 from clsplat.device.profile import stage
 from clsplat.gaussians import GROUPS
+from clsplat.stages.adam import corrected, updates_sh_rest
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
+
+ROWS = 128
+"""Gaussians of a group of `project_step` on a CPU: their gradients, 30 KiB, stay in its cache, and an array's part of
+them is long enough for a processor to fetch ahead. In groups of one vector of lanes a step takes 1.5 times as long."""
 
 SCREEN_BYTES = 8
 """Bytes of each Gaussian's gradient on the image; 4 more where contributions are kept."""
@@ -137,22 +144,73 @@ def project_grad(
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` from the pairs' slots,
     which have `fields`."""
-    wanted = {"ADDED_UP": slots.first_slots is None, "NO_SH_REST": not sh_rest and gaussians.coefficients > 1}
-    defines = {**fields.defines, **{name: True for name, needed in wanted.items() if needed}}
+    defines = _defines(gaussians, slots, fields, sh_rest=sh_rest)
     n = gaussians.count
-    first_slots = slots.first_slots or projected.tile_counts  # not looked at where they are added up
     launch_items(
         device,
         device.kernels("project_grad", **defines).project_grad,
         -(-n // device.shape.lanes) if slots.values.shape[0] else 0,
-        n,
-        gaussians.coefficients,
-        camera_array,
-        projected.tile_counts,
-        first_slots,
-        slots.values,
-        projected.splats,
+        *_inputs(gaussians, camera_array, projected, slots),
         *(model[group] for model in (gaussians, gradients) for group in GROUPS),
         screen.gradients,
         *([screen.contributions] if fields.contributions else []),
     )
+
+
+@stage("project_grad")
+def project_step(
+    device: Device,
+    step: int,
+    rates: Mapping[str, float],
+    config: OptimiserConfig,
+    model: tuple[DeviceGaussians, DeviceGaussians, DeviceGaussians],
+    camera_array: DeviceArray,
+    projected: Projected,
+    slots: Slots,
+    screen: Screen,
+    readback: DeviceArray,
+    *,
+    fields: SlotFields = PLAIN_SLOTS,
+) -> None:
+    """`project_grad` and with it `stages.adam.adam`, of the model (parameters, first and second moments), and no
+    gradients in memory. Arguments are those of the two."""
+    parameters = model[0]
+    sh_rest = updates_sh_rest(config, step)
+    defines = {**_defines(parameters, slots, fields, sh_rest=sh_rest), "ADAM": True}
+    if config.sparse:
+        defines["SPARSE"] = True
+    by_group = {
+        group: (0.0, 0.0) if group == "sh_rest" and not sh_rest else corrected(config, step, group, rates[group])
+        for group in GROUPS
+    }
+    arguments = (
+        *_inputs(parameters, camera_array, projected, slots),
+        screen.gradients,
+        *([screen.contributions] if fields.contributions else []),
+        *(config.beta1, config.beta2, config.epsilon),
+        *(by_group["means"][1], by_group["sh_rest"][1]),
+        *(rate for rate, _ in by_group.values()),
+        *(GROUPS["means"].limit ** 2, GROUPS["sh_dc"].limit ** 2),
+        readback.buffer,  # no array that a step goes through: it is touched where something is wrong
+        *(arrays[group] for arrays in model for group in GROUPS),
+    )
+    if device.shape.lanes > 1:
+        kernel = device.kernels("project_grad", ROWS=ROWS, **defines).project_step
+        launch_groups(device, kernel, -(-parameters.count // ROWS), 1, *arguments)
+    else:
+        kernel = device.kernels("project_grad", ROWS=LOCAL, **defines).project_step
+        launch_items(device, kernel, parameters.count, *arguments)
+
+
+def _defines(gaussians: DeviceGaussians, slots: Slots, fields: SlotFields, *, sh_rest: bool) -> dict[str, object]:
+    wanted = {"ADDED_UP": slots.first_slots is None, "NO_SH_REST": not sh_rest and gaussians.coefficients > 1}
+    return {**fields.defines, **{name: True for name, needed in wanted.items() if needed}}
+
+
+def _inputs(
+    gaussians: DeviceGaussians, camera_array: DeviceArray, projected: Projected, slots: Slots
+) -> tuple[object, ...]:
+    """The first arguments of both kernels."""
+    first_slots = slots.first_slots or projected.tile_counts  # not looked at where they are added up
+    counts = (projected.tile_counts, first_slots, slots.values, projected.splats)
+    return (gaussians.count, gaussians.coefficients, camera_array, *counts)

@@ -185,8 +185,9 @@ class _Counts(StepProbe):
         """Count in the gradients of pairs."""
         self.counts["blend_grad"] = _wrong(slots.values.get())
 
-    def row_gradients(self, rows: StepRows) -> None:
+    def before_rows(self, rows: StepRows) -> None:
         """Count in the gradients of Gaussians."""
+        assert rows.gradients is not None, "replay asks for them"
         self.counts["project_grad"] = _wrong_in(rows.gradients)
 
 
@@ -200,7 +201,7 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     fields = slot_fields(Adaptive(config).needs(record["step"]))
     step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
     pixels = (bundle.photograph, bundle.camera, bundle.background)
-    step.run((parameters, first, second), gradients, *pixels, probe)
+    step.run((parameters, first, second), *pixels, probe, gradients)
     return {**probe.counts, "adam": int(rasterizer.readback.get()[-len(REFUSED) :].sum())}
 
 

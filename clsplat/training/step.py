@@ -19,7 +19,7 @@ from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.stages.adam import adam, updates_sh_rest
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 from clsplat.stages.loss import Loss, loss
-from clsplat.stages.project import Projected, Screen, Slots
+from clsplat.stages.project import Projected, Screen, Slots, project_grad, project_step
 from clsplat.stages.target import target
 from clsplat.training.density import StatisticsNeeds
 
@@ -28,17 +28,21 @@ from clsplat.training.density import StatisticsNeeds
 class StepRows:
     """Rows of the model that are on the device at once, from start to before stop; all of them if the model fits.
 
-    projected, screen: what the step's view shows of these rows, and the gradients on its screen.
+    camera_array, projected, slots: the step's view, what it shows of these rows, and the gradients of their pairs;
+    screen: the gradients on its screen, from where the rows have changed on; gradients: the rows' own, where they are
+    asked for.
     """
 
     start: int
     stop: int
     parameters: DeviceGaussians
-    gradients: DeviceGaussians
     first: DeviceGaussians
     second: DeviceGaussians
+    camera_array: DeviceArray
     projected: Projected
+    slots: Slots
     screen: Screen
+    gradients: DeviceGaussians | None
 
 
 class StepProbe:
@@ -53,8 +57,11 @@ class StepProbe:
     def pair_gradients(self, slots: Slots) -> None:
         """The gradient of blending is known."""
 
-    def row_gradients(self, rows: StepRows) -> None:
-        """The gradients of these rows are known, and Adam has not changed the rows yet."""
+    def before_rows(self, rows: StepRows) -> None:
+        """Adam is about to change these rows."""
+
+    def after_rows(self, rows: StepRows) -> None:
+        """Adam has changed these rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,17 +81,19 @@ class GradientStep:
     def run(
         self,
         model: tuple[AnyGaussians, AnyGaussians, AnyGaussians],
-        gradients: DeviceGaussians,
         photograph: NDArray[Any] | DeviceArray,
         camera: Camera,
         background: NDArray[np.float32],
         probe: StepProbe,
+        gradients: DeviceGaussians | None = None,
         *,
         reads_loss: bool = False,
     ) -> Loss:
         """Update the model (parameters, first and second moments) by a photograph (H, W, 3 or 4) of the camera's size.
-        gradients: room for the rows that are on the device at once, zeros before and after; reads_loss: the loss will
-        be read."""
+
+        gradients: room for those of the rows that are on the device at once, zeros before and after, for a probe that
+        looks at them; the bits of the model are the same without; reads_loss: the loss will be read.
+        """
         device, rasterizer, work = self.device, self.rasterizer, self.rasterizer.work
         frame = rasterizer.forward(model[0], camera, background)
         probe.forward(frame)
@@ -96,21 +105,39 @@ class GradientStep:
         probe.loss(result)
         slots = rasterizer.pair_gradients(frame, result.gradient, fields=self.fields)
         probe.pair_gradients(slots)
-        sh_rest = updates_sh_rest(self.config.optimiser, self.step)
         for start, stop, (parameters, first, second) in parts(work, *model, keep=True):
-            projected = frame.projected.rows(start, stop)
-            backward = (parameters, frame, projected, slots.rows(start, stop), gradients)
-            screen = rasterizer.row_gradients(*backward, fields=self.fields, sh_rest=sh_rest)
-            rows = StepRows(start, stop, parameters, gradients, first, second, projected, screen)
-            probe.row_gradients(rows)
+            view = (frame.camera_array, frame.projected.rows(start, stop), slots.rows(start, stop))
+            screen = rasterizer.screen(parameters.count, self.fields)
+            rows = StepRows(start, stop, parameters, first, second, *view, screen, gradients)
+            if gradients is not None:
+                sh_rest = updates_sh_rest(self.config.optimiser, self.step)
+                arrays = (parameters, *view, gradients, screen)
+                project_grad(rasterizer.device, *arrays, fields=self.fields, sh_rest=sh_rest)
+            probe.before_rows(rows)
             self.update(rows)
+            probe.after_rows(rows)
         return result
 
     def update(self, rows: StepRows) -> None:
-        """Adam's step of some rows."""
-        models = (rows.parameters, rows.gradients, rows.first, rows.second)
-        shown, readback = rows.projected.tile_counts, self.rasterizer.readback
-        adam(self.device, self.step, self.rates, self.config.optimiser, *models, shown, readback)
+        """Adam's step of some rows, with the gradient of projection where that is not known yet."""
+        optimiser, readback = self.config.optimiser, self.rasterizer.readback
+        if rows.gradients is not None:
+            models = (rows.parameters, rows.gradients, rows.first, rows.second)
+            adam(self.device, self.step, self.rates, optimiser, *models, rows.projected.tile_counts, readback)
+            return
+        project_step(
+            self.rasterizer.device,
+            self.step,
+            self.rates,
+            optimiser,
+            (rows.parameters, rows.first, rows.second),
+            rows.camera_array,
+            rows.projected,
+            rows.slots,
+            rows.screen,
+            readback,
+            fields=self.fields,
+        )
 
 
 def slot_fields(needs: StatisticsNeeds) -> SlotFields:

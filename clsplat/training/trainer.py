@@ -35,7 +35,6 @@ from clsplat.stages.density import (
 )
 from clsplat.stages.device_gaussians import (
     AnyGaussians,
-    DeviceGaussians,
     HostGaussians,
     allocate_gaussians,
     download_gaussians,
@@ -90,19 +89,23 @@ class _Watched(StepProbe):
         """Remember the step, to look at if it turns out to have had trouble."""
         self.trainer.watch.last = LastStep(self.step.step, self.view, self.background, result.sums)
 
-    def row_gradients(self, rows: StepRows) -> None:
+    def before_rows(self, rows: StepRows) -> None:
         """Before the first row changes, have every kernel rehearsed that changes the state: a driver may fail in
         any."""
         trainer, step, parameters = self.trainer, self.step, rows.parameters
         sh_rest = updates_sh_rest(step.config.optimiser, step.step)
-        key = (parameters.count, parameters.coefficients, sh_rest, self.needs.gradients, self.needs.contributions)
+        size = (parameters.count, parameters.coefficients)
+        key = (*size, sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
         if key not in trainer.rehearsed:
-            with only_tried(trainer.device):
-                self.add_statistics(trainer.statistics.rows(0, rows.stop - rows.start), rows)
+            with only_tried(trainer.device), only_tried(trainer.rasterizer.device):
                 step.update(rows)
+                self.add_statistics(trainer.statistics.rows(0, rows.stop - rows.start), rows)
             trainer.rehearsed.add(key)
         trainer.mark = None
-        self.add_statistics(trainer.statistics.rows(rows.start, rows.stop), rows)
+
+    def after_rows(self, rows: StepRows) -> None:
+        """Add the rows to the statistics."""
+        self.add_statistics(self.trainer.statistics.rows(rows.start, rows.stop), rows)
 
     def add_statistics(self, statistics: DensityStatistics, rows: StepRows) -> None:
         """Add the step to the statistics of some rows, as far as density control needs them."""
@@ -186,7 +189,6 @@ class Trainer:
         self.parameters = parameters
         self.first = first or self._zeros(count, coefficients)
         self.second = second or self._zeros(count, coefficients)
-        self.gradients = self._new_gradients()
         needs = self.strategy.needs()
         self.statistics = new_statistics(
             self.device, count, agreement=needs.agreement, contributions=needs.contributions
@@ -197,16 +199,10 @@ class Trainer:
             return host_zeros(count, coefficients, self.parameters.rows)
         return allocate_gaussians(self.device, count, coefficients, zero=True)
 
-    def _new_gradients(self) -> DeviceGaussians:
-        """Zeros for the rows that are on the device at once; Adam leaves them so."""
-        model = self.parameters
-        rows = min(model.rows, model.count) if isinstance(model, HostGaussians) else model.count
-        return allocate_gaussians(self.device, rows, model.coefficients, zero=True)
-
     def _take_down(self) -> list[HostGaussians]:
         """Parameters, first and second moments on the host, and none of them on the device."""
         models = [to_host(model) for model in self.models().values()]
-        del self.parameters, self.first, self.second, self.gradients
+        del self.parameters, self.first, self.second
         return models
 
     def _placed(self, model: AnyGaussians) -> AnyGaussians:
@@ -239,7 +235,7 @@ class Trainer:
         step = GradientStep(self.device, self.rasterizer, config, self.step, self.rates(), slot_fields(needs))
         probe = _Watched(self, step, view, camera, self.background, needs)
         model = (self.parameters, self.first, self.second)
-        result = step.run(model, self.gradients, image, camera, self.background, probe, reads_loss=reads_loss)
+        result = step.run(model, image, camera, self.background, probe, reads_loss=reads_loss)
         self.controlled = False
         self._note()
         self._rearrange(self.strategy.after_gradient(self._state()))
@@ -313,7 +309,6 @@ class Trainer:
             models = [*self.models().values()] if self.plan.gathers else self._take_down()
             wider = (self._placed(widen(self.device, model, coefficients)) for model in models)
             self.parameters, self.first, self.second = wider
-            self.gradients = self._new_gradients()
 
     def _control_density(self) -> None:
         if self.step > 0 and self.strategy.is_due(self.step):
@@ -399,7 +394,7 @@ class Trainer:
 
     def restart(self) -> None:
         """Begin again, at the rates that `watch.patience` allows."""
-        del self.parameters, self.first, self.second, self.gradients, self.statistics
+        del self.parameters, self.first, self.second, self.statistics
         self.watch.forget()
         self._start()
 
@@ -420,7 +415,7 @@ class Trainer:
         self.controlled, self.mark = bool(checkpoint.state.get("controlled", False)), None
         self.watch.patience = patience
         self.watch.forget()
-        del self.parameters, self.first, self.second, self.gradients, self.statistics
+        del self.parameters, self.first, self.second, self.statistics
         self._make_plan(loaded[0].count)
         self._set_parameters(*(self._placed(model) for model in loaded))
         statistics = _named(checkpoint, "statistics/")

@@ -89,7 +89,7 @@ static inline floatL clampL(floatL x, float low, float high) {
 // (5) to (7) from J A and S, with the determinant as a sum of squares (56).
 static inline void covariance(Projection *p) {
   floatL xx = (floatL)(0.0f), yy = xx, xy = xx, minors = (floatL)(LOW_PASS * LOW_PASS);
-  for (int k = 0; k < 3; ++k) {
+  FOR_AXES(k) {
     const floatL m1 = p->s[k] * p->b1[k], m2 = p->s[k] * p->b2[k];
     xx = fmaL(m1, m1, xx);
     yy = fmaL(m2, m2, yy);
@@ -143,9 +143,9 @@ static inline void refine(const uint *row, __global const float *quaternions, __
   const floatL length = p->length / size;
   const floatL along_x = p->jx / (length * length), along_y = p->jy / (length * length);
   const floatL area = camera[CAMERA_HAND] * p->jx * along_y;
-  for (int k = 0; k < 3; ++k) {
+  FOR_AXES(k) {
     Double a[3];
-    for (int i = 0; i < 3; ++i) {
+    FOR_AXES(i) {
       a[i] = scaled2(camera[CAMERA_R00 + 3 * i], camera[CAMERA_R00_LOW + 3 * i], r[k]);
       a[i] = add2(a[i], scaled2(camera[CAMERA_R01 + 3 * i], camera[CAMERA_R01_LOW + 3 * i], r[3 + k]));
       a[i] = add2(a[i], scaled2(camera[CAMERA_R02 + 3 * i], camera[CAMERA_R02_LOW + 3 * i], r[6 + k]));
@@ -185,10 +185,10 @@ static inline int project_gaussians(const uint *row, __global const float *means
   for (int i = 0; i < 4; ++i) p->q[i] = raw[i] / p->length;
   floatL r[9], a[9];
   rotation_of(p->q, r);
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j)
-      a[3 * i + j] = fmaL((floatL)(camera[CAMERA_R00 + 3 * i]), r[j],
-                          fmaL((floatL)(camera[CAMERA_R01 + 3 * i]), r[3 + j], camera[CAMERA_R02 + 3 * i] * r[6 + j]));
+  FOR_AXES(i)
+  FOR_AXES(j)
+  a[3 * i + j] = fmaL((floatL)(camera[CAMERA_R00 + 3 * i]), r[j],
+                      fmaL((floatL)(camera[CAMERA_R01 + 3 * i]), r[3 + j], camera[CAMERA_R02 + 3 * i] * r[6 + j]));
   p->s[0] = expL(GATHER(log_scales, 3, 0));
   p->s[1] = expL(GATHER(log_scales, 3, 1));
   p->s[2] = expL(GATHER(log_scales, 3, 2));
@@ -204,7 +204,7 @@ static inline int project_gaussians(const uint *row, __global const float *means
   p->jy = camera[CAMERA_FY] / p->z;
 #endif
   const floatL area = camera[CAMERA_HAND] * p->jx * p->jy;
-  for (int k = 0; k < 3; ++k) {
+  FOR_AXES(k) {
     p->a2[k] = a[6 + k];
     p->b1[k] = p->jx * fmaL(-p->rx, a[6 + k], a[k]);
     p->b2[k] = p->jy * fmaL(-p->ry, a[6 + k], a[3 + k]);
@@ -221,8 +221,8 @@ static inline int project_gaussians(const uint *row, __global const float *means
   const floatL longest2 = longest * longest * across2;
   p->valid &= longest2 < FARTHEST * FARTHEST;
   intL which = longest2 * (p->sxx + p->syy) > REFINE_FROM * REFINE_FROM * p->det;
-  for (int k = 0; k < 3; ++k)
-    which |= across2 > FORESHORTENED * FORESHORTENED * fmaL(p->b1[k], p->b1[k], p->b2[k] * p->b2[k]);
+  FOR_AXES(k)
+  which |= across2 > FORESHORTENED * FORESHORTENED * fmaL(p->b1[k], p->b1[k], p->b2[k] * p->b2[k]);
   if (ANYL(which & p->valid)) {
     refine(row, quaternions, camera, MASKL(which), p);
     covariance(p);

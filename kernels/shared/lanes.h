@@ -152,6 +152,14 @@ static inline floatL exp2L(floatL x) {
             ROW4_(array, width, field, 12)))
 #endif
 
+// A short loop without a loop where a lane is an item: on a GPU an array that an index walks is memory, not registers.
+#if LANES == 1
+#define UNROLL _Pragma("unroll")
+#else
+#define UNROLL
+#endif
+#define FOR_AXES(k) UNROLL for (int k = 0; k < 3; ++k)
+
 // The rows of a work-item that has LANES of n, the last one again where they end.
 #define ROWS_OF_ITEM(n)                                                                                                \
   const uint first_row = get_global_id(0) * LANES;                                                                     \

@@ -39,7 +39,7 @@ from clsplat.stages.limit import Limits, measure_limits
 
 SMALL = ["--gaussians", "400", "--size", "70x50", "--repeat", "1"]
 FRAME = {"project", "duplicate", "ranges", "blend"}
-STEP = {"target", "loss", "blend_grad", "project_grad", "statistics", "adam"}
+STEP = {"target", "loss", "blend_grad", "project_grad", "statistics"}
 Capture = pytest.CaptureFixture[str]
 
 quick_limits = partial(measure_limits, seconds=1e-3, repeat=1, copy_bytes=2**16)
@@ -199,9 +199,10 @@ def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
     assert blend["share_of_arithmetic"] == pytest.approx(blend["pairs_per_second"] / 1e9)
     gradient = result["stages"]["blend_grad"]
     assert gradient["share_of_arithmetic"] == pytest.approx(gradient["pairs_per_second"] / 5e8)
-    adam = result["stages"]["adam"]
-    # Parameters, gradients and both moments of 59 floats, read and written.
-    assert adam["bytes"] == 300 * 59 * 4 * 4 * 2
+    # Parameters and both moments of 59 floats, read and written; splats, counts of tiles and places of slots, read, and
+    # gradients on the image, written; camera and slots beside these.
+    bytes_of_rows = 300 * (59 * 4 * 3 * 2 + 64 + 4 + 4 + 8)
+    assert bytes_of_rows < result["stages"]["project_grad"]["bytes"] < bytes_of_rows + 40 * result["pairs"]["listed"]
 
 
 MOST_LAUNCHES = 79

@@ -40,10 +40,15 @@ class Witness(StepProbe):
         del slots
         self.stages.append("pair_gradients")
 
-    def row_gradients(self, rows: StepRows) -> None:
-        self.stages.append("row_gradients")
-        self.gradients = {group: rows.gradients[group].get() for group in GROUPS}
+    def before_rows(self, rows: StepRows) -> None:
+        self.stages.append("before_rows")
+        if rows.gradients is not None:
+            self.gradients = {group: rows.gradients[group].get() for group in GROUPS}
         self.means, self.first = rows.parameters["means"].get(), rows.first["means"].get()
+
+    def after_rows(self, rows: StepRows) -> None:
+        self.stages.append("after_rows")
+        self.screen = rows.screen.gradients.get()
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +56,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
-def test_a_trainer_s_step_is_a_gradient_step(scene: Scene, default_device: Device) -> None:
+@pytest.mark.parametrize("looks", [False, True])
+def test_a_trainer_s_step_is_a_gradient_step(scene: Scene, default_device: Device, looks: bool) -> None:
+    """With the gradients in memory, to be looked at, and without."""
     trainer, by_hand = (Trainer(scene, CONFIG, default_device) for _ in range(2))
     before = by_hand.parameters["means"].get()
     view = int(np.random.default_rng(CONFIG.seed).permutation(len(trainer.views))[-1])
@@ -61,18 +68,21 @@ def test_a_trainer_s_step_is_a_gradient_step(scene: Scene, default_device: Devic
         default_device, Rasterizer(default_device), CONFIG, 1, by_hand.rates(), slot_fields(by_hand.strategy.needs(1))
     )
     model = (by_hand.parameters, by_hand.first, by_hand.second)
-    gradients = allocate_gaussians(default_device, by_hand.parameters.count, by_hand.parameters.coefficients, zero=True)
+    size = (by_hand.parameters.count, by_hand.parameters.coefficients)
+    gradients = allocate_gaussians(default_device, *size, zero=True) if looks else None
     photograph, witness = by_hand.photographs.load(view, 1.0), Witness()
     background = np.zeros(3, np.float32)
     camera = by_hand.local(by_hand.views[view].camera)
-    result = step.run(model, gradients, photograph, camera, background, witness)
-    assert witness.stages == ["forward", "loss", "pair_gradients", "row_gradients"]
+    result = step.run(model, photograph, camera, background, witness, gradients)
+    assert witness.stages == ["forward", "loss", "pair_gradients", "before_rows", "after_rows"]
     assert_same_bits(witness.means, before, "Adam comes after the probe")
     assert not witness.first.any()
-    assert witness.gradients["means"].any()
+    assert witness.screen.any()
     assert np.isfinite(result.read()).all()
     for kind in ("parameters", "first", "second"):
         for group in GROUPS:
             got, wanted = getattr(by_hand, kind)[group].get(), getattr(trainer, kind)[group].get()
             assert_same_bits(got, wanted, f"{kind} {group}")
-    assert all(not gradients[group].get().any() for group in GROUPS), "Adam leaves them zero"
+    if gradients is not None:
+        assert witness.gradients["means"].any()
+        assert all(not gradients[group].get().any() for group in GROUPS), "Adam leaves them zero"

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from clsplat.device.layout import SPLAT
 from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.stages.device_gaussians import DeviceGaussians
+from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.training import step as step_module
+from clsplat.training.step import GradientStep, StepRows
 from clsplat.training.trainer import Trainer
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -204,16 +206,26 @@ def test_garbage_in_parameters_spoils_nothing_else(scene: Scene, default_device:
 
 
 def poison_gradients(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, group: str, value: float) -> None:
-    """In the next step alone, after the backward pass."""
-    real = trainer.rasterizer.row_gradients
+    """In the next step alone, after the backward pass, with gradients in memory."""
+    model = trainer.parameters
+    gradients = allocate_gaussians(trainer.device, model.count, model.coefficients, zero=True)
+    run, update = GradientStep.run, GradientStep.update
 
-    def poisoned(parameters: DeviceGaussians, *arguments: object, **options: object) -> object:
-        screen = real(parameters, *arguments, **options)  # type: ignore[arg-type]
-        put(trainer.gradients[group], value)
-        monkeypatch.setattr(trainer.rasterizer, "row_gradients", real)
-        return screen
+    def looked_at(self: GradientStep, *arguments: Any) -> object:
+        monkeypatch.setattr(GradientStep, "run", run)
+        return run(self, *arguments, gradients)
 
-    monkeypatch.setattr(trainer.rasterizer, "row_gradients", poisoned)
+    def poisoned(self: GradientStep, rows: StepRows) -> None:
+        if self.device.only_tries:
+            update(self, rows)
+            return
+        put(gradients[group], value)
+        monkeypatch.setattr(GradientStep, "update", update)
+        update(self, rows)
+        assert not any(gradients[each].get().any() for each in GROUPS)
+
+    monkeypatch.setattr(GradientStep, "run", looked_at)
+    monkeypatch.setattr(GradientStep, "update", poisoned)
 
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -228,7 +240,6 @@ def test_a_broken_gradient_costs_its_gaussian_alone(
         plain.train_step()
         assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before, "it was not moved"
         assert_others_alike(poisoned, plain)
-        assert not any(poisoned.gradients[each].get().any() for each in GROUPS)
         poisoned.mend(look=True)
         (incident,) = poisoned.watch.incidents
         # A finite one of which the square is not is the optimiser's own trouble.
