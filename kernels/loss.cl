@@ -75,7 +75,7 @@ typedef struct {
   for (int i = get_local_id(0); i < ROWS * across; i += ITEMS)
 #define VECTOR(block)                                                                                                  \
   const int row = ROWS == 1 ? 0 : i / across, x = x_first + (i - row * across) * LANES;                                \
-  __local float *near_at = near + row * NEAR_WIDTH + x - (block).x0 + NEAR_MARGIN;
+  __local float *near_at = near + (row * NEAR_WIDTH + x - (block).x0 + NEAR_MARGIN);
 #define OUTSIDE(block, x, y) ((x) < 0 || (x) >= (block).stride || (y) >= (block).height)
 
 // The taps of a window around the row y that are inside the image, one past the last in y.
@@ -129,7 +129,7 @@ static inline float derivatives(const Block block, const int margin, const int y
     const floatL p = LOADL(block.image + here), q = LOADL(block.target + here);
     floatL off1 = (floatL)(0.0f), off2 = off1, var1 = off1, var2 = off1, covariance = off1; // off: means from p and q
     for (int tap = 0; tap < TAPS; ++tap) {
-      __local const float *in = near_at + tap - REACH;
+      __local const float *in = near_at + (tap - REACH);
       const floatL e1 = LOAD_NEAR(in) - p, e2 = LOAD_NEAR(in + NEAR_FIELD) - q;
       const floatL w1 = window[tap] * e1, w2 = window[tap] * e2, w = (floatL)(window[tap]);
       off1 += w1;
@@ -207,7 +207,7 @@ static inline float2 differences(const Block block, const int y, const float l1_
     const floatL p = LOADL(block.image + here), q = LOADL(block.target + here);
     floatL ssim = (floatL)(0.0f);
     for (int tap = 0; tap < TAPS; ++tap) {
-      __local const float *in = near_at + tap - REACH;
+      __local const float *in = near_at + (tap - REACH);
       const floatL by_p = 2.0f * (p - LOAD_NEAR(in + 3 * NEAR_FIELD));
       const floatL by_q = q - LOAD_NEAR(in + 4 * NEAR_FIELD);
       const floatL both = fmaL(by_q, LOAD_NEAR(in + 2 * NEAR_FIELD), LOAD_NEAR(in));
@@ -262,7 +262,7 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
 }
 #else
 // The sum of a value over the group, in a fixed tree, for its first item.
-static inline float group_sum(const float value, __local float *scratch) {
+static inline float sum_of_group(const float value, __local float *scratch) {
   const int item = get_local_id(0);
   barrier(CLK_LOCAL_MEM_FENCE);
   scratch[item] = value;
@@ -270,7 +270,7 @@ static inline float group_sum(const float value, __local float *scratch) {
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item < step) scratch[item] += scratch[item + step];
   }
-  return scratch[0];
+  return item == 0 ? scratch[0] : 0.0f;
 }
 
 #define BLOCK_OF_GROUP                                                                                                 \
@@ -291,7 +291,7 @@ GROUP __kernel void loss_ssim(const int width, const int height, const int strid
   BLOCK_OF_GROUP
   moments(block, MARGIN, y, near);
   barrier(CLK_LOCAL_MEM_FENCE);
-  const float ssim = group_sum(derivatives(block, 0, y, near), scratch);
+  const float ssim = sum_of_group(derivatives(block, 0, y, near), scratch);
   if (get_local_id(0) == 0) sums[group] = ssim;
 }
 
@@ -305,7 +305,7 @@ GROUP __kernel void loss_grad(const int width, const int height, const int strid
   adjoint_moments(block, MARGIN, y, near);
   barrier(CLK_LOCAL_MEM_FENCE);
   const float2 errors = differences(block, y, l1_scale, ssim_scale, near, gradient + (size_t)plane * channel);
-  const float absolute = group_sum(errors.x, scratch), squares = group_sum(errors.y, scratch);
+  const float absolute = sum_of_group(errors.x, scratch), squares = sum_of_group(errors.y, scratch);
   if (get_local_id(0) == 0) {
     sums[get_num_groups(0) + group] = absolute;
     sums[2 * get_num_groups(0) + group] = squares;
