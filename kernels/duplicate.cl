@@ -53,16 +53,17 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   BARRIER_LOCAL();
   const uint group = get_group_id(0), groups = get_num_groups(0);
   const uint begin = group * chunk, end = min(begin + chunk, n);
-  uint visible = group_sum(sums, group, scratch), pairs = group_sum(sums + groups, group, scratch);
+  uint visible = group_sum(sums, group, scratch);
+  ulong pairs = group_sum(sums + groups, group, scratch);
   uint complement = 0, largest = 0;
   for (uint first = begin; first < end; first += ITEMS) {
     const uint i = first + get_local_id(0);
     const uint is_shown = i < end && shown[i] != 0, count = i < end ? tile_counts[i] : 0;
     uint all_shown, all_pairs;
     const uint rank = visible + group_exclusive_scan(is_shown, scratch, &all_shown);
-    const uint slot = pairs + group_exclusive_scan(count, scratch, &all_pairs);
+    const uint slot = (uint)pairs + group_exclusive_scan(count, scratch, &all_pairs);
     visible += all_shown;
-    pairs = add_sat(pairs, all_pairs);
+    pairs += all_pairs;
     if (i < end) slots[i] = slot;
     if (is_shown) {
       const uint key = as_uint(splats[(size_t)SPLAT_SIZE * i + SPLAT_DEPTH]);
@@ -80,7 +81,7 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   atomic_max(readback + READBACK_LARGEST_KEY, extremes[1]);
   if (group + 1 == groups) {
     readback[READBACK_VISIBLE] = visible;
-    readback[READBACK_PAIRS] = pairs;
+    readback[READBACK_PAIRS] = CAPPED(pairs);
   }
 }
 

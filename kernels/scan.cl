@@ -22,14 +22,14 @@ GROUP __kernel void scan_chunks(const uint n, const uint chunk, __global const u
   __local uint scratch[ITEMS];
   const uint begin = get_group_id(0) * chunk;
   const uint end = min(begin + chunk, n);
-  uint running = group_sum(sums, get_group_id(0), scratch);
+  ulong running = group_sum(sums, get_group_id(0), scratch);
   for (uint base = begin; base < end; base += ITEMS) {
     const uint i = base + get_local_id(0);
     const uint value = i < end ? values[i] : 0;
     uint all;
     const uint before = group_exclusive_scan(value, scratch, &all);
-    if (i < end) out[i] = running + before;
-    running = add_sat(running, all);
+    if (i < end) out[i] = (uint)running + before;
+    running += all;
   }
-  if (get_local_id(0) == 0 && get_group_id(0) + 1 == get_num_groups(0)) total[0] = running;
+  if (get_local_id(0) == 0 && get_group_id(0) + 1 == get_num_groups(0)) total[0] = CAPPED(running);
 }

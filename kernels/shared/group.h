@@ -25,8 +25,11 @@
   value = group_max;
 #endif
 
-// The sum of the values of the items before this one; *total gets the sum of all. Sums stop at 0xffffffff, which is so
-// in every order of addition. scratch holds ITEMS elements.
+// A sum of 64 bits in 32, 0xffffffff where it does not fit. So a sum of many is the same in every order of addition.
+#define CAPPED(sum) ((sum) > 0xffffffff ? 0xffffffff : (uint)(sum))
+
+// The sum of the values of the items before this one; *total gets the sum of all. Sums stop at 0xffffffff. scratch
+// holds ITEMS elements.
 static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint *total) {
 #if ITEMS == 1
   *total = value;
@@ -38,7 +41,7 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
   for (uint step = 1; step < ITEMS; step *= 2) {
     const uint add = item >= step ? scratch[item - step] : 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    scratch[item] = add_sat(scratch[item], add);
+    scratch[item] = CAPPED((ulong)scratch[item] + add);
     barrier(CLK_LOCAL_MEM_FENCE);
   }
   *total = scratch[ITEMS - 1];
@@ -59,8 +62,9 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
 
 // The sum of values (count), for every item; it stops at 0xffffffff. scratch holds ITEMS elements.
 static inline uint group_sum(__global const uint *values, uint count, __local uint *scratch) {
-  uint sum = 0, total;
-  for (uint i = get_local_id(0); i < count; i += ITEMS) sum = add_sat(sum, values[i]);
-  group_exclusive_scan(sum, scratch, &total);
+  ulong sum = 0;
+  uint total;
+  for (uint i = get_local_id(0); i < count; i += ITEMS) sum += values[i];
+  group_exclusive_scan(CAPPED(sum), scratch, &total);
   return total;
 }

@@ -223,7 +223,7 @@ def test_the_table(capsys: Capture) -> None:
     quick(
         [
             "blend: before * alpha => before + alpha",
-            "scan: out[i] = running + before => out[i] = before",
+            "scan: (uint)running + before => before",
             "loss: mu1 => this is no C",
         ],
         "loss: mu1 => this is no C",

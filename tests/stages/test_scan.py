@@ -51,8 +51,10 @@ def test_nothing_to_scan(shaped_device: Device) -> None:
     assert out.get()[0] == 0
 
 
-def test_a_total_over_32_bits_is_told(shaped_device: Device) -> None:
-    values = upload(shaped_device, np.full(3000, 0x00200000, np.uint32))  # 6.3e9
+@pytest.mark.parametrize(("n", "value"), [(3000, 0x00200000), (9, 0x80000000), (5000, 0x000D1B72)])
+def test_a_total_over_32_bits_is_told(shaped_device: Device, n: int, value: int) -> None:
+    """Over many chunks, within one, and by little: 2^32 + 2704."""
+    values = upload(shaped_device, np.full(n, value, np.uint32))
     total = allocate(shaped_device, (1,), np.uint32)
     scan(shaped_device, Workspace(shaped_device), values, values, total)
     assert total.get()[0] == 0xFFFFFFFF
