@@ -120,9 +120,9 @@ class GradientStep:
             adam(self.device, self.step, self.rates, optimiser, *models, rows.projected.tile_counts, readback)
             return
         model = (rows.parameters, rows.first, rows.second)
-        view = (rows.camera_array, rows.projected, rows.slots, rows.screen)
-        device, step = self.rasterizer.device, (self.step, self.rates, optimiser)
-        project_step(device, *step, model, *view, readback, fields=self.fields)
+        view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
+        device = self.rasterizer.device
+        project_step(device, self.step, self.rates, optimiser, model, *view, fields=self.fields)
 
 
 def slot_fields(needs: StatisticsNeeds) -> SlotFields:
