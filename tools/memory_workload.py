@@ -34,6 +34,7 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.data_set import Lens
 from clsplat.scenes.scene import Scene
+from clsplat.stages.adam import adam
 from clsplat.stages.blend import count_pairs, tile_items
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.stages.limit import _splats
@@ -106,6 +107,16 @@ def frames(device: Device) -> None:
             count_pairs(
                 rasterizer.device, rasterizer.work, frame.part.lists, frame.projected.splats, background, frame.camera
             )
+
+
+def by_two_launches(device: Device) -> None:
+    """Adam by gradients that are in memory, as where a step is looked at: all rows, and those in view."""
+    models = [allocate_gaussians(device, 11, 4, zero=True) for _ in range(4)]
+    counts, readback = upload(device, np.arange(11, dtype=np.uint32) % 3), upload(device, np.zeros(8, np.uint32))
+    for sparse in (False, True):
+        adam(device, 1, dict.fromkeys(GROUPS, 0.1), OptimiserConfig(sparse=sparse), *models, counts, readback)
+    if not all(np.isfinite(models[0][group].get()).all() for group in GROUPS):
+        raise SystemExit("Adam's step is not finite")
 
 
 def rendering(device: Device) -> None:
@@ -309,7 +320,7 @@ def main(arguments: list[str]) -> int:
     print("probe_fma", flush=True)  # which a device runs before its first kernel, where it has lanes
     if items == 1:
         opened.kind = "cpu"  # the launches too are then those of a CPU
-    for part in (sorts, limits, frames, rendering, pictures, training):
+    for part in (sorts, limits, frames, by_two_launches, rendering, pictures, training):
         part(opened)
     return 0
 

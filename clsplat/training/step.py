@@ -125,19 +125,10 @@ class GradientStep:
             models = (rows.parameters, rows.gradients, rows.first, rows.second)
             adam(self.device, self.step, self.rates, optimiser, *models, rows.projected.tile_counts, readback)
             return
-        project_step(
-            self.rasterizer.device,
-            self.step,
-            self.rates,
-            optimiser,
-            (rows.parameters, rows.first, rows.second),
-            rows.camera_array,
-            rows.projected,
-            rows.slots,
-            rows.screen,
-            readback,
-            fields=self.fields,
-        )
+        model = (rows.parameters, rows.first, rows.second)
+        view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
+        device = self.rasterizer.device
+        project_step(device, self.step, self.rates, optimiser, model, *view, fields=self.fields)
 
 
 def slot_fields(needs: StatisticsNeeds) -> SlotFields:

@@ -18,11 +18,12 @@ import clsplat
 from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
-from clsplat.config.training import TrainConfig
+from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SlotFields
 from clsplat.errors import CapacityError
+from clsplat.gaussians import GROUPS
 from clsplat.rendering.memory_needs import plan_frame, plan_step
 from clsplat.rendering.memory_plan import Need, plan
 from clsplat.rendering.rasterizer import Rasterizer
@@ -32,6 +33,7 @@ from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.density import new_statistics
 from clsplat.stages.device_gaussians import HostGaussians, upload_gaussians
 from clsplat.stages.loss import loss
+from clsplat.stages.project import project_step
 from clsplat.stages.target import target
 from clsplat.training.trainer import Trainer
 
@@ -199,20 +201,22 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
     need = plan_step(device, 6000, 16, [camera], config, fields=fields, agreement=True).need
     rasterizer = Rasterizer(device, config)
     rasterizer.capacity = capacity or rasterizer.capacity
-    model, gradients, *moments = (upload_gaussians(device, gaussians) for _ in range(4))
+    model, first, second = (upload_gaussians(device, gaussians) for _ in range(3))
     background = upload(device, np.zeros(3, np.float32))
     statistics = new_statistics(device, 6000, agreement=True, contributions=True)
     frame = rasterizer.forward(model, camera, background)
     photograph = target(device, rasterizer.work, np.zeros((80, 100, 4), np.float32), background)
     result = loss(device, rasterizer.work, frame.blended.image, photograph, 100, 80, 0.2)
-    screen = rasterizer.backward(model, frame, result.gradient, gradients, fields=fields)
-    assert screen.contributions is not None
+    slots, screen = rasterizer.pair_gradients(frame, result.gradient, fields=fields), rasterizer.screen(6000, fields)
+    view = (frame.camera_array, frame.projected, slots, screen, rasterizer.readback)
+    rates = dict.fromkeys(GROUPS, 1e-3)
+    project_step(device, 1, rates, OptimiserConfig(), (model, first, second), *view, fields=fields)
     assert len(frame.bands) == 1 if capacity is None else len(frame.bands) > 2
     pairs = frame.part.pairs.tile_keys.shape[0] if capacity is None else capacity
     rows = need.row + need.model + (need.banded if capacity else 0)
     estimate = need.planes + need.scratch + need.gaussians * rows + pairs * need.pair
     assert 0.8 * estimate < device.memory.peak <= estimate
-    del moments, statistics
+    del statistics
 
 
 def test_the_needs_of_a_frame_are_those_of_its_arrays(default_device: Device) -> None:

@@ -56,7 +56,8 @@ BROKEN = {
     "project_rays: l22 * t.e2[0]": ("l11 * t.e2[0]", "rays"),
     "project_rays: latitude - cap": ("latitude + cap", "rays"),
     "project_rays: -(s * around) / fx": ("(s * around) / fx", "rays"),
-    "adam: (1.0f - beta2) * (g * g)": ("(1.0f - beta2) * g", "adam"),
+    "adam: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
+    "project_grad: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
     "density: fma1(gx, gx, gy * gy)": ("fma1(gx, gx, gx * gy)", "statistics"),
 }
 """What is miscompiled: kernel and words, the words that stand there then, and the stage that is to notice."""
