@@ -288,7 +288,8 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 // Adam's step of LANES rows, or of those up to n: gradients (LANES, width), zero in rows that are not `shown`.
 static inline void step_rows(const uint n, const uint first_row, const uint width, const int *shown,
                              const float *gradients, Step s, Stepped model) {
-  const size_t begin = (size_t)first_row * width, end = (size_t)n * width;
+  const size_t begin = (size_t)first_row * width;
+  const uint count = min((uint)LANES, n - first_row) * width;
 #ifdef SPARSE
   int some = 0;
   for (uint lane = 0; lane < LANES; ++lane) some |= shown[lane];
@@ -296,21 +297,22 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
   IntLanes taken[SH_FLOATS];
   for (uint lane = 0; lane < LANES; ++lane)
     for (uint k = 0; k < width; ++k) taken[0].lane[lane * width + k] = -shown[lane];
-#endif
-  for (uint k = 0; k < width; ++k) {
-    const size_t i = begin + k * LANES;
-    const floatL g = *(const floatL *)(gradients + k * LANES);
-#ifdef SPARSE
-    if (n - first_row >= LANES && step_vector(i, g, taken[k].all, s, model)) continue;
+#define TAKEN(k) taken[k].all
 #else
-    if (i + LANES <= end && step_vector(i, g, (intL)(-1), s, model)) continue;
+#define TAKEN(k) (intL)(-1)
 #endif
-    for (uint lane = 0; lane < LANES && i + lane < end; ++lane) {
+  ulong left = 0; // vectors with an element that is refused, or with one beyond the last row
+  for (uint k = 0; k < width; ++k) {
+    const floatL g = *(const floatL *)(gradients + k * LANES);
+    if ((k + 1) * LANES > count || !step_vector(begin + k * LANES, g, TAKEN(k), s, model)) left |= (ulong)1 << k;
+  }
+  if (left == 0) return;
+  for (uint i = 0; i < count; ++i) {
+    if (!(left >> (i / LANES) & 1)) continue;
 #ifdef SPARSE
-      if (!taken[k].lane[lane]) continue;
+    if (!shown[i / width]) continue;
 #endif
-      step_element(i + lane, gradients[k * LANES + lane], s, model);
-    }
+    step_element(begin + i, gradients[i], s, model);
   }
 }
 #endif

@@ -132,7 +132,14 @@ class Rehearsed:
         profile.Recorder.add = add  # type: ignore[assignment,method-assign]
         buffers._Buffer = _Buffer  # type: ignore[assignment,misc]  # noqa: SLF001
         DeviceArray.read_into = read_into  # type: ignore[assignment,method-assign]
+
+        def begin_get(array: DeviceArray) -> Any:
+            note(array, "read")
+            return lambda: np.zeros(array.shape, array.dtype)
+
+        DeviceArray.begin_get = begin_get  # type: ignore[method-assign]
         DeviceArray.set = lambda array, values: note(array, "write")  # type: ignore[assignment,method-assign]
+        DeviceArray.send = lambda array, values: note(array, "write")  # type: ignore[assignment,method-assign]
         DeviceArray.fill = lambda array, value: note(array, "fill")  # type: ignore[assignment,method-assign]
 
     def counted(self) -> list[int]:
@@ -147,7 +154,7 @@ def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
     rehearsed = Rehearsed(frame)
     rehearsed.install()
     device = Device(all_devices()[0], shape).with_memory_limit(MEMORY)
-    device.kind, device.max_allocation = "gpu", MEMORY
+    device.kind, device.max_allocation, device.shares_memory = "gpu", MEMORY, False
     width, height, count = frame["width"], frame["height"], frame["gaussians"]
     camera = Camera(width, height, float(width), float(width), width / 2, height / 2, np.eye(3), np.zeros(3))
     groups = ((3,), (4,), (3,), (), ((frame["sh_degree"] + 1) ** 2, 3))

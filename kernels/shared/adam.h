@@ -41,8 +41,16 @@ static inline void refuse(size_t i, Step s, float p, float g, float m, float v, 
                                        : READBACK_REFUSED_STEPS));
 }
 
+// With vectors an element has a step of its own where one is refused: rarely, and a compiler took half a minute to put
+// it everywhere.
+#if LANES > 1
+#define RARE __attribute__((noinline)) static
+#else
+#define RARE static inline
+#endif
+
 // The step of element i along its gradient g, by `change`.
-static inline void step_element(size_t i, float g, Step s, Stepped model) {
+RARE void step_element(size_t i, float g, Step s, Stepped model) {
   const float before = model.parameters[i], m_before = model.first[i], v_before = model.second[i];
   const float m = fma1(s.beta1, m_before, (1.0f - s.beta1) * g);
   const float v = fma1(s.beta2, v_before, (1.0f - s.beta2) * (g * g));

@@ -166,7 +166,7 @@ def test_absolute_gradients_in_less_memory(scene: Scene, default_device: Device)
     config = short(random_points=1500, iterations=8, density={"absolute_gradients": True})
     free = with_limit(default_device, None)
     wanted = train(scene, config, device=free)
-    device = with_limit(default_device, int(0.75 * free.memory.peak))
+    device = with_limit(default_device, int(0.85 * free.memory.peak))  # one tile has 1024 of the pairs
     got = train(scene, config, device=device)
     for field in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
         assert_same_bits(getattr(got, field), getattr(wanted, field))
