@@ -139,19 +139,19 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   BARRIER_LOCAL();
   for (int batch = begin, turn = 0; batch < end; batch += BATCH, turn ^= 1) {
     const int count = min(BATCH, end - batch);
-    for (int j = ITEM; j < count; j += ITEMS)
-      stage(staged + j, gaussian_from_sorted[batch + j], 0, splats, tile_x, tile_y);
+    for (int j = ITEM; j < BATCH; j += ITEMS)
+      stage(staged + j, gaussian_from_sorted[min(batch + j, end - 1)], 0, splats, tile_x, tile_y);
     OPEN_CELLS(open)
     if (GOES_ON(open)) atomic_inc(busy + turn);
     BARRIER_LOCAL();
     if (busy[turn] == 0) break;
     if (ITEM == 0) busy[turn ^ 1] = 0;
-    for (int j = 0; j < count; ++j) {
+    for (int j = 0; j < count; ++j) { // to its end: Intel's runtime for CPUs reads for items that have left a loop
       OPEN_CELLS(open)
-      if (!GOES_ON(open)) break;
       const int i = batch + j;
       SPLAT_STAGED(staged[j])
-      FOR_CELLS(cell, FROM_OWN(s.blocks)) {
+      const uint blocks = GOES_ON(open) ? FROM_OWN(s.blocks) : 0;
+      FOR_CELLS(cell, blocks) {
         const floatL power = LOG2_ALPHA(splat, cell);
         COUNT(evaluated += LANES;)
         const intL reached = MASKL(power >= LOG2_ALPHA_MIN);

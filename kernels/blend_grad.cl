@@ -91,7 +91,7 @@ static inline void take_gaussian(Pixels *p, floatL *sums, intL taken, floatL pow
 #if ITEMS > 1
 // Pairs whose sums over the group's items are made together: each item leaves its part of a field in a row, and then
 // an item adds up a row, in an order that no driver changes. A row is padded so that rows begin in banks of their own.
-#define TOGETHER (ITEMS < 256 ? 3 : 2)
+#define TOGETHER (ITEMS < 256 ? 3 : 1)
 #define ROW (ITEMS + 4)
 static inline float row_sum(__local const float *row) {
   __local const float4 *four = (__local const float4 *)row;
@@ -120,11 +120,12 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     const size_t pixel = CELL_IN_PLANE(cell);
     const intL stop = LOAD_CELL(int, stops + pixel, stride);
     const intL inside = MASKL(stop >= 0); // in padding nobody has written a gradient, and 0 * NaN is not 0
-    __global const int *gradient = (__global const int *)image_gradient + pixel;
     const floatL t = LOAD_CELL(float, transmittance + pixel, stride);
-    const floatL red = AS_FLOATL(LOAD_CELL(int, gradient, stride) & inside);
-    const floatL green = AS_FLOATL(LOAD_CELL(int, gradient + plane, stride) & inside);
-    const floatL blue = AS_FLOATL(LOAD_CELL(int, gradient + 2 * plane, stride) & inside);
+    const floatL red = AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + pixel, stride) & inside);
+    const floatL green =
+        AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + plane + pixel, stride) & inside);
+    const floatL blue =
+        AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + 2 * plane + pixel, stride) & inside);
     const floatL behind = t * (red * background[0] + green * background[1] + blue * background[2]);
     const Pixels p = {t, behind, red, green, blue, stop};
     pixels[cell] = p;
@@ -181,8 +182,10 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
   __local float rows[TOGETHER * SLOT_STRIDE * ROW] __attribute__((aligned(16)));
   for (int batch = last; batch > begin; batch -= BATCH) {
     const int count = min(BATCH, batch - begin); // of the pairs before `batch`, the last one first
-    for (int j = ITEM; j < count; j += ITEMS)
-      stage(staged + j, gaussian_from_sorted[batch - 1 - j], slot_from_sorted[batch - 1 - j], splats, tile_x, tile_y);
+    for (int j = ITEM; j < BATCH; j += ITEMS) {
+      const int i = max(batch - 1 - j, begin);
+      stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], splats, tile_x, tile_y);
+    }
     BARRIER_LOCAL();
     for (int first = 0; first < count; first += TOGETHER) {
       const int together = min(TOGETHER, count - first);

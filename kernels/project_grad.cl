@@ -294,10 +294,10 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
   int some = 0;
   for (uint lane = 0; lane < LANES; ++lane) some |= shown[lane];
   if (!some) return;
-  IntLanes taken[SH_FLOATS];
+  int taken[SH_FLOATS * LANES] ROW_ALIGNED;
   for (uint lane = 0; lane < LANES; ++lane)
-    for (uint k = 0; k < width; ++k) taken[0].lane[lane * width + k] = -shown[lane];
-#define TAKEN(k) taken[k].all
+    for (uint k = 0; k < width; ++k) taken[lane * width + k] = -shown[lane];
+#define TAKEN(k) *(const intL *)(taken + (k) * LANES)
 #else
 #define TAKEN(k) (intL)(-1)
 #endif

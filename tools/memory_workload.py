@@ -38,6 +38,7 @@ from clsplat.stages.adam import adam
 from clsplat.stages.blend import count_pairs, tile_items
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.stages.limit import _splats
+from clsplat.stages.scan import scan
 from clsplat.stages.sort import bitonic_sort, radix_sort
 from clsplat.training.trainer import Trainer
 
@@ -205,6 +206,10 @@ def sorts(device: Device) -> None:
         order = np.argsort(keys, kind="stable")
         if not (np.array_equal(done[0].get(), keys[order]) and np.array_equal(done[1].get(), order)):
             raise SystemExit(f"{n} keys were not sorted")
+    values, total = upload(device, np.ones(2100, np.uint32)), allocate(device, (1,), np.uint32)
+    scan(device, work, values, values, total)  # more than one chunk
+    if int(total.get()[0]) != 2100:
+        raise SystemExit("2100 values were not added up")
 
 
 def limits(device: Device) -> None:
@@ -287,6 +292,9 @@ def by_elements(source: str, lanes: int) -> str:
     source = re.sub(rf"\((float8|int8)\)\(({parts}(?:, {parts})+)\)", elements, source)
     gradient = r"AS_FLOATL\(LOAD_CELL\(int, \(__global const int \*\)(image_gradient[^,]*), stride\) & inside\)"
     source = re.sub(gradient, masked, source)
+    source = source.replace(
+        "#define LANES 16\n", "#define LANES 8\n"
+    )  # the loss; halves of 16 floats are the same to it
     loads = "((type##8)(LOAD4(type, p), LOAD4(type, (p) + (stride))))"
     each = [f"(p)[{i}]" for i in range(4)] + [f"(p)[(stride) + {i}]" for i in range(4)]
     return source.replace(loads, f"((type##8)({', '.join(each)}))")

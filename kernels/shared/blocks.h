@@ -97,8 +97,9 @@ static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y
 }
 #endif
 
-// A batch: what the items of a group fetch together, one splat each, and then all read.
-#define BATCH 64
+// A batch: what the items of a group fetch together, and then all read. Every item fetches as many, the last splats
+// again where the list ends: a compiler that makes vectors of items may else read for those that have none.
+#define BATCH (ITEMS < 64 ? 64 : ITEMS)
 typedef struct {
   float mx, my, l11, l12; // mx, my: from the tile's first pixel to the mean
   float l22, log2o, red, green;
