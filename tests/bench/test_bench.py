@@ -219,8 +219,8 @@ def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
     assert bytes_of_rows < result["stages"]["project_grad"]["bytes"] < bytes_of_rows + 40 * result["pairs"]["listed"]
 
 
-MOST_LAUNCHES = 79
-"""Kernels of a training step in the shape 1x64, with the radix sort. 40 are aimed at."""
+MOST_LAUNCHES = 40
+"""Kernels of a training step, in a GPU's shape and in a CPU's."""
 
 
 @pytest.mark.parametrize(("shape", "launches"), [((1, 64), MOST_LAUNCHES), (None, MOST_LAUNCHES)], ids=str)
