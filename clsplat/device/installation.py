@@ -57,7 +57,7 @@ def gpus(bus: Path = Path("/sys/bus/pci/devices")) -> list[str]:
     makers = []
     for folder in sorted(bus.glob("*")):
         try:
-            kind, number = ((folder / name).read_text().strip() for name in ("class", "vendor"))
+            kind, number = ((folder / name).read_text(encoding="utf-8").strip() for name in ("class", "vendor"))
         except OSError:
             continue
         if kind.startswith(_DISPLAY) and (maker := MAKERS.get(int(number, 16))):
@@ -72,7 +72,7 @@ def driver_findings(files: Iterable[Path]) -> list[Finding]:
 
 def _driver(path: Path) -> Finding:
     try:
-        library = path.read_text().strip()
+        library = path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         return Finding("driver", "note", f"{path}: cannot be read ({error})")
     name = str(path.parent / library) if (path.parent / library).is_file() else library

@@ -238,7 +238,7 @@ def test_a_text_that_no_cache_has(default_device: Device) -> None:
     assert not salted.source.splitlines()[-1].lstrip().startswith("//")
     assert variant.anew("") is variant
     program, salt = build(default_device.context, default_device.cl_device, salted)
-    assert program.num_kernels == 3
+    assert program.num_kernels == 2
     assert salt == ""
 
 

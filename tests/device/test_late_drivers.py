@@ -56,7 +56,6 @@ def whole(scene: Path, default_device: Device) -> Gaussians:
     [
         ("gather_rows", 15),  # the first densification, at the beginning of step 16
         ("NO_SH_REST=True", 12),
-        ("WIDTH=9", 11),  # of Adam, of degree 1
         ("density_statistics", 0),
         ("interrupted NO_SH_REST=True", 12),
     ],

@@ -44,7 +44,7 @@ def test_the_planes_behind_the_features_are_those_of_the_kernel() -> None:
     for offset, name in enumerate(DEPTHS):
         place = f"(FEATURES + {offset})" if offset else "FEATURES"
         assert f"#define {name.upper()} {place}" in text
-    assert re.findall(r"(\w+)\[k\], whole \+ (plane \+ )?pixel", text) == [("count", ""), ("heaviest", "plane + ")]
+    assert re.findall(r"(\w+)\[cell\], whole \+ (plane \+ )?pixel", text) == [("count", ""), ("heaviest", "plane + ")]
     assert WHOLE == ("count", "index")
 
 

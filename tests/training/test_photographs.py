@@ -121,7 +121,7 @@ def test_a_trainer_has_them_where_there_is_room(scene: Scene, default_device: De
 
 # The plan
 
-NEED = Need(10_000, 4 * 4 * 59, 4 * 45, 132, 40, 76, 2**31 // 36, 50 * 2**20, 30 * 2**20, 2**20, 100 * 2**20)
+NEED = Need(10_000, 4 * 4 * 59, 4 * 45, 132, 40, 76, 2**31 // 36, 50 * 2**20, 2**20, 100 * 2**20)
 
 
 def test_they_take_half_of_what_is_left() -> None:

@@ -211,9 +211,9 @@ def poison_gradients(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, group: s
     gradients = allocate_gaussians(trainer.device, model.count, model.coefficients, zero=True)
     run, update = GradientStep.run, GradientStep.update
 
-    def looked_at(self: GradientStep, *arguments: Any) -> object:
+    def looked_at(self: GradientStep, *arguments: Any, **named: Any) -> object:
         monkeypatch.setattr(GradientStep, "run", run)
-        return run(self, *arguments, gradients)
+        return run(self, *arguments, gradients, **named)
 
     def poisoned(self: GradientStep, rows: StepRows) -> None:
         if self.device.only_tries:
