@@ -81,6 +81,6 @@ def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
     source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
     source.fill(1.0)
     copy.fill(0.0)  # so that its pages are there
-    kernel = device.kernels("limit").limit_copy
+    kernel = device.kernels("limit", ITEMS=tile_items(device)).limit_copy
     runs = [device.timed(lambda: launch_items(device, kernel, n // lanes, n, source, copy)) for _ in range(repeat + 1)]
     return 8e3 * n / min(ms for _, ms in runs)

@@ -42,14 +42,14 @@ BROKEN = {
     "blend: before * alpha": ("before + alpha", "blend"),
     "blend: fmaL(-before, alpha, before)": ("fmaL(-before, before, before)", "blend"),
     "loss: 2.0f * (mu1 * mu2) + C1": ("2.0f * (mu1 * mu2) - C1", "loss"),
-    "blend_grad: fmaL(weight, shade, behind[k])": ("fmaL(weight, shade, -behind[k])", "blend_grad"),
+    "blend_grad: fmaL(weight, shade, p->behind)": ("fmaL(weight, shade, -p->behind)", "blend_grad"),
     "project_grad: sums[field] += slot[field]": ("sums[field] -= slot[field]", "project_grad"),
     "features: 2.0f * fma1(v[axis], v[next], w * v[last])": ("2.0f * fma1(v[axis], v[next], -w * v[last])", "features"),
     "features: (rest - splat[SPLAT_SUB_X])": ("(rest + splat[SPLAT_SUB_X])", "features"),
-    "channels: sums[field][k] / by": ("sums[field][k] * by", "channels"),
-    "channels: weight > largest[k]": ("weight < largest[k]", "channels"),
-    "channels: MASKL(t[k] <= 0.5f)": ("MASKL(t[k] <= 0.25f)", "channels"),
-    "channels: MASKL(count[k] == 0)": ("MASKL(count[k] == 1)", "channels"),
+    "channels: sums[field][cell] / by": ("sums[field][cell] * by", "channels"),
+    "channels: weight > largest[cell]": ("weight < largest[cell]", "channels"),
+    "channels: MASKL(t[cell] <= 0.5f)": ("MASKL(t[cell] <= 0.25f)", "channels"),
+    "channels: MASKL(count[cell] == 0)": ("MASKL(count[cell] == 1)", "channels"),
     "deep: depth >= bounds[bin]": ("depth < bounds[bin]", "deep"),
     "deep: before * alpha": ("before + alpha", "deep"),
     "deep: 1.0f - value": ("value", "deep"),
@@ -76,7 +76,7 @@ def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last
     quick(
         BROKEN,
         *("arithmetic: x / y", "duplicate: gaussian_from_visible[order[rank]]", "blend: before * alpha"),
-        *("channels: weight > largest[k]", "project_grad: sums[field] += slot[field]"),
+        *("channels: weight > largest[cell]", "project_grad: sums[field] += slot[field]"),
     ),
 )
 def test_one_wrong_operation_is_found(words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device) -> None:
@@ -109,7 +109,7 @@ def test_all_scenes_in_the_shape_of_a_cpu(default_device: Device, lanes: int) ->
 @pytest.mark.slow
 def test_a_shape_without_a_stored_digest_is_no_failure(default_device: Device) -> None:
     stages = (*FORWARD, "blend_grad")
-    results = {result.stage: result for result in run(shaped(default_device, 4, 4), quick=True, stages=stages)}
+    results = {result.stage: result for result in run(shaped(default_device, 1, 8), quick=True, stages=stages)}
     assert results["blend_grad"].passed
     assert results["blend_grad"].same_bits is None
     assert results["blend"].same_bits is True
@@ -121,9 +121,9 @@ SLOPPY = {
     "project: sqrt(p.syy / p.det)": "(sqrt(p.syy / p.det) * 1.0000003f)",
     "project: dx / length": "dx / length * 0.9999998f",
     "features: q[0] / length": "q[0] / length * 1.0000002f",
-    "channels: sums[field][k] / by": "sums[field][k] / by * 0.9999998f",
+    "channels: sums[field][cell] / by": "sums[field][cell] / by * 0.9999998f",
     "project_rays: sqrt(syy / det)": "(sqrt(syy / det) * 1.0000003f)",
-    "blend_grad: 1.0f / (1.0f - alpha)": "1.0f / (1.0f - alpha) * 1.00000024f",
+    "blend_grad: INVERSE(1.0f - alpha)": "INVERSE(1.0f - alpha) * 1.00000024f",
     "loss: 1.0f / (c * d)": "1.0f / (c * d) * 0.9999998f",
     "adam: sqrt(*v)": "sqrt(*v) * 1.0000003f",
     "density: sqrt(fma1(gx, gx, gy * gy))": "(sqrt(fma1(gx, gx, gy * gy)) * 1.0000003f)",

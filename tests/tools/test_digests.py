@@ -94,7 +94,7 @@ def test_a_child(tmp_path: Path) -> None:
     assert set(digests.channel_table(row)) <= set(page)
 
 
-@pytest.mark.parametrize("shape", quick([(1, 1), (1, 64), (4, 1), (8, 16), (16, 1)], (1, 64)), ids=str)
+@pytest.mark.parametrize("shape", quick([(1, 1), (1, 64), (4, 1), (16, 1)], (1, 64)), ids=str)
 def test_gradients_of_two_shapes(shape: tuple[int, int], default_device: Device) -> None:
     """The order of blending's sums is the shape's: of each parameter group within GRADIENT_BOUND, in norm."""
     wanted, got = arrays_of(shaped(default_device, 8, 1)), arrays_of(shaped(default_device, *shape))

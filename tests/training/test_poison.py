@@ -120,7 +120,7 @@ def little_memory(scene: Scene, device: Device) -> Device:
     trainer = Trainer(scene, MANY, free)
     for _ in range(MANY.iterations):
         trainer.train_step()
-    return device.with_memory_limit(int(0.25 * free.memory.peak))
+    return device.with_memory_limit(int(0.3 * free.memory.peak))
 
 
 # What something else has spoilt
