@@ -76,7 +76,7 @@ typedef struct {
   Lanes mean[3], quaternion[4], scale[3], opacity, colour[3], basis[16];
 } Gradients;
 
-// What the visible ones of the rows from first_row on have; returns 0 if none is visible. `shown` (LANES) is 1 where
+// Gradients of the visible ones of the rows from first_row on; returns 0 if none is visible. `shown` (LANES) is 1 where
 // one is. Fills screen and contributions, and of visible rows d_sh_rest, which is row first_row's.
 static inline int gradients_of(const uint n, const uint first_row, const int coefficients, __constant float *camera,
                                __global const uint *tile_counts, __global const uint *first_slots,
@@ -381,7 +381,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #endif
 
 #else // LANES == 1
-  // What a group's items have of their Gaussians, row by row; then they walk the model's arrays side by side.
+  // Gradients of a group's Gaussians, row by row; then its items walk the model's arrays side by side.
   __local float by_mean[3 * ROWS], by_quaternion[4 * ROWS], by_log_scale[3 * ROWS];
   __local float by_opacity[ROWS], by_colour[3 * ROWS], basis[SH_HIGHER * ROWS];
   __local int in_view[ROWS];

@@ -84,10 +84,8 @@ def _driver(path: Path) -> Finding:
         return Finding("driver", "note", f"{path}: {library} does not come back from being loaded", f"remove {path}")
     if result.returncode == 0:
         return Finding("driver", "ok", f"{path}: {library}")
-    reason = (result.stderr.strip().splitlines() or [f"status {result.returncode}"])[-1].removeprefix("OSError: ")
-    return Finding(
-        "driver", "note", f"{path}: {library} cannot be loaded: {reason}", f"install it again, or remove {path}"
-    )
+    text = f"{path}: {library} cannot be loaded: {_last_line(result)}"
+    return Finding("driver", "note", text, f"install it again, or remove {path}")
 
 
 def listed_devices() -> tuple[list[dict[str, Any]], str]:
@@ -101,9 +99,7 @@ def listed_devices() -> tuple[list[dict[str, Any]], str]:
         return json.loads(result.stdout[result.stdout.index("[") :]), ""
     if result.returncode < 0:
         return [], f"a driver took the process down (signal {-result.returncode})"
-    return [], (result.stderr.strip().splitlines() or [f"status {result.returncode}"])[-1].removeprefix(
-        "clsplat: error: "
-    )
+    return [], _last_line(result)
 
 
 def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Finding]:
@@ -142,10 +138,8 @@ def loader_finding() -> Finding:
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     if result.returncode == 0:
         return Finding("loader", "ok", f"pyopencl {result.stdout.strip()}")
-    reason = (result.stderr.strip().splitlines() or [f"status {result.returncode}"])[-1]
-    return Finding(
-        "loader", "missing", f"pyopencl cannot be imported: {reason}", "pip install --force-reinstall pyopencl"
-    )
+    text = f"pyopencl cannot be imported: {_last_line(result)}"
+    return Finding("loader", "missing", text, "pip install --force-reinstall pyopencl")
 
 
 def findings() -> list[Finding]:

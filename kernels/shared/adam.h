@@ -20,14 +20,14 @@ typedef struct {
   __global float *parameters, *first, *second;
 } Stepped;
 
-// What to subtract from a vector of parameters; *m and *v become the new moments.
+// The change to subtract from a vector of parameters; *m and *v become the new moments.
 static inline floatL change(floatL g, Step s, floatL *m, floatL *v) {
   *m = fmaL((floatL)(s.beta1), *m, (1.0f - s.beta1) * g);
   *v = fmaL((floatL)(s.beta2), *v, (1.0f - s.beta2) * (g * g));
   return s.rate * *m / fmaL(sqrt(*v), (floatL)(s.root), (floatL)(s.epsilon));
 }
 
-// What becomes of an element whose step is refused: p, g, m and v as they were before it.
+// Refuses the step of an element: p, g, m and v as they were before it.
 static inline void refuse(size_t i, Step s, float p, float g, float m, float v, __global float *first,
                           __global float *second) {
   const int parameter = p * p < s.limit2, gradient = fabs(g) < INFINITY;
