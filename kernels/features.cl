@@ -45,7 +45,7 @@ static inline InCamera in_camera(__constant float *camera, float x, float y, flo
   return p;
 }
 
-// What a value of the camera has grown by.
+// The growth of a value of the camera.
 #define GROWN(name)                                                                                                    \
   ((after[CAMERA_##name] - camera[CAMERA_##name]) + (after[CAMERA_##name##_LOW] - camera[CAMERA_##name##_LOW]))
 

@@ -1,4 +1,4 @@
-// What the device can do at most, in the terms of the pipeline: `clsplat bench` states each stage's share of it.
+// The most that the device can do, in the terms of the pipeline: `clsplat bench` states each stage's share of it.
 //
 // Owner: A work-item owns OWNED cells of pixels that nobody sees; in limit_copy LANES elements.
 // Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy one work-item for each LANES elements.

@@ -112,7 +112,7 @@ static inline void store_box(const Tangent *t, int width, int height, int tiles_
   if (!t->whole_rows) {
     float low = t->low_x - BOX_SLACK, high = t->high_x + BOX_SLACK;
 #if RAYS == 1
-    // What is shown begins here and ends a turn on; the picture may be less.
+    // The part that is shown begins here and ends a turn on; the picture may be less.
     const float turn = 2.0f * HALF_TURN * camera[CAMERA_FX], begin = 0.5f * ((float)width - turn);
     const float shift = turn * floor((low - begin) / turn);
     low -= shift;

@@ -10,12 +10,14 @@ time; exit status 1 where more device memory was used than allowed.
 
 from __future__ import annotations
 
+import argparse
 import resource
 import sys
 import time
 from pathlib import Path
 
 from clsplat.bench.subject import synthetic
+from clsplat.cli.bench import parse_size
 from clsplat.config.checks import parse_bytes
 from clsplat.device.context import open_device
 from clsplat.frame.draw import drawn_by
@@ -25,25 +27,28 @@ from clsplat.rendering.renderer import Renderer
 
 def main(arguments: list[str]) -> int:
     """Render, and print a line."""
-    if not arguments:
-        print(__doc__, file=sys.stderr)
-        return 2
-    path, size, memory, count = (*arguments, *("", "16384x8192", "512MiB", "200000")[len(arguments) :])
-    width, height = (int(word) for word in size.split("x"))
-    limit = parse_bytes(memory)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("output", type=Path, metavar="OUTPUT.exr")
+    parser.add_argument("size", nargs="?", default="16384x8192", metavar="WIDTHxHEIGHT")
+    parser.add_argument("memory", nargs="?", default="512MiB", metavar="MEMORY")
+    parser.add_argument("gaussians", nargs="?", type=int, default=200_000, metavar="GAUSSIANS")
+    options = parser.parse_args(arguments)
+    path, size, limit = options.output, parse_size(options.size), parse_bytes(options.memory)
+    assert size is not None
     assert limit is not None
-    subject = synthetic(int(count), 1024, 512)
+    width, height = size
+    subject = synthetic(options.gaussians, 1024, 512)
     camera = subject.camera.resized(width, height)
     renderer = Renderer(open_device(None, limit))
     rows = strip_rows(renderer.device, camera, ("rgb", "alpha"))
     start = time.monotonic()
-    write_in_strips(Path(path), drawn_by(renderer, subject.gaussians), camera, ("rgb", "alpha"), rows)
+    write_in_strips(path, drawn_by(renderer, subject.gaussians), camera, ("rgb", "alpha"), rows)
     seconds = time.monotonic() - start
     peak, host = renderer.device.memory.peak, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print(
         f"{path}: {width}x{height}, {-(-height // rows)} strips of {rows} rows, {seconds:.0f} s; "
         f"device {peak / 2**20:.0f} of {limit / 2**20:.0f} MiB, host {host / 2**20:.0f} MiB, "
-        f"file {Path(path).stat().st_size / 2**20:.0f} MiB"
+        f"file {path.stat().st_size / 2**20:.0f} MiB"
     )
     return int(peak > limit)
 

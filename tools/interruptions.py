@@ -67,6 +67,7 @@ VERBS = (
     Verb("bench", "bench --gaussians 5000 --size 320x240 --repeat 3", "clsplat.bench.settings", writes=False),
     Verb("tune", "tune", "clsplat.bench.shapes", writes=False),
     Verb("selftest", "selftest", "!subprocess.Popen", writes=False),
+    Verb("doctor", "doctor", "!subprocess.Popen", writes=False),
 )
 WATCHED = """
 import os, sys

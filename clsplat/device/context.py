@@ -20,10 +20,11 @@ from clsplat.device.known import tell_once
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Calls, Recorder
 from clsplat.device.program import Kernel, Kernels, build, variant_of
-from clsplat.device.quirks import compiles_by_size, kind_of, no_device, title
+from clsplat.device.quirks import compiles_by_size, no_device, title
 from clsplat.device.rehearsal import Rehearsal
 from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text
 from clsplat.device.source import kernel_source
+from clsplat.device.traits import pretended, traits_of
 from clsplat.errors import DeviceError, DriverError, switched_on
 
 T = TypeVar("T")
@@ -65,7 +66,7 @@ def all_devices() -> list[cl.Device]:
 
 def list_devices() -> list[DeviceInfo]:
     """Every OpenCL device that is visible, GPUs and CPUs, in the order of their index. Raises DeviceError for a
-    CLSPLAT_SHAPE that makes no sense for any."""
+    CLSPLAT_SHAPE or CLSPLAT_PRETEND that makes no sense for any."""
     asked_shape()
     return [
         DeviceInfo(
@@ -73,7 +74,7 @@ def list_devices() -> list[DeviceInfo]:
             name=device.name.strip(),
             platform=device.platform.name.strip(),
             version=device.platform.version.strip(),
-            kind=kind_of(device),
+            kind=traits_of(device).kind,
             compute_units=device.max_compute_units,
             memory_bytes=device.global_mem_size,
             shape=shape_text(device),
@@ -112,14 +113,14 @@ class Device:
         self.cl_device = device
         self.name = device.name.strip()
         self.driver = device.platform.version.strip()
-        self.kind = kind_of(device)
+        traits = traits_of(device)
+        self.kind = traits.kind
         self.shape, self._why_another = (shape, why) if shape else shape_of(device)
         self.only_tries = False
         self.waits = switched_on(SYNC)
         self.shares_memory = self.kind == "cpu"
         self.compiles_by_size = compiles_by_size(device)
-        self.max_allocation = int(device.max_mem_alloc_size)
-        self.max_group = int(device.max_work_group_size)
+        self.max_allocation, self.max_group = traits.allocation, traits.group
         self.memory = Memory()
         self.context = cl.Context([device])
         self.profile = profile
@@ -128,13 +129,13 @@ class Device:
         self.calls = Calls()
         self.under_way: list[object] = []
         self._options = "-cl-std=CL1.2"
-        if device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
+        if traits.exact_division:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
         self._switches: Mapping[str, object] = {}
         self.recorder = Recorder(self.queue)
         self.rehearsal = Rehearsal(device, all_devices().index(device), self.shape.label)
-        self._fma: list[dict[str, object]] = []
+        self._fma: list[dict[str, object]] = [] if traits.contraction else [{}]
 
     def kernels(self, stem: str, **defines: object) -> Kernels:
         """The kernels of `stem`.cl in this device's shape, built at the first call."""
@@ -300,7 +301,7 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 
 @lru_cache(maxsize=8)
-def _open(index: int, shape: Shape, why: str, *, profile: bool) -> Device:
+def _open(index: int, shape: Shape, why: str, _pretended: str, *, profile: bool) -> Device:
     return Device(all_devices()[index], shape, profile=profile, why=why)
 
 
@@ -310,5 +311,5 @@ def open_device(selector: str | None = None, memory_limit: int | None = None, *,
     memory_limit: bytes that the buffers of this object's users may take together; profile: its queue measures.
     """
     chosen: Any = select(selector)
-    device = _open(all_devices().index(chosen), *shape_of(chosen), profile=profile)
+    device = _open(all_devices().index(chosen), *shape_of(chosen), pretended(), profile=profile)
     return device if memory_limit is None else device.with_memory_limit(memory_limit)

@@ -135,7 +135,12 @@ def access_findings(nodes: Sequence[Path] | None = None) -> list[Finding]:
 def loader_finding() -> Finding:
     """A line about pyopencl, with the loader of drivers that it brings: whether it can be imported."""
     code = "import pyopencl; print(pyopencl.VERSION_TEXT)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    try:
+        result = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=patience(), check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Finding("loader", "missing", f"pyopencl does not come back from its import within {patience():g} s")
     if result.returncode == 0:
         return Finding("loader", "ok", f"pyopencl {result.stdout.strip()}")
     text = f"pyopencl cannot be imported: {_last_line(result)}"

@@ -21,6 +21,7 @@ import pyopencl as cl
 
 import clsplat
 from clsplat.device.source import kernel_root, kernel_source
+from clsplat.device.traits import pretended
 from clsplat.errors import reason_of
 from clsplat.files import atomic_write, locked, parse_json
 
@@ -64,8 +65,9 @@ def _kernels_digest(broken: str) -> str:
 
 
 def device_key(device: cl.Device) -> str:
-    """A device and its driver."""
-    return f"{device.name.strip()} | {device.platform.version.strip()} | {device.driver_version.strip()}"
+    """A device and its driver, and what is pretended of it."""
+    words = [device.name.strip(), device.platform.version.strip(), device.driver_version.strip()]
+    return " | ".join([*words, pretended()] if pretended() else words)
 
 
 def driver_key(device: cl.Device) -> str:

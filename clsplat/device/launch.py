@@ -73,7 +73,9 @@ def _first(
 ) -> None:
     """Set the types of the kernel's arguments, and check that the driver can launch it. Raises DriverError."""
     types = [_type(value) for value in values]
-    most = kernel.most_items(device.cl_device) if tells_group_sizes(device.cl_device) else device.max_group
+    most = device.max_group
+    if tells_group_sizes(device.cl_device):
+        most = min(most, kernel.most_items(device.cl_device))
     if local is not None and prod(local) > most:
         raise device.rehearsal.fail(
             kernel.variant,
@@ -136,5 +138,6 @@ def launch_grid(device: Device, kernel: Kernel, size: tuple[int, ...], *argument
     Nothing where a side is 0.
     """
     if all(size):
-        local = (size[0], *(1 for _ in size[1:])) if device.kind == "cpu" and size[0] <= 1024 else None
+        fits = size[0] <= min(device.max_group, 1024)
+        local = (size[0], *(1 for _ in size[1:])) if device.kind == "cpu" and fits else None
         _enqueue(device, kernel, size, local, arguments)

@@ -14,7 +14,8 @@ import pyopencl as cl
 
 from clsplat.device import known
 from clsplat.device.child import regardless
-from clsplat.device.quirks import kind_of, most_lanes, title
+from clsplat.device.quirks import most_lanes, title
+from clsplat.device.traits import traits_of
 from clsplat.errors import DeviceError, reason_of
 from clsplat.files import atomic_write, parse_json
 
@@ -62,7 +63,7 @@ class Shape:
 
 def default_shape(device: cl.Device) -> Shape:
     """The shape by type and vector width; why there are several is in docs/decisions/0003-one-source-many-shapes.md."""
-    if kind_of(device) != "cpu":
+    if traits_of(device).kind != "cpu":
         items = next((n for n in (64, 32, 16) if n <= most_items(device)), 1)
         return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
     lanes = min(16 if device.native_vector_width_float >= 16 else 8, most_lanes(device))
@@ -71,8 +72,9 @@ def default_shape(device: cl.Device) -> Shape:
 
 def most_items(device: cl.Device) -> int:
     """Work-items that a group of our kernels can have: by the device's limit, and by its local memory."""
-    most: int = device.max_work_group_size
-    while most > 1 and Shape(1, most, 1).local_bytes > device.local_mem_size:
+    traits = traits_of(device)
+    most = traits.group
+    while most > 1 and Shape(1, most, 1).local_bytes > traits.local_memory:
         most //= 2
     return most
 
@@ -80,7 +82,7 @@ def most_items(device: cl.Device) -> int:
 def candidates(device: cl.Device) -> list[Shape]:
     """The shapes that are worth a trial, the default first."""
     default = default_shape(device)
-    if kind_of(device) == "cpu":
+    if traits_of(device).kind == "cpu":
         others = [replace(default, lanes=lanes) for lanes in (16, 8)]
     else:
         others = [replace(default, items=items) for items in (32, 128, 256) if items <= most_items(device)]
@@ -102,12 +104,12 @@ def wanted_shape(device: cl.Device) -> Shape:
     shape = _parsed(text or saved_shapes().get(known.device_key(device), ""), default)
     if shape is None or (not text and shape.items > most_items(device)):
         return default
-    name, most = device.name.strip(), device.max_work_group_size
-    if shape.items > most:
-        raise DeviceError(f"CLSPLAT_SHAPE={text}: {name} has at most {most} items in a work-group")
+    name, traits = device.name.strip(), traits_of(device)
+    if shape.items > traits.group:
+        raise DeviceError(f"CLSPLAT_SHAPE={text}: {name} has at most {traits.group} items in a work-group")
     if shape.items > most_items(device):
         raise DeviceError(
-            f"CLSPLAT_SHAPE={text}: {name} has {device.local_mem_size >> 10} KiB of local memory, and a group of "
+            f"CLSPLAT_SHAPE={text}: {name} has {traits.local_memory >> 10} KiB of local memory, and a group of "
             f"{shape.items} items needs {shape.local_bytes >> 10} KiB; expected at most {most_items(device)} items"
         )
     return shape

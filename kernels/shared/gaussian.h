@@ -52,7 +52,7 @@ static inline Double camera_row(__constant float *r, __constant float *r_low, fl
   return multiply_add2(r[2], r_low[2], z, sum);
 }
 
-// What a place on the image is linear in, and in two floats' terms what is left of it: of the quotient x/z, or of x.
+// The quantity that a place on the image is linear in, x/z or x, in two floats: the value, and the rest of it.
 #ifdef ORTHOGRAPHIC
 #define RATIO(x, z) (x)
 static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) { return x_low; }

@@ -1,4 +1,4 @@
-// What a work-group does together. At ITEMS == 1 a group is one sequential work-item and nothing is left of this.
+// Tasks that a work-group does together. At ITEMS == 1 a group is one sequential work-item and nothing is left of this.
 #ifndef ITEMS
 #error "ITEMS must be defined: work-items per group, 1 on CPUs"
 #endif

@@ -1,4 +1,4 @@
-// What the kernels that write and read a splat or a slot must agree on, beside the layouts on top of every text.
+// Forms that the kernels which write and read a splat or a slot must agree on, beside the layouts on top of every text.
 
 // A splat's L11, L12 and L22 are the whitening W times this, sqrt(log2(e) / 2); the slots' moments are of that product.
 #define WHITEN 0.84932180028801904f

@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 
 from clsplat.device import installation
-from clsplat.device.installation import access_findings, device_findings, driver_findings, gpu_findings, gpus
+from clsplat.device.installation import (
+    access_findings,
+    device_findings,
+    driver_findings,
+    gpu_findings,
+    gpus,
+    loader_finding,
+)
 from clsplat.device.quirks import driver_files, gpu_advice
 
 NVIDIA, AMD, INTEL = "0x10de", "0x1002", "0x8086"
@@ -79,6 +86,14 @@ def test_drivers_that_cannot_be_loaded_are_named(tmp_path: Path) -> None:
     )
     assert findings[0].advice == f"install it again, or remove {tmp_path / 'a.icd'}"
     assert "b.icd: cannot be read" in findings[1].text
+
+
+def test_a_loader_that_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "pyopencl.py").write_text("import time; time.sleep(60)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("CLSPLAT_DRIVER_TIMEOUT", "0.5")
+    finding = loader_finding()
+    assert (finding.state, finding.text) == ("missing", "pyopencl does not come back from its import within 0.5 s")
 
 
 def test_no_device_and_trouble_are_missing() -> None:
