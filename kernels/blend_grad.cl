@@ -51,10 +51,13 @@ typedef struct {
   intL stop;
 } Pixels;
 
-// Takes a pair out of a cell's pixels, in the lanes that took it, and adds their gradients to its sums (SLOT_STRIDE).
-static inline void take_gaussian(Pixels *p, floatL *sums, intL taken, floatL power, floatL u, floatL v, float l11,
-                                 float l12, float l22, float c_red, float c_green, float c_blue) {
-  const floatL uncapped = AS_FLOATL(AS_INTL(exp2L(power)) & taken);
+// A pair in a cell's pixels: g, and the pair's weight in the colour.
+typedef struct {
+  floatL g, weight;
+} Share;
+
+// Takes a pair out of a cell's pixels, by its alpha before the cap, 0 in the lanes that did not take it.
+static inline Share take_out(Pixels *p, floatL uncapped, float c_red, float c_green, float c_blue) {
   const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
   const floatL inverse = INVERSE(1.0f - alpha);
   const floatL before = p->t * inverse;
@@ -64,29 +67,60 @@ static inline void take_gaussian(Pixels *p, floatL *sums, intL taken, floatL pow
   const floatL g = AS_FLOATL(AS_INTL(alpha * d_alpha) & MASKL(uncapped < ALPHA_MAX));
   p->behind = fmaL(weight, shade, p->behind);
   p->t = before;
-  sums[SLOT_RED] = fmaL(weight, p->red, sums[SLOT_RED]);
-  sums[SLOT_GREEN] = fmaL(weight, p->green, sums[SLOT_GREEN]);
-  sums[SLOT_BLUE] = fmaL(weight, p->blue, sums[SLOT_BLUE]);
-  add_moments(g, u, v, sums);
+  const Share share = {g, weight};
+  return share;
+}
+
+// Adds a cell's gradients to a pair's sums (SLOT_STRIDE).
+static inline void add_gradients(floatL *sums, const Pixels *p, Share share, floatL u, floatL v, float l11, float l12,
+                                 float l22) {
+  sums[SLOT_RED] = fmaL(share.weight, p->red, sums[SLOT_RED]);
+  sums[SLOT_GREEN] = fmaL(share.weight, p->green, sums[SLOT_GREEN]);
+  sums[SLOT_BLUE] = fmaL(share.weight, p->blue, sums[SLOT_BLUE]);
+  add_moments(share.g, u, v, sums);
 #ifdef ABSOLUTE_GRADIENTS
-  sums[SLOT_ABSX] += fabs(g * (l11 * u));
-  sums[SLOT_ABSY] += fabs(g * fmaL((floatL)(l12), u, l22 * v));
+  sums[SLOT_ABSX] += fabs(share.g * (l11 * u));
+  sums[SLOT_ABSY] += fabs(share.g * fmaL((floatL)(l12), u, l22 * v));
 #endif
 #ifdef CONTRIBUTIONS
-  sums[SLOT_WEIGHT] += weight;
+  sums[SLOT_WEIGHT] += share.weight;
 #endif
 }
 
-// The i-th pair of the tile's list, in the pixels of a cell.
-#define TAKE_CELL(cell)                                                                                                \
-  {                                                                                                                    \
-    const floatL dy = my - AT_Y(cell);                                                                                 \
-    const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;                                          \
-    const floatL power = log2_alpha(u, v, log2o);                                                                      \
-    const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels[cell].stop);                          \
-    if (CONTRIBUTES(taken))                                                                                            \
-      take_gaussian(pixels + cell, sums, taken, power, u, v, l11, l12, l22, c_red, c_green, c_blue);                   \
+// Alpha of the i-th pair of the tile's list in a cell's pixels.
+#define ALPHA_IN(cell)                                                                                                 \
+  const floatL dy = my - AT_Y(cell);                                                                                   \
+  const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;                                            \
+  const floatL power = log2_alpha(u, v, log2o);                                                                        \
+  const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels[cell].stop);
+
+// The pair in the pixels of the cells that it reaches. Where a work-item walks many cells there is a loop for each of
+// three tasks: with short chains and few registers a processor has more cells under way (docs/performance.md).
+#if LANES >= 8
+#define TAKE_PAIR(reach)                                                                                               \
+  floatL alpha_of[CELLS], u_of[CELLS];                                                                                 \
+  Share share_of[CELLS];                                                                                               \
+  uint reached = 0;                                                                                                    \
+  FOR_CELLS(cell, reach) {                                                                                             \
+    ALPHA_IN(cell)                                                                                                     \
+    alpha_of[cell] = AS_FLOATL(AS_INTL(exp2L(power)) & taken);                                                         \
+    u_of[cell] = u;                                                                                                    \
+    reached |= (uint)(CONTRIBUTES(taken) != 0) << cell;                                                                \
+  }                                                                                                                    \
+  FOR_CELLS(cell, reached) share_of[cell] = take_out(pixels + cell, alpha_of[cell], c_red, c_green, c_blue);           \
+  FOR_CELLS(cell, reached)                                                                                             \
+  add_gradients(sums, pixels + cell, share_of[cell], u_of[cell], l22 * (my - AT_Y(cell)), l11, l12, l22);
+#else
+#define TAKE_PAIR(reach)                                                                                               \
+  FOR_CELLS(cell, reach) {                                                                                             \
+    ALPHA_IN(cell)                                                                                                     \
+    if (CONTRIBUTES(taken)) {                                                                                          \
+      const floatL alpha = AS_FLOATL(AS_INTL(exp2L(power)) & taken);                                                   \
+      const Share share = take_out(pixels + cell, alpha, c_red, c_green, c_blue);                                      \
+      add_gradients(sums, pixels + cell, share, u, v, l11, l12, l22);                                                  \
+    }                                                                                                                  \
   }
+#endif
 
 #if ITEMS > 1
 // Pairs whose sums over the group's items are made together: each item leaves its part of a field in a row, and then
@@ -160,8 +194,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     const Reach reach = reach_of(splat, tile_x, tile_y);
 #endif
     floatL sums[SLOT_STRIDE] = {(floatL)(0.0f)};
-    FOR_CELLS(cell, reach)
-    TAKE_CELL(cell)
+    TAKE_PAIR(reach)
 #if LANES >= 8
     typedef float8 float8U __attribute__((aligned(4)));
     *(__global float8U *)slot = sums8(sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]);
@@ -194,8 +227,8 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
         SPLAT_STAGED(staged[first + j])
         float sums[SLOT_STRIDE];
         for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
-        FOR_CELLS(cell, FROM_OWN(s.blocks))
-        TAKE_CELL(cell) __local float *column = rows + j * (SLOT_STRIDE * ROW) + ITEM;
+        TAKE_PAIR(FROM_OWN(s.blocks))
+        __local float *column = rows + j * (SLOT_STRIDE * ROW) + ITEM;
         for (int field = 0; field < SLOT_STRIDE; ++field) column[field * ROW] = sums[field];
       }
       BARRIER_LOCAL();
