@@ -213,7 +213,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "scan_sums": (_group_sum(_of_item),),
     "scan_chunks": (
         _group_sum(lambda run: run.sums_before),
-        Rule("for (uint base = begin; base < end; base += ITEMS)", _of_item),
+        Rule("for (uint base = begin; base < end; base += ITEMS)", _of_item, ends=("running += all;",)),
     ),
     "radix_histogram": (
         Rule("digit += ITEMS) counters[digit] = 0;", lambda run: run.shared(run.digits), mark=("shared", 1)),

@@ -406,7 +406,7 @@ def test_a_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_tables_have_a_place_in_the_page() -> None:
     page = gpu_page.PAGE.read_text("utf-8")
-    names = ("kernels", "pairs", "frames", "stages", "steps", "devices", "intel")
+    names = ("kernels", "pairs", "frames", "stages", "goals", "steps", "devices", "intel")
     filled = gpu_page.fill_in(page, {name: f"table of {name}" for name in names})
     assert all(f"<!-- {name} -->\ntable of {name}\n<!-- end -->" in filled for name in names)
     with pytest.raises(ClsplatError, match="has no place for the table costs"):
