@@ -158,9 +158,8 @@ def goals(rows: Sequence[Any], predictions: Predictions, frame: Mapping[str, Any
     gpu = _gpu(GPU)
     stages, drawn = (predictions[SHAPE, GPU, name] for name in (frame["name"], picture))
     whole, before, shown = (sum(each.values(), Stage()) for each in (stages, began(), drawn))
-    pair = sum(
-        row.a_pair or 0 for row in rows if (row.built.target, f"1x{row.source.items}") == (TARGET, SHAPE) and row.pair
-    )
+    shown_rows = [row for row in rows if (row.built.target, f"1x{row.source.items}") == (TARGET, SHAPE)]
+    pair = sum({row.built.kernel: row.a_pair for row in shown_rows if row.a_pair}.values())
     hidden = frame["gaussians"] - frame["visible"]
     saved = hidden * 4 * 6 * floats_of((frame["sh_degree"] + 1) ** 2) / gpu.gb * 1e-6
     beside = [stage for name, stage in stages.items() if name not in ("blend", "blend_grad")]

@@ -62,11 +62,6 @@ class Run:
         return self.batches * self.batch / self.items
 
     @property
-    def block_rows(self) -> int:
-        """Rows of the blocks of a tile."""
-        return 4 if self.items >= 32 else 8
-
-    @property
     def together(self) -> int:
         """Pairs whose sums are made together, TOGETHER in blend_grad.cl."""
         return 3 if self.items < 256 else 1
@@ -141,7 +136,6 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
     "blend": (
         Rule("for (int batch = begin", lambda run: run.batches, ends=("if (busy[turn] == 0) break;",)),
         Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
-        Rule("for (int row = 0; row < BLOCK_ROWS; ++row)", lambda run: run.fetches * run.block_rows),
         Rule("for (int j = 0; j < count", lambda run: 1),
     ),
     "blend_grad": (
@@ -149,10 +143,8 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
         Rule("for (int batch = last", lambda run: run.batches),
         Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
-        Rule("for (int row = 0; row < BLOCK_ROWS; ++row)", lambda run: run.fetches * run.block_rows),
         Rule("for (int first = 0; first < count; first += TOGETHER)", lambda run: 1 / run.together),
         Rule("for (int j = 0; j < together; ++j)", lambda run: 1, ends=("column[field * ROW] = sums[field];",)),
-        Rule("for (int row = ITEM; row < together * SLOT_STRIDE", lambda run: 1 / run.together),
         Rule("for (int i = 1; i < ITEMS / 4; ++i)", lambda run: run.items / 4 / run.together, mark=("shared", 1)),
         Rule("for (int i = 1; i < ITEMS / 4; ++i)", lambda run: run.summing, part=True),
         Rule("return (sum.x + sum.y)", lambda run: run.summing, part=True),
@@ -251,7 +243,6 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("FOR_VECTORS(block, margin)", _loss(2 * REACH)),
         Rule("for (int tap = taps.x; tap < taps.y;", _loss(2 * REACH, WINDOW), mark=("global", 5)),
         Rule("FOR_VECTORS(block, 0)", _loss(0)),
-        Rule("for (int tap = 0; tap < TAPS; ++tap) {", _loss(0, WINDOW), mark=("shared", 5)),
     ),
     "project_step": (
         Rule(

@@ -20,7 +20,7 @@ from gpu_compilers import Built, NoCompilerError, Source, ask_package, read_amd,
 from gpu_devices import Gpu, occupancy, waves_at_a_time
 from gpu_intel import read_intel
 from gpu_loops import UnknownLoopError, cost_of, rules_of, unused_rules
-from gpu_model import predict
+from gpu_model import Stage, predict
 from gpu_rules import BY_ITEM, BY_PAIR, Rule, Run
 from gpu_static import FRAMES, MOST_A_PAIR, NO_STACK, Row, broken, sources_of
 
@@ -411,3 +411,31 @@ def test_tables_have_a_place_in_the_page() -> None:
     assert all(f"<!-- {name} -->\ntable of {name}\n<!-- end -->" in filled for name in names)
     with pytest.raises(ClsplatError, match="has no place for the table costs"):
         gpu_page.fill_in(page, {"costs": ""})
+
+
+def predictions() -> dict[tuple[str, str, str], dict[str, Stage]]:
+    step = {name: Stage(1.0, 0.5, 2) for name in ("target", "loss", "blend", "blend_grad", "project_grad")}
+    return {
+        (gpu_page.SHAPE, gpu.name, frame): step if frame == "large" else {"blend": Stage(2.0, 0.5, 1)}
+        for gpu in gpu_page.GPUS
+        for frame in ("large", "picture")
+    }
+
+
+def test_a_step_by_parts() -> None:
+    lines = gpu_page.stage_table(predictions(), "large").splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    (loss,) = [line for line in lines if line.startswith("| loss |")]
+    assert loss.startswith("| loss | 4 | 2.00 | 1.00 | 3.00 | 5 |")  # target is of it, and 1 + 4 launches before
+    assert lines[-1].startswith("| all | 10 | 5.00 | 2.50 | 7.50 | 81 |")
+    with pytest.raises(ClsplatError, match="stages turn: of no part in PARTS"):
+        gpu_page.parts_of({"turn": Stage()})
+
+
+def test_what_is_wanted() -> None:
+    frame = {"name": "large", "gaussians": 10, "visible": 10, "sh_degree": 3, "walked": 10_000_000}
+    text = gpu_page.goals([row("blend", 300.0)], predictions(), frame, "picture").replace("\n", " ")
+    assert "**7.5 ms** (wanted: at most 12)" in text
+    assert "**400 a second** (wanted: at least 200)" in text
+    # 4.0 ms less three parts of 1.0 is 1.0, in which an RTX 4090 starts 1290 million instructions
+    assert "to take 1.0 ms: 129 instructions of a warp for a pair in place of 300." in text
