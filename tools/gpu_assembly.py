@@ -193,61 +193,62 @@ sass_kind, gcn_kind = _classifier(SASS_KINDS), _classifier(GCN_KINDS)
 
 _SASS_LINE = re.compile(r"^\s+/\*[0-9a-f]+\*/\s+(?P<guard>@!?\w+\s+)?(?P<name>[A-Z][\w.]*)(?P<rest>[^;]*);")
 _SASS_LABEL = re.compile(r"^(\.[\w$]+):")
-_SASS_SOURCE = re.compile(r'^\s*//## File "(?P<file>[^"]*)", line (?P<line>\d+)')
+_SASS_SOURCE = re.compile(r'^\s*//## File "[^"]*", line (\d+)')
 _SECTION = re.compile(r"^\.text\.([\w$]+):")
-
-
-def parse_sass(text: str) -> dict[str, Loop]:
-    """Kernels by name from the output of `nvdisasm -c`, with source lines where it was made with -g."""
-    functions: dict[str, list[str | Instruction]] = {}
-    current: list[str | Instruction] = []
-    source = 0
-    for line in text.splitlines():
-        if match := _SECTION.match(line):
-            current, source = functions.setdefault(match[1], []), 0
-        elif match := _SASS_SOURCE.match(line):
-            source = int(match["line"])
-        elif match := _SASS_LABEL.match(line):
-            current.append(match[1])
-        elif (match := _SASS_LINE.match(line)) and match["name"] != "NOP":  # which fill up what is behind the end
-            current.append(_sass(match["name"], match["rest"], bool(match["guard"]), source))
-    return {name: kernel_of(blocks_of(items)) for name, items in functions.items()}
-
-
-def _sass(name: str, rest: str, guarded: bool, source: int) -> Instruction:
-    """BSSY names where ways meet again, so that it is no jump. CALL is one, if it is to a label of the kernel: a
-    function has a name."""
-    family = name.partition(".")[0]
-    target = re.search(r"`\((\.[\w$]+)\)", rest) if family in ("BRA", "BRX", "JMP", "CALL") else None
-    always = not guarded and not re.match(r"\s*!?U?P[0-6]", rest)
-    ends = always and (family in ("BRA", "BRX", "JMP", "EXIT", "RET") or target is not None)
-    return Instruction(name, sass_kind(name), target[1] if target else "", ends, source)
-
-
 _GCN_LINE = re.compile(r"^\s+(?P<name>[a-z][a-z0-9]*_\w+)(?P<rest>[^;]*)")
 _GCN_LABEL = re.compile(r"^(\.L\w+|\w+):")
 _GCN_SOURCE = re.compile(r"^\s+\.loc\s+\d+\s+(\d+)")
 
 
+def parse_sass(text: str) -> dict[str, Loop]:
+    """Kernels by name from the output of `nvdisasm -c`, with source lines where it was made with -g."""
+    return _parsed(text, (_SECTION, _SASS_SOURCE, _SASS_LABEL, _SASS_LINE), _sass)
+
+
 def parse_gcn(text: str) -> dict[str, Loop]:
     """Kernels by name from the assembly that clang writes for AMD."""
+    names = re.findall(r"^\s+\.amdhsa_kernel (\w+)", text, flags=re.MULTILINE)
+    begins = re.compile(rf"^({'|'.join(names)}|\.Lfunc_end\d+):")  # what follows an end is no instruction
+    kernels = _parsed(text, (begins, _GCN_SOURCE, _GCN_LABEL, _GCN_LINE), _gcn)
+    return {name: kernels[name] for name in names}
+
+
+def _parsed(
+    text: str,
+    patterns: tuple[re.Pattern[str], re.Pattern[str], re.Pattern[str], re.Pattern[str]],
+    instruction: Callable[[re.Match[str], int], Instruction],
+) -> dict[str, Loop]:
+    """Functions by name. patterns: of lines that begin a function, name a source line, are a label, or an instruction;
+    the first that matches counts."""
+    begins, names_source, label, line = patterns
     functions: dict[str, list[str | Instruction]] = {}
     current: list[str | Instruction] = []
     source = 0
-    names = set(re.findall(r"^\s+\.amdhsa_kernel (\w+)", text, flags=re.MULTILINE))
-    for line in text.splitlines():
-        if match := _GCN_LABEL.match(line):
-            if match[1] in names:
-                current, source = functions.setdefault(match[1], []), 0
-            elif match[1].startswith(".Lfunc_end"):
-                current = []
-            else:
-                current.append(match[1])
-        elif match := _GCN_SOURCE.match(line):
+    for each in text.splitlines():
+        if match := begins.match(each):
+            current, source = functions.setdefault(match[1], []), 0
+        elif match := names_source.match(each):
             source = int(match[1])
-        elif match := _GCN_LINE.match(line):
-            name, target = match["name"], re.match(r"\s+(\.L\w+)", match["rest"])
-            jumps = name.startswith(("s_branch", "s_cbranch"))
-            ends = name in ("s_branch", "s_endpgm", "s_setpc_b64")
-            current.append(Instruction(name, gcn_kind(name), target[1] if jumps and target else "", ends, source))
+        elif match := label.match(each):
+            current.append(match[1])
+        elif (match := line.match(each)) and match["name"] != "NOP":  # which fill up what is behind NVIDIA's end
+            current.append(instruction(match, source))
     return {name: kernel_of(blocks_of(items)) for name, items in functions.items()}
+
+
+def _sass(match: re.Match[str], source: int) -> Instruction:
+    """BSSY names where ways meet again, so that it is no jump. CALL is one, if it is to a label of the kernel: a
+    function has a name."""
+    name, rest = match["name"], match["rest"]
+    family = name.partition(".")[0]
+    target = re.search(r"`\((\.[\w$]+)\)", rest) if family in ("BRA", "BRX", "JMP", "CALL") else None
+    always = not match["guard"] and not re.match(r"\s*!?U?P[0-6]", rest)
+    ends = always and (family in ("BRA", "BRX", "JMP", "EXIT", "RET") or target is not None)
+    return Instruction(name, sass_kind(name), target[1] if target else "", ends, source)
+
+
+def _gcn(match: re.Match[str], source: int) -> Instruction:
+    name, target = match["name"], re.match(r"\s+(\.L\w+)", match["rest"])
+    jumps = name.startswith(("s_branch", "s_cbranch"))
+    ends = name in ("s_branch", "s_endpgm", "s_setpc_b64")
+    return Instruction(name, gcn_kind(name), target[1] if jumps and target else "", ends, source)

@@ -6,7 +6,8 @@
 
 PATH is a run, a model or a scene, as `clsplat bench` takes it; its first view is drawn. Listed are the pairs of a tile
 and a Gaussian in the tiles' lists, walked those up to the last one that some pixel of the tile takes. Rows of
-gpu_frames.json of these names are replaced. The row without a path is a made-up frame, of which the counts are assumed.
+gpu_frames.json of these names are replaced. Rows that nobody counted are of made-up frames, whose counts are assumed;
+one with `picture` is drawn and not trained on.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def run(arguments: list[str]) -> int:
         require(bool(name and equals and path), f"{text}: expected NAME=PATH")
         frames[name] = count(name, load_subject(Path(path)))
         print(json.dumps(frames[name]))
-    rows = sorted(frames.values(), key=lambda row: row["gaussians"])
+    rows = sorted(frames.values(), key=lambda row: (row.get("picture", False), row["gaussians"]))
     atomic_write(FRAMES, (json.dumps({"frames": rows}, indent=2) + "\n").encode())
     return 0
 

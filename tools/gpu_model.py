@@ -9,13 +9,16 @@ may be trusted, real times are longer.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from gpu_compilers import Built, Source
 from gpu_devices import ARCHITECTURES, Gpu
-from gpu_loops import BY_ITEM, BY_PAIR, Cost, Run, cost_of
+from gpu_loops import Cost, cost_of, rules_of
+from gpu_rules import BY_PAIR, NUMBERS, Run
+
+from clsplat.device.layout import TILE
 
 COPIES = ("write", "read")
 """Launches that are transfers between host and device, which are not predicted."""
@@ -38,10 +41,19 @@ class Stage:
         return Stage(self.issue + other.issue, self.memory + other.memory, self.launches + other.launches)
 
 
-def run_of(frame: Mapping[str, Any], items: int, wave: int) -> Run:
-    """The numbers of a frame on which loops depend."""
-    addends = frame["listed"] / max(frame["visible"], 1)
-    return Run(items, wave, addends, frame["width"], (frame["sh_degree"] + 1) ** 2)
+def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave: int) -> Run:
+    """The numbers of a frame and of a launch on which loops depend."""
+    tiles = -(-frame["width"] // TILE) * -(-frame["height"] // TILE)
+    numbers = dict(zip(NUMBERS.get(launch["kernel"], ()), map(int, launch["scalars"]), strict=False))
+    return Run(
+        items,
+        wave,
+        addends=frame["listed"] / max(frame["visible"], 1),
+        listed=frame["walked"] / tiles,
+        coefficients=(frame["sh_degree"] + 1) ** 2,
+        groups=math.prod(launch["size"]) // items,
+        **{name: numbers[name] for name in ("elements", "digits") if name in numbers},
+    )
 
 
 def issued(cost: Cost, target: str) -> tuple[float, float]:
@@ -59,12 +71,9 @@ def predict(
     built: Mapping[tuple[Source, str], Built],
     frame: Mapping[str, Any],
     gpu: Gpu,
-    say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Stage]:
-    """The stages of a step, in order, from its launches (`gpu_variants.py`) and the kernels for the GPU's target.
-    say: is told of each loop that no rule knows, and that counts as one round."""
+    """The stages of a step, in order, from its launches (`gpu_variants.py`) and the kernels for the GPU's target."""
     stages: dict[str, Stage] = {}
-    costs: dict[tuple[Source, str], tuple[float, float]] = {}
     wave = ARCHITECTURES[gpu.target].wave
     for launch in launches:
         if launch["kernel"] in COPIES:
@@ -72,14 +81,8 @@ def predict(
         instructions = 0.0
         if "stem" in launch:
             source, name = Source(launch["stem"], tuple(launch["options"])), launch["kernel"]
-            run = run_of(frame, source.items, wave)
-            if (source, name) not in costs:
-                rules = BY_PAIR.get(name, BY_ITEM.get(name, ()))
-                cost = cost_of(built[source, name], source.lines, rules, run, strict=name in BY_PAIR)
-                costs[source, name] = issued(cost, gpu.target)
-                for loop in cost.unknown:
-                    say(f"{name} for {gpu.target}: counted as one round, BY_ITEM in gpu_loops.py has no rule: {loop}")
-            once, rounds = costs[source, name]
+            run = run_of(frame, launch, source.items, wave)
+            once, rounds = issued(cost_of(built[source, name], source.lines, rules_of(name), run), gpu.target)
             waves = math.prod(launch["size"]) / wave
             if name in BY_PAIR:
                 waves = max(waves, math.prod(launch["size"]) / source.items)

@@ -3,32 +3,45 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
-from gpu_devices import GPUS, occupancy
+from gpu_devices import GPUS, Gpu, occupancy
 from gpu_intel import INTEL, IntelBuilt
 from gpu_model import Stage
 from plotting import plot_stacks
 
 from clsplat.errors import ClsplatError
 from clsplat.files import atomic_write
+from clsplat.gaussians import floats_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, PLOT = ROOT / "docs/gpu-static.md", ROOT / "docs/images/gpu-static.svg"
 SHAPE, TARGET, GPU = "1x64", "sm_89", "RTX 4090"
 """Of the tables that show one of each."""
+LETTERS = 140
+"""Of a line of text."""
 PARTS = {
-    "blend": ("blend",),
-    "blend_grad": ("blend_grad",),
+    "project": ("project",),
     "lists and sorts": ("duplicate", "ranges"),
-    "loss": ("loss",),
+    "blend": ("blend",),
+    "loss": ("target", "loss"),
+    "blend_grad": ("blend_grad",),
     "project_grad, Adam": ("project_grad", "adam"),
-    "other": (),
+    "statistics": ("statistics",),
 }
-"""Bars of the plot: stages by name; `other` has the rest."""
+"""Parts of a step, of which each is a row of a table and a bar of the plot; stages by name."""
+BEGAN = json.loads(Path(__file__).with_name("gpu_began.json").read_text())
+"""Instructions of a warp and bytes of each stage where the work for GPUs began, as the tools of the commit
+`counted_by`, whose kernels are the same, count them with rules of their own."""
+VKSPLAT, VKSPLAT_GPU = (19, 25, 25, 32, 130, 131, 5), "RTX 3090"
+"""Seconds of these parts in VkSplat's trainings of 30,000 steps, mean of seven scenes, by its project's page."""
+WANTED, FRAMES_WANTED, LITEGS = 12, 200, 4.0
+"""Milliseconds of a step, at most, and pictures a second, at least; milliseconds of a step of LiteGS."""
 
 Predictions = Mapping[tuple[str, str, str], Mapping[str, Stage]]
 """Stages of a step by shape, GPU and frame."""
@@ -92,25 +105,98 @@ def intel_table(built: Sequence[IntelBuilt]) -> str:
     return markdown(lines)
 
 
+def parts_of(stages: Mapping[str, Stage]) -> dict[str, Stage]:
+    """The parts of a step. Raises ClsplatError for a stage that is of none."""
+    of_part = {stage: part for part, members in PARTS.items() for stage in members}
+    if strange := [name for name in stages if name not in of_part]:
+        raise ClsplatError(f"stages {', '.join(strange)}: of no part in PARTS of gpu_page.py")
+    return {part: sum((stages[name] for name in members if name in stages), Stage()) for part, members in PARTS.items()}
+
+
+def began() -> dict[str, Stage]:
+    """The stages of a step on the GPU that is shown, where the work for GPUs began."""
+    gpu = _gpu(GPU)
+    return {
+        name: Stage(stage["instructions"] / gpu.issued, stage["bytes"] / gpu.gb * 1e-6, stage["launches"])
+        for name, stage in BEGAN["stages"].items()
+    }
+
+
+def _gpu(name: str) -> Gpu:
+    return next(gpu for gpu in GPUS if gpu.name == name)
+
+
 def stage_table(predictions: Predictions, frame: str) -> str:
-    """Milliseconds of each stage on one GPU."""
-    stages = predictions[SHAPE, GPU, frame]
-    lines = [["stage", "launches", "issue, ms", "memory, ms", "sum, ms"]]
-    for name, stage in [*stages.items(), ("all", sum(stages.values(), Stage()))]:
+    """Milliseconds of each part of a step on one GPU, and of others' beside it."""
+    now, before, other = (
+        list(parts_of(stages).items())
+        for stages in (predictions[SHAPE, GPU, frame], began(), predictions[SHAPE, VKSPLAT_GPU, frame])
+    )
+    lines = [["part", "launches", "issue, ms", "memory, ms", "sum, ms", f"{BEGAN['commit']}: launches", "sum, ms"]]
+    lines[0] += [f"{VKSPLAT_GPU}: sum, ms", "VkSplat there, ms"]
+    theirs = [seconds / 30 for seconds in VKSPLAT]
+    for each in (now, before, other):
+        each.append(("all", sum((stage for _, stage in each), Stage())))
+    for (name, stage), (_, old), (_, there), seen in zip(now, before, other, [*theirs, sum(theirs)], strict=True):
         numbers = (f"{value:.2f}" for value in (stage.issue, stage.memory, stage.both))
-        lines.append([name, str(stage.launches), *numbers])
+        lines.append(
+            [
+                name,
+                str(stage.launches),
+                *numbers,
+                str(old.launches),
+                f"{old.both:.2f}",
+                f"{there.both:.2f}",
+                f"{seen:.2f}",
+            ]
+        )
     return markdown(lines)
 
 
-def device_table(predictions: Predictions, frames: Sequence[str]) -> str:
-    """Milliseconds of a step on every GPU: of the largest frame in every shape, of the others in one."""
+def goals(rows: Sequence[Any], predictions: Predictions, frame: Mapping[str, Any], picture: str) -> str:
+    """A step and a picture in a sentence each, and what a step as fast as LiteGS would take."""
+    gpu = _gpu(GPU)
+    stages, drawn = (predictions[SHAPE, GPU, name] for name in (frame["name"], picture))
+    whole, before, shown = (sum(each.values(), Stage()) for each in (stages, began(), drawn))
+    shown_rows = [row for row in rows if (row.built.target, f"1x{row.source.items}") == (TARGET, SHAPE)]
+    pair = sum({row.built.kernel: row.a_pair for row in shown_rows if row.a_pair}.values())
+    hidden = frame["gaussians"] - frame["visible"]
+    saved = hidden * 4 * 6 * floats_of((frame["sh_degree"] + 1) ** 2) / gpu.gb * 1e-6
+    beside = [stage for name, stage in stages.items() if name not in ("blend", "blend_grad")]
+    left = LITEGS - sum(max(stage.issue, stage.memory) for stage in beside) + saved
+    instructions = max(left, 0) * gpu.issued / frame["walked"]
+    return "\n\n".join(
+        (
+            fill(
+                f"A step of the largest frame on an {GPU}: **{whole.both:.1f} ms** (wanted: at most {WANTED}), as if "
+                f"nothing hid behind anything; {before.both:.1f} ms at {BEGAN['commit']} in its default shape, "
+                f"{BEGAN['shape']}, under the same constants. The picture of 1080p: **{1000 / shown.both:.0f} a "
+                f"second** (wanted: at least {FRAMES_WANTED}).",
+                LETTERS,
+            ),
+            fill(
+                f"LiteGS takes {LITEGS:.1f} ms a step there, mean of trainings that end at 1 M Gaussians. For as much "
+                "of this frame, memory and instructions would have to hide each other in each stage, rows of Gaussians "
+                f"that are not visible to stay as they are ({saved:.1f} ms), and blending with its gradient to take "
+                f"{left:.1f} ms: {instructions:.0f} instructions of a warp for a pair in place of {pair:.0f}.",
+                LETTERS,
+            ),
+        )
+    )
+
+
+def device_table(predictions: Predictions, frames: Sequence[str], picture: str) -> str:
+    """Milliseconds of a step on every GPU: of the largest frame in every shape, of the others in one; and pictures a
+    second."""
     *smaller, largest = frames
     shapes = sorted({shape for shape, _, _ in predictions}, key=lambda shape: int(shape.partition("x")[2]))
     columns = [(SHAPE, frame) for frame in smaller] + [(shape, largest) for shape in shapes]
-    lines = [["GPU", *(f"{frame}, {shape}" for shape, frame in columns)]]
+    lines = [["GPU", *(f"{frame}, {shape}" for shape, frame in columns), f"1080p a second, {SHAPE}"]]
     for gpu in GPUS:
         sums = [sum(predictions[shape, gpu.name, frame].values(), Stage()) for shape, frame in columns]
-        lines.append([gpu.name, *(f"{each.issue:.1f} + {each.memory:.1f}" for each in sums)])
+        drawn = sum(predictions[SHAPE, gpu.name, picture].values(), Stage())
+        cells = (f"{each.issue:.1f} + {each.memory:.1f}" for each in sums)
+        lines.append([gpu.name, *cells, f"{1000 / drawn.both:.0f}"])
     return markdown(lines)
 
 
@@ -149,26 +235,23 @@ def write_page(
     rows: Sequence[Any], intel: Sequence[IntelBuilt], predictions: Predictions, frames: Sequence[Mapping[str, Any]]
 ) -> None:
     """Write the tables into the page, and the plot beside it. intel: empty leaves Intel's table as it is."""
-    names = [frame["name"] for frame in frames]
-    largest = names[-1]
+    trained = [frame for frame in frames if not frame.get("picture")]
+    names, largest = [frame["name"] for frame in trained], trained[-1]["name"]
+    picture = next(frame["name"] for frame in frames if frame.get("picture"))
     tables = {
         "kernels": kernel_table(rows),
         "pairs": pair_table(rows),
         "frames": frame_table(frames),
         "stages": stage_table(predictions, largest),
-        "steps": device_table(predictions, names),
+        "goals": goals(rows, predictions, trained[-1], picture),
+        "steps": device_table(predictions, names, picture),
         "devices": gpu_table(),
     }
     if intel:
         tables["intel"] = intel_table(intel)
     atomic_write(PAGE, fill_in(PAGE.read_text("utf-8"), tables).encode())
-    bars = {gpu.name: _parts(predictions[SHAPE, gpu.name, largest]) for gpu in GPUS}
+    bars = {
+        gpu.name: {part: stage.both for part, stage in parts_of(predictions[SHAPE, gpu.name, largest]).items()}
+        for gpu in GPUS
+    }
     plot_stacks(PLOT, bars, f"A training step, {largest}, {SHAPE}: predicted", "ms: issue and memory added up")
-
-
-def _parts(stages: Mapping[str, Stage]) -> dict[str, float]:
-    known = {stage: part for part, members in PARTS.items() for stage in members}
-    sums = dict.fromkeys(PARTS, 0.0)
-    for name, stage in stages.items():
-        sums[known.get(name, "other")] += stage.both
-    return sums

@@ -11,10 +11,11 @@ The kernels are those of a training step, with the defines that the package give
 every kernel, as `check_memory.py` builds them. clang 19 makes NVIDIA's and AMD's assembly of them; NVIDIA's is
 assembled by ptxas, of a package that pip fetches once into the cache folder. Division and sqrt are rounded correctly.
 
-Instructions for a pair of a tile and a Gaussian are those of all waves of a group, from the loops of `gpu_loops.py`.
+Instructions for a pair of a tile and a Gaussian are those of all waves of a group, from its loops (`gpu_rules.py`).
 --intel has a table of Intel's own compiler, which says less (`gpu_intel.py`). --check holds the ceilings below; --page
 writes docs/gpu-static.md, with the times that `gpu_model.py` predicts. Exit status 0: as expected, 1: a ceiling is
-broken, or a loop is not known, or a compiler refuses a kernel, 2: a compiler is missing.
+broken, or a loop or a rule is without the other, or a compiler
+refuses a kernel, 2: a compiler is missing.
 """
 
 from __future__ import annotations
@@ -37,9 +38,10 @@ from gpu_assembly import CLASSES
 from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, clang, compile_source, nvidia
 from gpu_devices import ARCHITECTURES, GPUS, occupancy
 from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
-from gpu_loops import BY_PAIR, Run, UnknownLoopError, by_pair, loop_table
+from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
 from gpu_model import Stage, predict
 from gpu_page import write_page
+from gpu_rules import BY_PAIR, Rule, Run
 from measuring import reporting, require
 
 from clsplat.progress import aligned
@@ -58,13 +60,14 @@ MOST_A_PAIR = {"blend": 350, "blend_grad": 950}
 @dataclass(frozen=True)
 class Row:
     """A kernel of a file, for a target and shape. pair: instructions for a pair by class, or None where it is not
-    counted so; unknown: the reason, where there should be a number."""
+    counted so; rules: those that its loops have; unknown: the reason, where there is no rule for one."""
 
     source: Source
     built: Built
     items: int
     more_shared: int
     pair: Counter[str] | None
+    rules: frozenset[Rule] = frozenset()
     unknown: str = ""
 
     @property
@@ -137,13 +140,15 @@ def compiled(
 def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
     """The row of a kernel; launch: items of a group and shared memory, if it is known to be launched."""
     items, more_shared = launch or (source.items if built.kernel in BY_PAIR else 64, 0)
-    pair, unknown = None, ""
-    if built.kernel in BY_PAIR:
+    pair, rules, unknown = None, frozenset[Rule](), ""
+    if launch or built.kernel in BY_PAIR:
+        run = Run(source.items, ARCHITECTURES[built.target].wave)
         try:
-            pair = by_pair(built, source.lines, Run(source.items, ARCHITECTURES[built.target].wave))
+            rules = cost_of(built, source.lines, rules_of(built.kernel), run).rules
+            pair = by_pair(built, source.lines, run) if built.kernel in BY_PAIR else None
         except UnknownLoopError as error:
             unknown = str(error)
-    return Row(source, built, items, more_shared, pair, unknown)
+    return Row(source, built, items, more_shared, pair, rules, unknown)
 
 
 def table(rows: Sequence[Row]) -> list[str]:
@@ -204,11 +209,10 @@ def broken(rows: Sequence[Row]) -> list[str]:
         if stem in bare and (built.stack or built.spills):
             found.append(f"{where}: {built.stack} bytes of stack and {built.spills} of spills, expected none")
         most = MOST_A_PAIR.get(built.kernel)
-        if most is not None and built.target.startswith("sm_"):
-            if row.unknown:
-                found.append(row.unknown)
-            elif row.a_pair is not None and row.a_pair > most:
-                found.append(f"{where}: {row.a_pair:.0f} instructions of a warp for a pair, expected at most {most}")
+        if most is not None and built.target.startswith("sm_") and row.a_pair is not None and row.a_pair > most:
+            found.append(f"{where}: {row.a_pair:.0f} instructions of a warp for a pair, expected at most {most}")
+        if row.unknown:
+            found.append(row.unknown)
     stems = {row.source.stem for row in rows}
     found += [
         f"{stem}: no kernel file of a step; NO_STACK in gpu_static.py is to follow"
@@ -235,6 +239,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once")
     options = parser.parse_args(arguments)
     frames = json.loads(FRAMES.read_text())["frames"]
+    trained = [frame for frame in frames if not frame.get("picture")]
     if options.page:
         return make_page(frames, options.jobs)
     shapes = [CHECKED[0]] if options.check else options.shapes.split(",")
@@ -244,11 +249,9 @@ def run(arguments: list[str]) -> int:
     for target in targets:
         require(target in TARGETS, f"--targets {target}: expected one of {', '.join(TARGETS)}")
     wanted = options.stems.split(",") if options.stems else []
-    if options.check:
-        wanted = [*NO_STACK]
     rows: list[Row] = []
     for shape in shapes:
-        asked = ask_package("all", shape) if options.all else ask_package("step", shape, frames[-1:])[0]
+        asked = ask_package("all", shape) if options.all else ask_package("step", shape, trained[-1:])[0]
         sources = {
             source: kernels for source, kernels in sources_of(asked).items() if not wanted or source.stem in wanted
         }
@@ -277,20 +280,22 @@ def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
     """Count and predict everything, and write the page."""
     rows: list[Row] = []
     sources_for_intel: list[Source] = []
-    unknown: set[str] = set()
+    used: dict[str, set[Rule]] = {}
     predictions: dict[tuple[str, str, str], dict[str, Stage]] = {}
     for shape in SHAPES:
         steps = ask_package("step", shape, frames)
         sources = sources_of(launch for step in steps for launch in step)
         found = compiled(sources, TARGETS, jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
         rows += found
+        for row in found:
+            used.setdefault(row.built.kernel, set()).update(row.rules)
         sources_for_intel += [source for source in sources if source.stem in NO_STACK]
         for gpu in GPUS:
             built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
             for frame, step in zip(frames, steps, strict=True):
-                predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu, unknown.add)
-    for text in sorted(unknown):
-        note(text)
+                predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
+    if unused := unused_rules(used):
+        raise UnknownLoopError("; ".join(unused))
     intel = compiled_for_intel(sources_for_intel, jobs, note) if ocloc() else []
     write_page(rows, intel, predictions, frames)
     return 0

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Builds and launches of kernels as the package itself asks for them, noted in a child process for `gpu_static.py`.
 
-    gpu_variants.py step LANESxITEMS FRAME...    a training step of frames of these counts, in JSON
+    gpu_variants.py step LANESxITEMS FRAME...    a training step of frames of these counts, in JSON, or a picture alone
     gpu_variants.py all LANESxITEMS              every kernel: what `memory_workload.py` runs
 
 A step is not made: nothing is built, put on a queue or kept in memory, and the numbers that it reads back are the
@@ -106,6 +106,7 @@ class Rehearsed:
             del device, wait
             memory = sum(value.size for value in values if isinstance(value, cl.LocalMemory))
             entry = {"kernel": kernel.name, **noted(kernel.variant), "size": size, "local": local, "shared": memory}
+            entry["scalars"] = [float(value) for value in values if isinstance(value, (int, float, np.number))]
             rehearsed.launches.append(entry)
 
         def add(recorder: profile.Recorder, name: str, event: object, nbytes: int) -> None:
@@ -150,7 +151,8 @@ class Rehearsed:
 
 
 def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The launches of a training step of this frame, copies among them, each with its stage and bytes."""
+    """The launches of a training step of this frame, or with `picture` of its forward pass, copies among them, each
+    with its stage and bytes."""
     rehearsed = Rehearsed(frame)
     rehearsed.install()
     device = Device(all_devices()[0], shape).with_memory_limit(MEMORY)
@@ -161,10 +163,15 @@ def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
     gaussians = Gaussians(*(np.zeros((count, *group), np.float32) for group in groups))
     photograph = np.zeros((height, width, 3), np.uint8)
     trainer = trainer_of(Subject("rehearsed", gaussians, camera, photograph), device, RasterizerConfig())
-    trainer.train_step()  # the first makes what later ones find
+
+    def forward() -> None:
+        trainer.rasterizer.forward(trainer.parameters, camera, np.zeros(3, np.float32), backward=False)
+
+    work = forward if frame.get("picture") else trainer.train_step
+    work()  # the first makes what later ones find
     rehearsed.launches.clear()
     device.recorder.on = trainer.device.recorder.on = True
-    trainer.train_step()
+    work()
     device.recorder.on = False
     return rehearsed.launches
 
