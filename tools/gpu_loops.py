@@ -117,6 +117,11 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule("for (int i = 1; i < ITEMS / 4; ++i)", lambda run: run.items / 4 / run.together, mark=("shared", 1)),
         Rule("for (int i = 1; i < ITEMS / 4; ++i)", lambda run: 1 / run.waves, part=True),
         Rule("return (sum.x + sum.y)", lambda run: 1 / run.waves, part=True),
+        Rule("for (int k = ITEM; k < TILE * TILE; k += ITEMS)", lambda run: 0),
+        Rule("for (int turn = last", lambda run: 1 / run.items),
+        Rule("for (int round = 0; round < ITEMS; ++round)", lambda run: 1),
+        Rule("slot[field] = sums[field];", lambda run: 1 / run.waves, part=True),
+        Rule("const Staged s = staged[ITEM];", lambda run: 1 / run.waves, part=True),
         Rule("for (int k = 0; k < OWNED; ++k)", lambda run: 0),
     ),
 }

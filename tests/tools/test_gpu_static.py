@@ -20,7 +20,7 @@ from gpu_devices import Gpu, occupancy, waves_at_a_time
 from gpu_intel import read_intel
 from gpu_loops import BY_PAIR, Rule, Run, UnknownLoopError, cost_of
 from gpu_model import predict
-from gpu_static import FRAMES, MOST_A_PAIR, NO_STACK, Row, broken, sources_of
+from gpu_static import FRAMES, MOST_A_PAIR, MOST_BY_GAUSSIAN, NO_STACK, Row, broken, sources_of
 
 from clsplat.errors import ClsplatError
 
@@ -257,9 +257,11 @@ def test_occupancy_on_ada(registers: int, shared: int, items: int, waves: int, b
     assert occupancy(kernel, items) == waves / 48
 
 
-def row(stem: str = "blend", pair: float | None = None, unknown: str = "", **changes: Any) -> Row:
+def row(
+    stem: str = "blend", pair: float | None = None, unknown: str = "", more: tuple[str, ...] = (), **changes: Any
+) -> Row:
     counts = None if pair is None else Counter(fp32=pair)
-    source = Source(stem, ("-DITEMS=64", "-DLANES=1"))
+    source = Source(stem, ("-DITEMS=64", "-DLANES=1", *more))
     return Row(source, built(kernel=stem, **changes), 64, 0, counts, unknown)  # type: ignore[arg-type]
 
 
@@ -268,6 +270,8 @@ def test_ceilings() -> None:
     assert broken(good) == []
     (told,) = broken([*good, row("blend_grad", MOST_A_PAIR["blend_grad"] + 1)])
     assert told == "blend_grad, 1x64, sm_89: 951 instructions of a warp for a pair, expected at most 950"
+    (told,) = broken([*good, row("blend_grad", MOST_BY_GAUSSIAN + 1, more=("-DBY_GAUSSIAN",))])
+    assert told.endswith("501 instructions of a warp for a pair, expected at most 500")
     (told,) = broken([*good, row("sort_radix", stack=8)])
     assert told == "sort_radix, 1x64, sm_89: 8 bytes of stack and 0 of spills, expected none"
     assert broken([*good, row("project_grad", stack=8, target="gfx1100")]) == []
