@@ -2,7 +2,8 @@
 //
 // Owner: A group owns a tile and writes one slot for each of its pairs, at a place of its own: no atomics on global
 //   memory.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's. An item has pixels; with
+//   BY_GAUSSIAN it has one Gaussian after the other.
 // Buffers: blend's, its transmittance and stops, image_gradient (3, height, width): of the loss by colour,
 //   slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE), every one of them: sums over the tile's pixels in blend's
 //   whitened units (49).
