@@ -158,7 +158,7 @@ class Device:
         self.rehearsal.built(variant, salt)
         return Kernels(variant, program)
 
-    def with_shape(self, label: str = "", **changes: int) -> Device:
+    def with_shape(self, label: str = "", **changes: Any) -> Device:
         """A device like this with another shape, by its label or by lanes, items and chunks."""
         shape = self.shape.relabelled(label) if label else self.shape
         if changes:
