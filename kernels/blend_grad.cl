@@ -2,7 +2,8 @@
 //
 // Owner: A group owns a tile and writes one slot for each of its pairs, at a place of its own: no atomics on global
 //   memory.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's. An item has pixels; with
+//   BY_GAUSSIAN it has one Gaussian after the other.
 // Buffers: blend's, its transmittance and stops, image_gradient (3, height, width): of the loss by colour,
 //   slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE), every one of them: sums over the tile's pixels in blend's
 //   whitened units (49).
@@ -122,7 +123,9 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
   }
 #endif
 
-#if ITEMS > 1
+#ifdef BY_GAUSSIAN
+#include "shared/walk.h"
+#elif ITEMS > 1
 // Pairs whose sums over the group's items are made together: each item leaves its part of a field in a row, and then
 // an item adds up a row, in an order that no driver changes. A row is padded so that rows begin in banks of their own.
 #define TOGETHER (ITEMS < 256 ? 3 : 1)
@@ -146,9 +149,29 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 #endif
 ) {
   TILE_OF_GROUP
+  int last = begin;
+#ifdef BY_GAUSSIAN
+  __local Passing passing[TILE * TILE];
+  __local Fixed fixed[TILE * TILE];
+  for (int k = ITEM; k < TILE * TILE; k += ITEMS) {
+    const int x = k % TILE, y = k / TILE;
+    const size_t pixel = stride * (tile_y + y) + tile_x + x;
+    const int stop = stops[pixel];
+    float t = 0.0f;
+    Fixed f = {0.0f, 0.0f, 0.0f, as_float(stop)};
+    if (stop >= 0) { // in padding nobody has written a gradient
+      t = transmittance[pixel];
+      f.x = image_gradient[pixel];
+      f.y = image_gradient[plane + pixel];
+      f.z = image_gradient[2 * plane + pixel];
+    }
+    passing[PLACE(x, y)] = (Passing)(t, t * (f.x * background[0] + f.y * background[1] + f.z * background[2]));
+    fixed[PLACE(x, y)] = f;
+    last = max(last, stop);
+  }
+#else
   PIXEL_TABLES
   Pixels pixels[OWNED];
-  int last = begin;
   Open live = 0; // cells with a pixel that has a gradient
   ALL_CELLS(cell) {
     const size_t pixel = CELL_IN_PLANE(cell);
@@ -166,6 +189,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     last = max(last, maxL(stop));
     if (ANYL((red != 0.0f) | (green != 0.0f) | (blue != 0.0f))) OPEN_CELL(live, cell);
   }
+#endif
   RAISE_TO_GROUP_MAX(last)
 #ifdef NO_LAST_CONTRIBUTOR // RasterizerConfig.last_contributor: begin at the end of the list, to no effect
   last = end;
@@ -209,6 +233,32 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 #ifdef CONTRIBUTIONS
     slot[SLOT_WEIGHT] = sumL(sums[SLOT_WEIGHT]);
 #endif
+  }
+#elif defined(BY_GAUSSIAN)
+  __local Staged staged[ITEMS]; // by an item for itself, all at once
+  float sums[SLOT_STRIDE];
+  for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
+  Walker walker = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, begin - 1, 0, 0};
+  for (int turn = last; turn > (last > begin ? begin - ITEMS : begin); turn -= ITEMS) { // the last one has no new pairs
+    const int next = max(turn - 1 - ITEM, begin);
+    stage(staged + ITEM, gaussian_from_sorted[next], slot_from_sorted[next], splats, tile_x, tile_y);
+    for (int round = 0; round < ITEMS; ++round) {
+      if (round == ITEM) {
+        if (walker.i >= begin) {
+          __global float *slot = slots + (size_t)SLOT_STRIDE * walker.slot;
+          for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = sums[field];
+        }
+        const Staged s = staged[ITEM];
+        const int i = turn - 1 - ITEM;
+        const Walker w = {
+            s.mx, s.my, s.l11, s.l12, s.l22, s.log2o, s.red, s.green, s.blue, i, i >= begin ? s.blocks : 0, s.slot};
+        walker = w;
+        for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
+      }
+      const int chunk = (round - ITEM) & (ITEMS - 1);
+      if (walker.blocks >> CHUNK_BLOCK(chunk) & 1) take_chunk(&walker, chunk, passing, fixed, sums);
+      BARRIER_LOCAL();
+    }
   }
 #else
   __local Staged staged[BATCH];

@@ -83,11 +83,16 @@ def default_device() -> Device:
 SHAPED = [(index, shape) for index in KEPT for shape in shapes_of(open_device(str(index)))]
 
 
-@pytest.fixture(scope="session", params=SHAPED, ids=lambda of: f"{of[1][0]}x{of[1][1]}-{label(of[0])}")
+def _shaped_label(parameter: tuple[int, tuple[int, ...]]) -> str:
+    index, (lanes, items, *by_gaussian) = parameter
+    return f"{lanes}x{items}{'g' if by_gaussian else ''}-{label(index)}"
+
+
+@pytest.fixture(scope="session", params=SHAPED, ids=_shaped_label)
 def shaped_device(request: pytest.FixtureRequest) -> Device:
     """Each driver in kernel shapes."""
-    index, (lanes, items) = request.param
-    return shaped(open_device(str(index)), lanes, items)
+    index, shape = request.param
+    return shaped(open_device(str(index)), *shape)
 
 
 @pytest.fixture(scope="session")

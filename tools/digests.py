@@ -38,8 +38,8 @@ sys.path[:0] = [str(ROOT / part) for part in ("tests/support", "tools", ".")]
 import numpy as np  # noqa: E402
 from processor import processor  # noqa: E402
 
-SHAPES = ("8x1", "16x1", "1x1", "1x32", "1x64", "1x128", "1x256")
-"""Lanes x items; the first is what the others are compared with."""
+SHAPES = ("8x1", "16x1", "1x1", "1x32", "1x64", "1x128", "1x256", "1x32g", "1x64g")
+"""Lanes x items, `g` for a gradient by Gaussian; the first is what the others are compared with."""
 METHODS = {"loops": ("8x1", "1x64"), "loopvec": ("1x64",), "cbs": ("1x64",)}
 """POCL_WORK_GROUP_METHOD, beside the one that PoCL takes by itself, and shapes."""
 UNKNOWN_METHOD = "Unknown work group generation method"
@@ -218,9 +218,8 @@ def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
 
     from clsplat.device.context import Device, all_devices
 
-    lanes, items = map(int, shape.split("x"))
     found = next(d for d in all_devices() if d.platform.name == "rusticl") if index < 0 else all_devices()[index]
-    device = Device(found).with_shape(lanes=lanes, items=items)
+    device = Device(found).with_shape(shape)
     if scene == Path("open"):
         Device(found).kernels("probe")  # in the driver's own shape, whose vectors are probed by a launch
         return

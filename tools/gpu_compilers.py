@@ -66,6 +66,16 @@ class Source:
         return next(int(each.partition("=")[2]) for each in self.options if each.startswith("-DITEMS="))
 
     @property
+    def by_gaussian(self) -> bool:
+        """True for the gradient of blending in which an item has a Gaussian."""
+        return "-DBY_GAUSSIAN" in self.options or "-DBY_GAUSSIAN=1" in self.options
+
+    @property
+    def shape(self) -> str:
+        """The kernels' shape, as CLSPLAT_SHAPE has it."""
+        return f"1x{self.items}{'g' if self.by_gaussian else ''}"
+
+    @property
     def label(self) -> str:
         """The stem, with the defines beside the shape."""
         shape = ("-DITEMS=", "-DLANES=", "-cl")

@@ -121,9 +121,8 @@ def _share(loop: Loop, lines: Sequence[str], parts: Sequence[Rule], run: Run, us
     return counts
 
 
-def by_pair(built: Built, lines: Sequence[str], run: Run) -> Counter[str]:
-    """Instructions by class, of all waves of a group, for a pair. Raises UnknownLoopError."""
-    cost = cost_of(built, lines, BY_PAIR[built.kernel], run)
+def by_pair(cost: Cost, run: Run) -> Counter[str]:
+    """Instructions by class, of all waves of a group, for a pair."""
     counts: Counter[str] = Counter()
     for kind in CLASSES:
         counts[kind] = cost.rounds[kind] * run.waves

@@ -74,18 +74,18 @@ def kernel_table(rows: Sequence[Any]) -> str:
 
 def pair_table(rows: Sequence[Any]) -> str:
     """Instructions a pair, by shape and target, of the two kernels."""
-    found = {(row.built.kernel, row.built.target, row.source.items): row for row in rows if row.pair or row.unknown}
+    found = {(row.built.kernel, row.built.target, row.source.shape): row for row in rows if row.pair or row.unknown}
     targets = list(dict.fromkeys(target for _, target, _ in found))
     lines = [["kernel", "shape", *targets]]
     for kernel in ("blend", "blend_grad"):
-        for items in sorted({items for _, _, items in found}):
+        for shape in dict.fromkeys(shape for name, _, shape in found if name == kernel):
             cells = []
             for target in targets:
-                row = found.get((kernel, target, items))
+                row = found.get((kernel, target, shape))
                 number = "unknown" if row is None or row.a_pair is None else f"{row.a_pair:.0f}"
                 stack = row.built.stack + row.built.spills if row else 0
                 cells.append(f"{number}, {stack} B" if stack else number)
-            lines.append([f"`{kernel}`", f"1x{items}", *cells])
+            lines.append([f"`{kernel}`", shape, *cells])
     return markdown(lines)
 
 
@@ -158,7 +158,7 @@ def goals(rows: Sequence[Any], predictions: Predictions, frame: Mapping[str, Any
     gpu = _gpu(GPU)
     stages, drawn = (predictions[SHAPE, GPU, name] for name in (frame["name"], picture))
     whole, before, shown = (sum(each.values(), Stage()) for each in (stages, began(), drawn))
-    shown_rows = [row for row in rows if (row.built.target, f"1x{row.source.items}") == (TARGET, SHAPE)]
+    shown_rows = [row for row in rows if (row.built.target, row.source.shape) == (TARGET, SHAPE)]
     pair = sum({row.built.kernel: row.a_pair for row in shown_rows if row.a_pair}.values())
     hidden = frame["gaussians"] - frame["visible"]
     saved = hidden * 4 * 6 * floats_of((frame["sh_degree"] + 1) ** 2) / gpu.gb * 1e-6

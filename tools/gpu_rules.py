@@ -151,6 +151,16 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
     ),
 }
 """Kernels that a group runs for a tile: rounds for a pair in each of the group's waves."""
+WALK: tuple[Rule, ...] = (
+    Rule("for (int i = last + (int)get_local_id(0); i < end; i += ITEMS)", lambda run: 0),  # pairs beyond
+    Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
+    Rule("for (int k = ITEM; k < TILE * TILE; k += ITEMS)", lambda run: 0),  # once a tile
+    Rule("for (int turn = last", lambda run: 1 / run.items),
+    Rule("for (int round = 0; round < ITEMS; ++round)", lambda run: 1),
+    Rule("slot[field] = sums[field];", lambda run: 1 / run.waves, part=True),
+    Rule("const Staged s = staged[ITEM];", lambda run: 1 / run.waves, part=True),
+)
+"""The same of `blend_grad` where an item has a Gaussian."""
 
 
 def _of_item(run: Run) -> float:

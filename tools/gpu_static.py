@@ -41,20 +41,24 @@ from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
 from gpu_model import Stage, predict
 from gpu_page import write_page
-from gpu_rules import BY_PAIR, Rule, Run
+from gpu_rules import BY_PAIR, WALK, Rule, Run
 from measuring import reporting, require
 
 from clsplat.progress import aligned
 
 SHAPES = ("1x32", "1x64", "1x128", "1x256")
+WALKS = ("1x32g", "1x64g")
+"""Shapes with another form of blending's gradient alone."""
 FRAMES = Path(__file__).with_name("gpu_frames.json")
-CHECKED = ("1x64", ("sm_89", "gfx1100"))
+CHECKED = (("1x64", "1x32g"), ("sm_89", "gfx1100"))
 NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
 """Kernel files of which nothing may lie in stack memory or be spilled, on sm_89."""
 NO_SCRATCH = ("blend", "blend_grad")
 """The same on gfx1100."""
 MOST_A_PAIR = {"blend": 350, "blend_grad": 950}
 """Instructions of a warp for a pair, at most, on sm_89."""
+MOST_BY_GAUSSIAN = 500
+"""The same of blend_grad by Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ class Row:
             "kernel": built.kernel,
             "source": self.source.label,
             "target": built.target,
-            "shape": f"1x{self.source.items}",
+            "shape": self.source.shape,
             "group": self.items,
             "registers": built.registers,
             "spills": built.spills,
@@ -144,8 +148,8 @@ def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
     if launch or built.kernel in BY_PAIR:
         run = Run(source.items, ARCHITECTURES[built.target].wave)
         try:
-            rules = cost_of(built, source.lines, rules_of(built.kernel), run).rules
-            pair = by_pair(built, source.lines, run) if built.kernel in BY_PAIR else None
+            cost = cost_of(built, source.lines, WALK if source.by_gaussian else rules_of(built.kernel), run)
+            rules, pair = cost.rules, by_pair(cost, run) if built.kernel in BY_PAIR else None
         except UnknownLoopError as error:
             unknown = str(error)
     return Row(source, built, items, more_shared, pair, rules, unknown)
@@ -189,7 +193,7 @@ def loops_of(rows: Sequence[Row]) -> list[str]:
     """The loops of each row, as a tree."""
     lines = []
     for row in rows:
-        lines.append(f"{row.source.label}: {row.built.kernel}, 1x{row.source.items}, {row.built.target}")
+        lines.append(f"{row.source.label}: {row.built.kernel}, {row.source.shape}, {row.built.target}")
         for depth, title, counts in loop_table(row.built, row.source.lines):
             kinds = ", ".join(f"{counts[kind]} {kind}" for kind in CLASSES if counts[kind])
             lines.append(f"{'  ' * (depth + 1)}{title}: {kinds}")
@@ -204,11 +208,11 @@ def broken(rows: Sequence[Row]) -> list[str]:
     found = []
     for row in rows:
         built, stem = row.built, row.source.stem
-        where = f"{built.kernel}, 1x{row.source.items}, {built.target}"
+        where = f"{built.kernel}, {row.source.shape}, {built.target}"
         bare = NO_STACK if built.target.startswith("sm_") else NO_SCRATCH
         if stem in bare and (built.stack or built.spills):
             found.append(f"{where}: {built.stack} bytes of stack and {built.spills} of spills, expected none")
-        most = MOST_A_PAIR.get(built.kernel)
+        most = MOST_BY_GAUSSIAN if row.source.by_gaussian else MOST_A_PAIR.get(built.kernel)
         if most is not None and built.target.startswith("sm_") and row.a_pair is not None and row.a_pair > most:
             found.append(f"{where}: {row.a_pair:.0f} instructions of a warp for a pair, expected at most {most}")
         if row.unknown:
@@ -242,18 +246,19 @@ def run(arguments: list[str]) -> int:
     trained = [frame for frame in frames if not frame.get("picture")]
     if options.page:
         return make_page(frames, options.jobs)
-    shapes = [CHECKED[0]] if options.check else options.shapes.split(",")
+    shapes = CHECKED[0] if options.check else options.shapes.split(",")
     targets = CHECKED[1] if options.check else TARGETS if options.targets == "all" else options.targets.split(",")
     for shape in shapes:
-        require(shape in SHAPES, f"--shapes {shape}: expected one of {', '.join(SHAPES)}")
+        require(shape in SHAPES + WALKS, f"--shapes {shape}: expected one of {', '.join(SHAPES + WALKS)}")
     for target in targets:
         require(target in TARGETS, f"--targets {target}: expected one of {', '.join(TARGETS)}")
     wanted = options.stems.split(",") if options.stems else []
     rows: list[Row] = []
     for shape in shapes:
         asked = ask_package("all", shape) if options.all else ask_package("step", shape, trained[-1:])[0]
+        stems = ["blend_grad"] if options.check and shape in WALKS else wanted
         sources = {
-            source: kernels for source, kernels in sources_of(asked).items() if not wanted or source.stem in wanted
+            source: kernels for source, kernels in sources_of(asked).items() if not stems or source.stem in stems
         }
         if options.intel:
             built = compiled_for_intel(sources, options.jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
@@ -294,6 +299,10 @@ def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
             built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
             for frame, step in zip(frames, steps, strict=True):
                 predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
+    for shape in WALKS:
+        sources = sources_of(ask_package("step", shape, frames[-1:])[0])
+        walks = {source: kernels for source, kernels in sources.items() if source.by_gaussian}
+        rows += compiled(walks, TARGETS, jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
     if unused := unused_rules(used):
         raise UnknownLoopError("; ".join(unused))
     intel = compiled_for_intel(sources_for_intel, jobs, note) if ocloc() else []

@@ -198,8 +198,7 @@ def every(shape: Shape) -> list[dict[str, Any]]:
 
 def main(arguments: list[str]) -> int:
     """Print what the arguments ask for."""
-    lanes, items = map(int, arguments[1].split("x"))
-    shape = Shape(lanes, items, chunks=64)
+    shape = Shape(1, 1, chunks=64).relabelled(arguments[1])
     if arguments[0] == "all":
         print(json.dumps(every(shape)))
     else:

@@ -22,6 +22,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import shutil
 import signal
 import subprocess
@@ -166,8 +167,8 @@ def digests(setting: Setting) -> dict[str, Any]:
     """Digests of the self-test's stages that are not those of a CPU. They are stored with the package."""
     stored = json.loads((ROOT / "clsplat" / "selftest" / "digests.json").read_text())["digests"]
     (device,) = selftest(setting)["devices"]
-    lanes, items = (int(word) for word in device["shape"].replace("lanes x", "").replace("items", "").split())
-    label = f"{lanes}x{items}"
+    lanes, items = (int(word) for word in re.findall(r"[0-9]+", device["shape"]))
+    label = f"{lanes}x{items}{'g' if 'by Gaussian' in device['shape'] else ''}"
     wanted = {name: value.get(label) if isinstance(value, dict) else value for name, value in stored.items()}
     return {"shape": label, "other": sorted(name for name, value in device["digests"].items() if value != wanted[name])}
 

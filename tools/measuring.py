@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.device.context import Device
+from clsplat.device.shapes import Shape
 from clsplat.errors import ClsplatError, InputError
 
 Result = dict[str, Any]
@@ -54,7 +55,7 @@ def machine(device: Device, repeat: int) -> Result:
     return {
         "device": device.name,
         "driver": device.driver,
-        "shape": {"lanes": device.shape.lanes, "items": device.shape.items},
+        "shape": {name: getattr(device.shape, name) for name in ("lanes", "items", "by_gaussian")},
         "repeat": repeat,
         "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     }
@@ -63,7 +64,7 @@ def machine(device: Device, repeat: int) -> Result:
 def heading(result: Result) -> str:
     """`machine` in a line."""
     load = f"load average {result['load_average'] or 0:.1f}"
-    shape = f"{result['shape']['lanes']} lanes x {result['shape']['items']} items"
+    shape = Shape(**result["shape"], chunks=1).words
     driver = result["driver"].split("  ")[0]
     return f"{result['device']}, {driver}, {shape}; medians of {result['repeat']}; {load}"
 

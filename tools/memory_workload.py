@@ -319,14 +319,14 @@ def main(arguments: list[str]) -> int:
     if arguments[0] == "planted":
         planted(Device(device, Shape(lanes=1, items=64, chunks=4)))
         return 0
-    lanes, items = map(int, arguments[0].split("x"))
+    shape = Shape(1, 1, chunks=4).relabelled(arguments[0])
     if "plain" in arguments[1:]:
-        if lanes not in (1, 8):
-            raise SystemExit(f"{lanes} lanes: expected 1 or 8")
-        stand_in(lanes)
-    opened = Device(device, Shape(lanes=lanes, items=items, chunks=4))
+        if shape.lanes not in (1, 8):
+            raise SystemExit(f"{shape.lanes} lanes: expected 1 or 8")
+        stand_in(shape.lanes)
+    opened = Device(device, shape)
     print("probe_fma", flush=True)  # which a device runs before its first kernel, where it has lanes
-    if items == 1:
+    if shape.items == 1:
         opened.kind = "cpu"  # the launches too are then those of a CPU
     for part in (sorts, limits, frames, by_two_launches, rendering, pictures, training):
         part(opened)

@@ -12,7 +12,7 @@ import statistics
 import sys
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -69,7 +69,7 @@ def choose(trials: list[Trial]) -> Shape:
 
 
 def _in_a_process(index: int, shape: Shape) -> float | None:
-    with closing(Child(python_module("clsplat.bench.shapes", str(index), str(shape.lanes), str(shape.items)))) as child:
+    with closing(Child(python_module("clsplat.bench.shapes", str(index), shape.label))) as child:
         try:
             answer = child.receive(patience())
         except TimeoutError:
@@ -96,5 +96,5 @@ def measure(device: Device, workload: tuple[int, int, int] = WORKLOAD, repeat: i
 if __name__ == "__main__":
     end_with_parent()
     chosen = all_devices()[int(sys.argv[1])]
-    shape = replace(default_shape(chosen), lanes=int(sys.argv[2]), items=int(sys.argv[3]))
+    shape = default_shape(chosen).relabelled(sys.argv[2])
     tell(ms=measure(Device(chosen, shape)))

@@ -92,7 +92,7 @@ def bench(
     return {
         "device": device.name,
         "driver": device.driver,
-        "shape": {"lanes": device.shape.lanes, "items": device.shape.items},
+        "shape": {name: getattr(device.shape, name) for name in ("lanes", "items", "by_gaussian")},
         "source": subject.name,
         "rasterizer": asdict(config),
         "gaussians": len(subject.gaussians),

@@ -18,8 +18,9 @@ from clsplat.cli.session import Services
 class Tune(Verb):
     """Find the quickest shape of the kernels for a device by a short trial, and keep it for later runs.
 
-    A shape is how many pixels a kernel works on at once, and how many work-items share a tile. A run that is resumed,
-    or repeated for the same bytes, wants the shape that it had. CLSPLAT_SHAPE=LANESxITEMS overrides what is kept.
+    A shape is how many pixels a kernel works on at once, how many work-items share a tile, and whether they share
+    its pixels or its Gaussians for the gradient. A run that is resumed, or repeated for the same bytes, wants the
+    shape that it had. CLSPLAT_SHAPE=LANESxITEMS overrides what is kept.
     """
 
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
@@ -41,17 +42,16 @@ def run(verb: Tune, _: Services) -> int:
         save_shape(device, None)
         print(f"{info.name} ({info.version.split('  ')[0]}): the default, {default_shape(device)}", file=sys.stderr)
         return 0
-    trials, best = tune(
-        device, info.index, lambda shape: print(f"trying {shape.lanes} lanes x {shape.items} items", file=sys.stderr)
-    )
+    trials, best = tune(device, info.index, lambda shape: print(f"trying {shape.words}", file=sys.stderr))
     if verb.json:
-        records = [{"lanes": trial.shape.lanes, "items": trial.shape.items, "ms": trial.ms} for trial in trials]
+        records = [{**asdict(trial.shape), "ms": trial.ms} for trial in trials]
         document = {"device": info.name, "version": info.version, "best": asdict(best), "trials": records}
         print(json.dumps(document, indent=2))
         return 0
+    width = max(len(trial.shape.words) for trial in trials)
     for trial in trials:
         text = "failed" if trial.ms is None else f"{trial.ms:8.2f} ms"
         mark = "  <- kept" if trial.shape == best else ""
-        print(f"{trial.shape.lanes:2d} lanes x {trial.shape.items:3d} items  {text}{mark}")
+        print(f"{trial.shape.words:{width}}  {text}{mark}")
     print(f"in {saved_path()}", file=sys.stderr)
     return 0

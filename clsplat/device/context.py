@@ -159,9 +159,12 @@ class Device:
         self.rehearsal.built(variant, salt)
         return Kernels(variant, program)
 
-    def with_shape(self, **changes: int) -> Device:
-        """A device like this with another shape."""
-        device = Device(self.cl_device, replace(self.shape, **changes), profile=self.profile)
+    def with_shape(self, label: str = "", **changes: Any) -> Device:
+        """A device like this with another shape, by its label or by lanes, items and chunks."""
+        shape = self.shape.relabelled(label) if label else self.shape
+        if changes:
+            shape = replace(shape, by_gaussian=False)
+        device = Device(self.cl_device, replace(shape, **changes), profile=self.profile)
         device.memory.limit = self.memory.limit
         return device
 

@@ -21,6 +21,8 @@ from clsplat.files import atomic_write, parse_json
 
 LANES = (1, 4, 8, 16)
 """Pixels that a vector can have."""
+WALKS = ((1, 32), (1, 64))
+"""Lanes and items of the shapes that are also there by Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -29,17 +31,32 @@ class Shape:
 
     lanes: pixels per vector in the blend kernels (1 on GPUs); items: work-items per work-group in kernels that
     co-operate (1 on CPUs, where a group is one sequential loop); chunks: pieces that a scan or sort is cut into at
-    `items` == 1.
+    `items` == 1; by_gaussian: an item of blending's gradient has a Gaussian and walks the pixels, not pixels that the
+    Gaussians come to (docs/decisions/0023-a-group-shares-a-tile.md), with 1 lane and items as in WALKS.
     """
 
     lanes: int
     items: int
     chunks: int
+    by_gaussian: bool = False
 
     @property
     def label(self) -> str:
-        """LANESxITEMS, the form that CLSPLAT_SHAPE takes."""
-        return f"{self.lanes}x{self.items}"
+        """LANESxITEMS, and a `g` behind it by Gaussian, the form that CLSPLAT_SHAPE takes."""
+        return f"{self.lanes}x{self.items}{'g' if self.by_gaussian else ''}"
+
+    @property
+    def words(self) -> str:
+        """The label in words."""
+        return f"{self.lanes} lanes x {self.items} items{', by Gaussian' if self.by_gaussian else ''}"
+
+    def relabelled(self, label: str) -> Shape:
+        """A shape like this with another label. Raises ValueError for what is none."""
+        match = re.fullmatch(r"(\d+)x(\d+)(g?)", label.strip())
+        lanes, items, by_gaussian = (int(match[1]), int(match[2]), bool(match[3])) if match else (0, 0, False)
+        if lanes not in LANES or items < 1 or items & (items - 1) or (by_gaussian and (lanes, items) not in WALKS):
+            raise ValueError(f"{label}: no shape")
+        return replace(self, lanes=lanes, items=items, by_gaussian=by_gaussian)
 
     @property
     def digit_bits(self) -> int:
@@ -86,6 +103,7 @@ def candidates(device: cl.Device) -> list[Shape]:
         others = [replace(default, lanes=lanes) for lanes in (16, 8)]
     else:
         others = [replace(default, items=items) for items in (32, 128, 256) if items <= most_items(device)]
+        others += [default.relabelled(f"{lanes}x{items}g") for lanes, items in WALKS if items <= most_items(device)]
     return [default, *(shape for shape in others if shape != default)]
 
 
@@ -93,7 +111,10 @@ def asked_shape() -> str:
     """CLSPLAT_SHAPE, or nothing. Raises DeviceError where that makes no sense."""
     text = os.environ.get("CLSPLAT_SHAPE", "")
     if text and _parsed(text, Shape(1, 1, 1)) is None:
-        raise DeviceError(f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16")
+        raise DeviceError(
+            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16; a g behind "
+            f"{' and '.join(f'{lanes}x{items}' for lanes, items in WALKS)} is for a gradient by Gaussian"
+        )
     return text
 
 
@@ -139,7 +160,7 @@ def shape_text(device: cl.Device) -> str:
         shape, _ = shape_of(device)
     except DeviceError:
         return f"too small for CLSPLAT_SHAPE={asked_shape()}"
-    return f"{shape.lanes} lanes x {shape.items} items"
+    return shape.words
 
 
 def shapes_in_turn(device: cl.Device) -> list[Shape]:
@@ -160,13 +181,10 @@ def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str
 
 
 def _parsed(text: str, default: Shape) -> Shape | None:
-    match = re.fullmatch(r"(\d+)x(\d+)", text.strip())
-    if match is None:
+    try:
+        return default.relabelled(text)
+    except ValueError:
         return None
-    lanes, items = int(match[1]), int(match[2])
-    if lanes not in LANES or items < 1 or items & (items - 1):
-        return None
-    return replace(default, lanes=lanes, items=items)
 
 
 def saved_path() -> Path:

@@ -11,7 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ def stored_digests() -> dict[str, Any]:
 
 def shape_label(device: Device) -> str:
     """Lanes and items as the gradient's sums go."""
-    return f"{device.shape.lanes}x{tile_items(device)}"
+    return replace(device.shape, items=tile_items(device)).label
 
 
 def run(
@@ -105,11 +105,11 @@ def _result(name: str, benches: list[Bench], outcomes: list[Outcome]) -> Result:
     )
 
 
-def _child(index: int, shape: tuple[int, int], stages: Sequence[str], *, quick: bool) -> None:
+def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> None:
     """Build and run on the `index`-th device; a line of JSON for what begins, another for what came of it."""
     end_with_parent()
     tell(begins="opening the device")
-    device = Device(all_devices()[index]).with_shape(lanes=shape[0], items=shape[1])
+    device = Device(all_devices()[index]).with_shape(shape)
     device.rehearsal.say = lambda kernel: tell(begins=kernel)
     try:
         if not quick:
@@ -127,5 +127,5 @@ def _child(index: int, shape: tuple[int, int], stages: Sequence[str], *, quick: 
 
 
 if __name__ == "__main__":
-    which, lanes, items, names, *flags = sys.argv[1:]
-    _child(int(which), (int(lanes), int(items)), names.split(","), quick="quick" in flags)
+    which, label, names, *flags = sys.argv[1:]
+    _child(int(which), label, names.split(","), quick="quick" in flags)

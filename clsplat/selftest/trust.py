@@ -75,7 +75,7 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = STAGES, *, quick: 
     """Test the `index`-th device in a process of its own; stages: in the order of STAGES, FORWARD among them."""
     report = Report(wanted=tuple(stages))
     begun, seconds = "starting", patience()
-    words = [str(index), str(shape.lanes), str(shape.items), ",".join(stages), *(["quick"] if quick else [])]
+    words = [str(index), shape.label, ",".join(stages), *(["quick"] if quick else [])]
     with closing(Child(python_module("clsplat.selftest.child", *words))) as child:
         try:
             while (message := child.receive(seconds)) is not None:
@@ -110,7 +110,7 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
     # where all have failed, the reason may be gone: the one that is wanted is tried anew
     announced = False
     for shape in dict.fromkeys(shapes or [given]):
-        tried = device if shape == given else device.with_shape(lanes=shape.lanes, items=shape.items)
+        tried = device if shape == given else device.with_shape(shape.label)
         if not _has_passed(tried, stages):
             if not announced:
                 print(f"{title(cl_device)}: used for the first time, a short test of its driver", file=sys.stderr)

@@ -143,6 +143,8 @@ def blend_grad(
         return slots
     cells = blended.cells_from_sorted
     defines = {**fields.defines, **({"RECORD_CELLS": True} if cells else {})}
+    if device.shape.by_gaussian:
+        defines["BY_GAUSSIAN"] = True
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
     planes = (image_gradient, blended.transmittance, blended.stops)
     arrays = (*listed, splats, background, *planes, slots, *([cells] if cells else []))

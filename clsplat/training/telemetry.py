@@ -47,7 +47,7 @@ def session(device: Device, step: int) -> dict[str, Any]:
         "device": device.name,
         "driver": device.driver,
         "kind": device.kind,
-        "shape": f"{device.shape.lanes} lanes x {device.shape.items} items",
+        "shape": device.shape.words,
         "memory_limit": device.memory.limit,
         "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "versions": versions,

@@ -78,7 +78,7 @@ def test_the_environment_goes_first(default_device: Device, monkeypatch: pytest.
     assert shape_of(device)[0] == replace(default_shape(device), lanes=1, items=64)
 
 
-@pytest.mark.parametrize("text", ["fast", "8", "3x1", "8x0", "8x3", "8x-1"])
+@pytest.mark.parametrize("text", ["fast", "8", "3x1", "8x0", "8x3", "8x-1", "8x1g", "1x16g", "1x64gg"])
 def test_a_shape_that_makes_no_sense(text: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setenv("CLSPLAT_SHAPE", text)
     assert main(["devices"]) == 2
@@ -92,6 +92,21 @@ def test_a_shape_that_is_too_large_for_the_device(default_device: Device, monkey
     monkeypatch.setenv("CLSPLAT_SHAPE", "1x1048576")
     with pytest.raises(DeviceError, match=r"CLSPLAT_SHAPE=1x1048576: .* has at most [0-9]+ items in a work-group"):
         shape_of(device)
+
+
+def test_a_gradient_by_gaussian_is_a_shape_of_its_own(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = default_device.cl_device
+    walking = replace(default_shape(device), lanes=1, items=32, by_gaussian=True)
+    save_shape(device, walking)
+    assert shape_of(device)[0] == walking and walking.label == "1x32g"
+    assert walking.words == "1 lanes x 32 items, by Gaussian"
+    assert default_device.with_shape("1x32g").with_shape().shape == walking
+    assert not default_device.with_shape("1x32g").with_shape(items=64).shape.by_gaussian
+    monkeypatch.setenv("CLSPLAT_SHAPE", "1x64")
+    assert shape_of(device)[0].label == "1x64"
+    labels = [shape.label for shape in candidates(gpu(1024, 48))]
+    assert labels == ["1x64", "1x32", "1x128", "1x256", "1x32g", "1x64g"]
+    assert [shape.label for shape in candidates(gpu(32, 48))] == ["1x32", "1x32g"]
 
 
 def gpu(items: int, local_kib: int) -> Any:

@@ -12,15 +12,19 @@ from compare import assert_close, assert_close_images, assert_same_bits
 from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 from quick import quick
 
+from clsplat.camera import Camera
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
+from clsplat.device.layout import SlotFields
+from clsplat.gaussians import Gaussians
 from clsplat.reference import render as reference
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import blend_grad
 from clsplat.stages.device_gaussians import upload_gaussians
 
+PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
 
 
@@ -58,8 +62,8 @@ def test_sizes_at_the_seams(shaped_device: Device, size: tuple[int, int]) -> Non
 def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
     scene = scenes.random_cloud(2000, 8, 150, 100)
     frames = [
-        Pipeline.run(shaped(device, lanes, items), scene).frame.blended
-        for lanes, items in shapes_of(device, (1, 256), (4, 1), every=every)
+        Pipeline.run(shaped(device, *shape), scene).frame.blended
+        for shape in shapes_of(device, (1, 256), (4, 1), every=every)
     ]
     for other in frames[1:]:
         assert_same_bits(other.image.get(), frames[0].image.get())
@@ -94,6 +98,49 @@ def test_the_gradient_of_a_group_of_any_size(default_device: Device, items: int)
         # two orders of adding up 256 numbers, sqrt(256) half ulp where nothing cancels, and three Newton steps for a
         # division, an ulp more
         assert np.linalg.norm(got - wanted) <= 2e-6 * np.linalg.norm(wanted), name
+
+
+def stacked(count: int) -> tuple[Gaussians, Camera]:
+    """A tile, and so many thin Gaussians before each other in it."""
+    gaussians, camera = scenes.one(16, 16)
+    arrays = {name: np.repeat(getattr(gaussians, name), count, axis=0) for name in PARAMETERS}
+    shift = np.random.default_rng(count).uniform(-0.1, 0.1, (count, 3))
+    arrays["means"] = (arrays["means"] + shift).astype(np.float32)
+    arrays["opacity_logits"][:] = -3
+    return replace(gaussians, **arrays), camera
+
+
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65, 300])
+def test_the_gradient_by_gaussian(device: Device, count: int) -> None:
+    """An item takes every 32nd pair of a tile's list, and the last ones walk to the end of the tile alone."""
+    scene = stacked(count)
+    d_image = np.random.default_rng(2).standard_normal((16, 16, 3))
+    fields = SlotFields(absolute=True, contributions=True)
+    runs = [Pipeline.run(shaped(device, *shape), scene) for shape in ((1, 1), (1, 32, True), (1, 64, True))]
+    (wanted, wanted_screen), *others = (run.screened(d_image, fields) for run in runs)
+    assert runs[0].frame.part.lists.gaussian_from_sorted.shape == (count,)
+    for got, screen in others:
+        pairs = [(getattr(got, name), getattr(wanted, name)) for name in PARAMETERS]
+        pairs.append((screen.gradients.get(), wanted_screen.gradients.get()))
+        assert screen.contributions is not None and wanted_screen.contributions is not None
+        pairs.append((screen.contributions.get(), wanted_screen.contributions.get()))
+        for a, b in pairs:
+            assert np.linalg.norm(a - b) <= 2e-6 * np.linalg.norm(b)  # as of groups above
+
+
+@pytest.mark.parametrize("switch", ["last_contributor", "gradient_skip", "row_skip", "column_skip", "vector_skip"])
+def test_the_gradient_by_gaussian_has_its_bits_with_every_switch(device: Device, switch: str) -> None:
+    """A pair beyond a pixel's stop, or a block that an ellipse does not reach, adds zeros alone."""
+    slots = []
+    scene, by_gaussian = scenes.random_cloud(900, 8, 75, 50), shaped(device, 1, 32, True)
+    for config in (BenchSwitches(), BenchSwitches(**{switch: False})):  # type: ignore[arg-type]
+        opened = by_gaussian.with_switches(kernel_defines(config))
+        frame = (run := Pipeline.run(opened, scene)).frame
+        values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
+        of = (opened, run.rasterizer.work, frame.part.lists, frame.projected.splats, frame.background, frame.blended)
+        slots.append(blend_grad(*of, upload(opened, values)).get() + np.float32(0))
+    assert_same_bits(slots[0], slots[1])
+    assert slots[0].any()
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.25, 1.0])

@@ -34,19 +34,21 @@ EVERY_SHAPE = pytest.mark.parametrize("every", quick([False, True], False))
 """Of a test of all shapes at once: the quick run has two, as building takes most of the time."""
 
 
-def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[int, int], ...]:
-    """(lanes, items) that a driver is tested in: a CPU's shape, a GPU's; the default driver also in the scalar loop, in
-    a mixture, and in `more`, unless not `every` one is wanted. Each driver in each shape: tools/digests.py."""
-    return (*QUICK_SHAPES, (1, 1), (8, 16), *more) if every and device is open_device() else QUICK_SHAPES
+def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[Any, ...], ...]:
+    """(lanes, items), or (lanes, items, True) by Gaussian, that a driver is tested in: a CPU's shape, a GPU's; the
+    default driver also in the scalar loop, in a mixture, by Gaussian, and in `more`, unless not `every` one is wanted.
+    Each driver in each shape: tools/digests.py."""
+    every = every and device is open_device()
+    return (*QUICK_SHAPES, (1, 1), (8, 16), (1, 32, True), *more) if every else QUICK_SHAPES
 
 
 @cache
-def shaped(device: Device, lanes: int, items: int) -> Device:
+def shaped(device: Device, lanes: int, items: int, by_gaussian: bool = False) -> Device:
     """The device in another shape; one for the whole session, as each builds its own kernels. Skips a test in a shape
     in which the driver would take the process down."""
     if reason := why_not(all_devices().index(device.cl_device), lanes, items):
         pytest.skip(reason)
-    return device.with_shape(lanes=lanes, items=items)
+    return device.with_shape(f"{lanes}x{items}{'g' if by_gaussian else ''}")
 
 
 @dataclass

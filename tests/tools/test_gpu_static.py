@@ -21,8 +21,8 @@ from gpu_devices import Gpu, occupancy, waves_at_a_time
 from gpu_intel import read_intel
 from gpu_loops import UnknownLoopError, cost_of, rules_of, unused_rules
 from gpu_model import Stage, predict
-from gpu_rules import BY_ITEM, BY_PAIR, Rule, Run
-from gpu_static import FRAMES, MOST_A_PAIR, NO_STACK, Row, broken, sources_of
+from gpu_rules import BY_ITEM, BY_PAIR, WALK, Rule, Run
+from gpu_static import FRAMES, MOST_A_PAIR, MOST_BY_GAUSSIAN, NO_STACK, Row, broken, sources_of
 
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import ClsplatError
@@ -282,7 +282,7 @@ def test_rules_that_no_loop_has_are_told() -> None:
 
 def test_rules_are_of_lines_that_kernels_have() -> None:
     texts = {path.stem: kernel_source(path.stem).splitlines() for path in kernel_root().glob("*.cl")}
-    for kernel, rules in {**BY_PAIR, **BY_ITEM}.items():
+    for kernel, rules in [*BY_PAIR.items(), *BY_ITEM.items(), ("blend_grad", WALK)]:
         (lines,) = [text for text in texts.values() if any(re.match(rf"(.* )?{kernel}\(", line) for line in text)]
         for rule in rules:
             assert any(rule.matches(number, lines) for number in range(1, len(lines) + 1)), (kernel, rule.text)
@@ -312,9 +312,11 @@ def test_occupancy_on_ada(registers: int, shared: int, items: int, waves: int, b
     assert occupancy(kernel, items) == waves / 48
 
 
-def row(stem: str = "blend", pair: float | None = None, unknown: str = "", **changes: Any) -> Row:
+def row(
+    stem: str = "blend", pair: float | None = None, unknown: str = "", more: tuple[str, ...] = (), **changes: Any
+) -> Row:
     counts = None if pair is None else Counter(fp32=pair)
-    source = Source(stem, ("-DITEMS=64", "-DLANES=1"))
+    source = Source(stem, ("-DITEMS=64", "-DLANES=1", *more))
     return Row(source, built(kernel=stem, **changes), 64, 0, counts, unknown=unknown)  # type: ignore[arg-type]
 
 
@@ -323,6 +325,8 @@ def test_ceilings() -> None:
     assert broken(good) == []
     (told,) = broken([*good, row("blend_grad", MOST_A_PAIR["blend_grad"] + 1)])
     assert told == "blend_grad, 1x64, sm_89: 951 instructions of a warp for a pair, expected at most 950"
+    (told,) = broken([*good, row("blend_grad", MOST_BY_GAUSSIAN + 1, more=("-DBY_GAUSSIAN",))])
+    assert told.endswith("501 instructions of a warp for a pair, expected at most 500")
     (told,) = broken([*good, row("sort_radix", stack=8)])
     assert told == "sort_radix, 1x64, sm_89: 8 bytes of stack and 0 of spills, expected none"
     assert broken([*good, row("project_grad", stack=8, target="gfx1100")]) == []

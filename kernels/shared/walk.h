@@ -1,0 +1,72 @@
+// The gradient of blending by an item a Gaussian, BY_GAUSSIAN: a group's items walk the pixels of a tile one behind the
+// other, each with a Gaussian and its sums in registers, and hand the pixels' state on in local memory. The pixels are
+// in ITEMS chunks, each a part of a row. In round r of a turn item j is at chunk (r - j) % ITEMS: a chunk meets the
+// Gaussians in their order, an item begins its next Gaussian where it has left the last chunk, and a barrier serves all
+// pixels of a chunk. What is common to a chunk's row is worked out once.
+#if ITEMS < 16 || ITEMS > 128
+#error "a chunk is a row of a tile, or a part of one of two pixels or more"
+#endif
+#define CHUNK (TILE * TILE / ITEMS) // pixels
+#define ROW_CHUNKS (TILE / CHUNK)
+#define CHUNK_BLOCK(chunk) ((chunk) / ROW_CHUNKS / BLOCK_H * BLOCK_COLUMNS + (chunk) % ROW_CHUNKS * CHUNK / BLOCK_W)
+
+// A pixel's place: items that are at chunks beside each other read places beside each other.
+#define PLACE(x, y) ((x) % CHUNK * ITEMS + (y) * ROW_CHUNKS + (x) / CHUNK)
+
+// Pixels in local memory: transmittance and `behind`, which change; the image's gradient and, as bits, the stop.
+typedef float2 Passing;
+typedef float4 Fixed;
+
+// A Gaussian under way. i: its pair, before `begin` where there is none.
+typedef struct {
+  float mx, my, l11, l12, l22, log2o, red, green, blue;
+  int i;
+  uint blocks, slot;
+} Walker;
+
+// Takes the walker's pair out of a chunk's pixels, and adds their gradients to its sums (SLOT_STRIDE). Pixels that do
+// not take it go along with an alpha of 0: of 32 items some have one that does, and branches would keep the pixels of a
+// chunk apart.
+static inline void take_chunk(const Walker *w, int chunk, __local Passing *passing, __local const Fixed *fixed,
+                              float *sums) {
+  const float dy = w->my - (float)(chunk / ROW_CHUNKS), v = w->l22 * dy;
+  const float left = (float)(chunk % ROW_CHUNKS * CHUNK);
+  float g_row = 0.0f, gu_row = 0.0f; // sums of g and g u: v is the row's
+  _Pragma("unroll") for (int k = 0; k < CHUNK; ++k) {
+    const int place = k * ITEMS + chunk;
+    const Fixed pixel = fixed[place];
+    const Passing state = passing[place];
+    const float u = whitened_u(w->l11, w->l12, w->mx - (left + (float)k), dy);
+    const float power = log2_alpha(u, v, w->log2o);
+    const int taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL(w->i < as_int(pixel.w));
+    const float uncapped = as_float(as_int(exp2L(power)) & taken);
+    const float alpha = uncapped < ALPHA_MAX ? uncapped : ALPHA_MAX;
+    const float inverse = INVERSE(1.0f - alpha);
+    const float before = state.x * inverse;
+    const float shade = fmaL(pixel.x, w->red, fmaL(pixel.y, w->green, pixel.z * w->blue));
+    const float weight = alpha * before;
+    const float d_alpha = fmaL(before, shade, -(state.y * inverse));
+    const float g = uncapped < ALPHA_MAX ? alpha * d_alpha : 0.0f;
+    const float gu = g * u;
+    passing[place] = (Passing)(taken ? before : state.x, fmaL(weight, shade, state.y));
+    sums[SLOT_RED] = fmaL(weight, pixel.x, sums[SLOT_RED]);
+    sums[SLOT_GREEN] = fmaL(weight, pixel.y, sums[SLOT_GREEN]);
+    sums[SLOT_BLUE] = fmaL(weight, pixel.z, sums[SLOT_BLUE]);
+    sums[SLOT_GUU] = fmaL(gu, u, sums[SLOT_GUU]);
+    g_row += g;
+    gu_row += gu;
+#ifdef ABSOLUTE_GRADIENTS
+    sums[SLOT_ABSX] += fabs(g * (w->l11 * u));
+    sums[SLOT_ABSY] += fabs(g * fmaL(w->l12, u, w->l22 * v));
+#endif
+#ifdef CONTRIBUTIONS
+    sums[SLOT_WEIGHT] += weight;
+#endif
+  }
+  const float gv_row = v * g_row;
+  sums[SLOT_G] += g_row;
+  sums[SLOT_GU] += gu_row;
+  sums[SLOT_GV] += gv_row;
+  sums[SLOT_GUV] = fmaL(v, gu_row, sums[SLOT_GUV]);
+  sums[SLOT_GVV] = fmaL(v, gv_row, sums[SLOT_GVV]);
+}
