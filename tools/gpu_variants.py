@@ -133,7 +133,8 @@ class Rehearsed:
         buffers._Buffer = _Buffer  # type: ignore[assignment,misc]  # noqa: SLF001
         DeviceArray.read_into = read_into  # type: ignore[assignment,method-assign]
 
-        def begin_get(array: DeviceArray) -> Any:
+        def begin_get(array: DeviceArray, into: object = None) -> Any:
+            del into
             note(array, "read")
             return lambda: np.zeros(array.shape, array.dtype)
 
