@@ -113,7 +113,10 @@ def frames(device: Device) -> None:
 def by_two_launches(device: Device) -> None:
     """Adam by gradients that are in memory, as where a step is looked at: all rows, and those in view."""
     models = [allocate_gaussians(device, 11, 4, zero=True) for _ in range(4)]
-    counts, readback = upload(device, np.arange(11, dtype=np.uint32) % 3), upload(device, np.zeros(len(READBACK), np.uint32))
+    counts, readback = (
+        upload(device, np.arange(11, dtype=np.uint32) % 3),
+        upload(device, np.zeros(len(READBACK), np.uint32)),
+    )
     for sparse in (False, True):
         adam(device, 1, dict.fromkeys(GROUPS, 0.1), OptimiserConfig(sparse=sparse), *models, counts, readback)
     if not all(np.isfinite(models[0][group].get()).all() for group in GROUPS):

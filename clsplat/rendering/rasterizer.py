@@ -114,6 +114,11 @@ class Rasterizer:
             self.work.clear()
         self.capacity = plan.pairs
 
+    @property
+    def takes_room(self) -> bool:
+        """True if a pass may be by capacity: there is memory to spare, and the order by depth is that of Gaussians."""
+        return not self.work.tight and self._switches.depth_sort != "pairs"
+
     def _send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Camera and background on the device, where a background on the host goes up with the camera, in one copy."""
         pack = self._packs.get(camera)
