@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training steps by capacity: launched before the number of their pairs is known, looked at a step later, and done again
-where there were more (docs/decisions/0025-launch-by-capacity.md)."""
+"""Training steps by capacity: launched before the number of their pairs is known, looked at a step later, and made
+again where there were more (docs/decisions/0025-launch-by-capacity.md)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray
