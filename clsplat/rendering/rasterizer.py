@@ -169,7 +169,8 @@ class Rasterizer:
         """Memory on the host for a copy of the counts."""
         if self._arriving is None:
             self._arriving = pinned(self.device, (TURNS, len(READBACK)), np.uint32)
-        return self._arriving[turn]
+        row: NDArray[np.uint32] = self._arriving[turn]
+        return row
 
     def part(self, frame: Frame, band: Band) -> Part:
         """The band with its pairs and lists; where there are several bands it takes the memory of the one before."""
