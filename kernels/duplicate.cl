@@ -102,8 +102,7 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
 // order (visible): by depth -> gaussian_from_rank, counts (visible). BY_CAPACITY: tile_counts (n) of a pass that has
 // stopped become zero, so that statistics see nothing of it.
 __kernel void order_counts(ELEMENTS(visible), __global const uint *order, __global const uint *gaussian_from_visible,
-                           __global uint *tile_counts, __global uint *gaussian_from_rank,
-                           __global uint *counts
+                           __global uint *tile_counts, __global uint *gaussian_from_rank, __global uint *counts
 #ifdef BY_CAPACITY
                            ,
                            const uint n

@@ -13,7 +13,7 @@
 //   loss per unit of each. Rows of Gaussians that are not visible are left as they are. project_step, built with ADAM:
 //   the parameters and their moments `first` and `second`, of the same shapes; `readback` (READBACK_SIZE) counts, and
 //   the scalars are those of Step, one a group where they differ. The gradient of a Gaussian that is not visible is
-//   zero, or with SPARSE its row stays as it is.
+//   zero, or with SPARSE its row stays as it is. After a pass that has stopped (duplicate.cl) nothing changes.
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -150,7 +150,8 @@ def pictures(device: Device) -> None:
 
 
 def training(device: Device) -> None:
-    """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset."""
+    """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset. Some
+    by capacity, of which one has too little."""
     view = camera(20, 17)
     paper = TrainConfig(
         iterations=6,
@@ -176,13 +177,19 @@ def training(device: Device) -> None:
             max_gaussians=60,
         ),
     )
-    for config, channels in ((paper, 3), (wide, 4)):
+    ahead, rooms = replace(paper, iterations=3, warmup=()), iter((0, 2000, 1))
+    for config, channels in ((paper, 3), (wide, 4), (ahead, 3)):
         pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
         if channels == 3:
             pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
         start = cloud(18, view, 5, degree=0)
         trainer = Trainer(scene_of(view, pixels), config, device, start)
+        if config is ahead:
+            trainer.pending.on = True
+            trainer.pending.room = lambda *_: next(rooms)  # type: ignore[method-assign]
         losses = [trainer.train_step().read()[0] for _ in range(config.iterations)]
+        if trainer.pending.redone != (config is ahead):
+            raise SystemExit(f"{trainer.pending.redone} steps were made again")
         if not np.isfinite(losses).all():
             raise SystemExit(f"the training went wrong: losses {losses}")
 

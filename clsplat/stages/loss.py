@@ -55,10 +55,10 @@ def _blocks(device: Device, height: int, stride: int) -> _Blocks:
     return _Blocks(rows, columns, groups, field, partials=groups * LOSS_RING * 3 * field, sums=9 * height * across)
 
 
-def scratch_bytes(device: Device, height: int, stride: int) -> int:
-    """Bytes of the partial derivatives and the partial sums."""
+def scratch_bytes(device: Device, height: int, stride: int, turns: int = 1) -> int:
+    """Bytes of the partial derivatives and, of each turn, the partial sums."""
     blocks = _blocks(device, height, stride)
-    return 4 * (blocks.partials + blocks.sums)
+    return 4 * (blocks.partials + turns * blocks.sums)
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,6 +65,11 @@ class Pending:
         self._frame: Frame | None = None
         self.redone = 0
 
+    @property
+    def turns(self) -> int:
+        """Losses whose sums are kept at a time."""
+        return TURNS if self.on else 1
+
     def forget(self) -> None:
         """Forget all steps: the model is a new one."""
         self._steps.clear()
@@ -100,7 +105,7 @@ class Pending:
             return run(0, None)
         if not room:
             self.settle()
-        turn = self._turn = (self._turn + 1) % TURNS  # of exact ones too: their loss is looked at a step later
+        turn = self._turn = (self._turn + 1) % self.turns  # of exact ones too: their loss is looked at a step later
         before, result = self._watch.last, run(turn, Room(room, turn) if room else None)
         if not room:
             return result

@@ -181,6 +181,7 @@ class Trainer:
             fields=slot_fields(needs),
             agreement=needs.agreement,
             photographs=sum(view.camera.width * view.camera.height for view in self.views),
+            turns=self.pending.turns,
         )
         self.rasterizer.follow(self.plan)
         self.photographs.follow(self.plan.photographs)
