@@ -56,8 +56,8 @@ class Counted:
     in order of Gaussians; visible and pairs: the totals, pairs capped at 2^32 - 1; least_key and key_bits: what every
     depth key has at least, and how many low bits of the rest can be set; refused: what `adam` had counted.
 
-    by_capacity: visible and pairs are only what they are at most; on_device: the READBACK in which kernels find the
-    totals; arriving: a function that waits for its copy, and returns it.
+    Of a pass by capacity visible and pairs are the most that there can be; on_device: the READBACK in which its kernels
+    find the totals; arriving: a function that waits for a copy of that, and returns it.
     """
 
     tile_counts: DeviceArray

@@ -261,7 +261,7 @@ class Trainer:
         return self.pending.room(self.rasterizer, (factor, self.rasterizer), self.parameters.count)
 
     def _begin_again(self) -> None:
-        """What comes before a step that is made again: there is no way back from here."""
+        """Preparation for a step that is made again: there is no way back from here."""
         self.mark = None
         self.mend()
 
