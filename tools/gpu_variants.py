@@ -162,6 +162,7 @@ def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
     gaussians = Gaussians(*(np.zeros((count, *group), np.float32) for group in groups))
     photograph = np.zeros((height, width, 3), np.uint8)
     trainer = trainer_of(Subject("rehearsed", gaussians, camera, photograph), device, RasterizerConfig())
+    trainer.pending.on = False  # launches of as many items as have work, for bytes and times
     trainer.train_step()  # the first makes what later ones find
     rehearsed.launches.clear()
     device.recorder.on = trainer.device.recorder.on = True
