@@ -10,6 +10,7 @@
 // Equations: docs/gradients.md, (47), by shared/tile.h, which project.cl counts with.
 #include "shared/math.h"
 #include "shared/group.h"
+#include "shared/count.h"
 #include "shared/tile.h"
 #include "shared/prefetch.h"
 
@@ -43,11 +44,18 @@ GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const 
 // shown, tile_counts (n), sums (2, groups) -> slots (n): scan of the tile counts; gaussian_from_visible, depth_keys
 // (visible); the first four of readback, zero before: numbers of the visible and of pairs, the complement of the
 // smallest key, the largest. A positive float's bits sort as it does. A group owns a chunk.
+// BY_CAPACITY: a pass stops that has more than `capacity` pairs, or comes after elements that Adam has refused, and so
+// do all that follow, until the host has seen it: they have no visible Gaussians, and no step changes the model.
 GROUP __kernel void compact_visible(const uint n, const uint chunk, __global const uint *shown,
                                     __global const uint *tile_counts, __global const float *splats,
                                     __global const uint *sums, __global uint *slots,
                                     __global uint *gaussian_from_visible, __global uint *depth_keys,
-                                    __global uint *readback) {
+                                    __global uint *readback
+#ifdef BY_CAPACITY
+                                    ,
+                                    const uint capacity
+#endif
+) {
   __local uint scratch[ITEMS], extremes[2];
   if (get_local_id(0) == 0) extremes[0] = extremes[1] = 0;
   BARRIER_LOCAL();
@@ -80,15 +88,31 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   atomic_max(readback + READBACK_KEY_COMPLEMENT, extremes[0]);
   atomic_max(readback + READBACK_LARGEST_KEY, extremes[1]);
   if (group + 1 == groups) {
-    readback[READBACK_VISIBLE] = visible;
-    readback[READBACK_PAIRS] = CAPPED(pairs);
+    int goes_on = 1;
+#ifdef BY_CAPACITY
+    goes_on = pairs <= capacity;
+    for (uint k = READBACK_STOPPED; k < READBACK_SIZE; ++k) goes_on &= readback[k] == 0;
+    readback[READBACK_STOPPED] = !goes_on;
+#endif
+    readback[READBACK_VISIBLE] = goes_on ? visible : 0;
+    readback[READBACK_PAIRS] = goes_on ? CAPPED(pairs) : 0;
   }
 }
 
-// order (visible): by depth -> gaussian_from_rank, counts (visible)
-__kernel void order_counts(const uint visible, __global const uint *order, __global const uint *gaussian_from_visible,
-                           __global const uint *tile_counts, __global uint *gaussian_from_rank, __global uint *counts) {
+// order (visible): by depth -> gaussian_from_rank, counts (visible). BY_CAPACITY: tile_counts (n) of a pass that has
+// stopped become zero, so that statistics see nothing of it.
+__kernel void order_counts(ELEMENTS(visible), __global const uint *order, __global const uint *gaussian_from_visible,
+                           __global uint *tile_counts, __global uint *gaussian_from_rank, __global uint *counts
+#ifdef BY_CAPACITY
+                           ,
+                           const uint n
+#endif
+) {
+  FIND_ELEMENTS(visible)
   const uint rank = get_global_id(0);
+#ifdef BY_CAPACITY
+  if (rank < n && visible_counts[READBACK_STOPPED]) tile_counts[rank] = 0;
+#endif
   if (rank >= visible) return;
   const uint i = gaussian_from_visible[order[rank]];
   gaussian_from_rank[rank] = i;
@@ -135,10 +159,11 @@ __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, co
 // pair_ids (pairs): slot and Gaussian; pairs in order of depth. A Gaussian's slots follow each other, and Gaussians'
 // slots the Gaussians, so that what is summed over slots streams through memory.
 // Only tiles from first_tile to before end_tile, from which keys count.
-__kernel void duplicate(const uint visible, const int tiles_x, const int tiles_y, const int first_tile,
+__kernel void duplicate(ELEMENTS(visible), const int tiles_x, const int tiles_y, const int first_tile,
                         const int end_tile, __global const uint *gaussian_from_rank, __global const uint *offsets,
                         __global const uint *slots, __global const float *splats, __global uint *tile_keys,
                         __global uint2 *pair_ids) {
+  FIND_ELEMENTS(visible)
   const uint rank = get_global_id(0);
   if (rank >= visible) return;
   const uint ahead = gaussian_from_rank[min(rank + AHEAD, visible - 1)];

@@ -13,7 +13,7 @@
 //   loss per unit of each. Rows of Gaussians that are not visible are left as they are. project_step, built with ADAM:
 //   the parameters and their moments `first` and `second`, of the same shapes; `readback` (READBACK_SIZE) counts, and
 //   the scalars are those of Step, one a group where they differ. The gradient of a Gaussian that is not visible is
-//   zero, or with SPARSE its row stays as it is.
+//   zero, or with SPARSE its row stays as it is. After a pass that has stopped (duplicate.cl) nothing changes.
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -341,7 +341,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #if LANES > 1
   // A group of the model's arrays after the other, each in runs that are long enough for a processor to fetch ahead.
   const uint begin = get_global_id(0) * BLOCKS * LANES;
-  if (begin >= n) return;
+  if (begin >= n || readback[READBACK_STOPPED]) return;
   int shown[ROWS];
   const uint blocks = min((n - begin - 1) / LANES + 1, (uint)BLOCKS);
   float by_mean[3 * ROWS] ROW_ALIGNED, by_quaternion[4 * ROWS] ROW_ALIGNED, by_log_scale[3 * ROWS] ROW_ALIGNED;
@@ -386,7 +386,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   __local float by_opacity[ROWS], by_colour[3 * ROWS], basis[SH_HIGHER * ROWS];
   __local int in_view[ROWS];
   const uint me = get_local_id(0), items = get_local_size(0), first_row = get_global_id(0) - me;
-  const uint rows = first_row < n ? min(items, n - first_row) : 0;
+  const uint rows = first_row < n && !readback[READBACK_STOPPED] ? min(items, n - first_row) : 0;
   int any = 0, shown[1] = {0};
   if (me < rows)
     any = gradients_of(n, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,

@@ -6,10 +6,12 @@
 //   2), zeroed before; slot_from_sorted, gaussian_from_sorted (pairs). All are indices.
 // Equations: none.
 #include "shared/math.h"
+#include "shared/count.h"
 
-__kernel void ranges(const uint pairs, __global const uint *tile_keys, __global const uint *pair_from_sorted,
+__kernel void ranges(ELEMENTS(pairs), __global const uint *tile_keys, __global const uint *pair_from_sorted,
                      __global const uint2 *pair_ids, __global uint *ranges, __global uint *slot_from_sorted,
                      __global uint *gaussian_from_sorted) {
+  FIND_ELEMENTS(pairs)
   const uint i = get_global_id(0);
   if (i >= pairs) return;
   const uint tile = tile_keys[i];

@@ -7,18 +7,21 @@
 // Equations: out[i] is the sum of values[0] to values[i - 1].
 #include "shared/math.h"
 #include "shared/group.h"
+#include "shared/count.h"
 
 // values (n) -> sums (groups)
-GROUP __kernel void scan_sums(const uint n, const uint chunk, __global const uint *values, __global uint *sums) {
+GROUP __kernel void scan_sums(ELEMENTS(n), const uint chunk, __global const uint *values, __global uint *sums) {
+  FIND_ELEMENTS(n)
   __local uint scratch[ITEMS];
   const uint begin = get_group_id(0) * chunk;
-  const uint sum = group_sum(values + begin, min(chunk, n - begin), scratch);
+  const uint sum = group_sum(values + begin, begin < n ? min(chunk, n - begin) : 0, scratch);
   if (get_local_id(0) == 0) sums[get_group_id(0)] = sum;
 }
 
 // values (n), sums (groups) -> out (n); total[0]: the sum of all, or 0xffffffff where that does not fit 32 bits
-GROUP __kernel void scan_chunks(const uint n, const uint chunk, __global const uint *values, __global const uint *sums,
+GROUP __kernel void scan_chunks(ELEMENTS(n), const uint chunk, __global const uint *values, __global const uint *sums,
                                 __global uint *out, __global uint *total) {
+  FIND_ELEMENTS(n)
   __local uint scratch[ITEMS];
   const uint begin = get_group_id(0) * chunk;
   const uint end = min(begin + chunk, n);

@@ -8,9 +8,11 @@
 // Equations: none; Batcher's bitonic network.
 #include "shared/math.h"
 #include "shared/group.h"
+#include "shared/count.h"
 
-GROUP __kernel void bitonic_sort(const uint n, const uint padded, __global const uint *keys, __global uint *keys_out,
+GROUP __kernel void bitonic_sort(ELEMENTS(n), const uint padded, __global const uint *keys, __global uint *keys_out,
                                  __global uint *values_out, __local uint *k, __local uint *v) {
+  FIND_ELEMENTS(n)
   const uint item = get_local_id(0);
   for (uint i = item; i < padded; i += ITEMS) {
     k[i] = i < n ? keys[i] : 0xffffffff;

@@ -12,6 +12,7 @@
 // Equations: none; docs/decisions/0001-split-sort.md.
 #include "shared/math.h"
 #include "shared/group.h"
+#include "shared/count.h"
 
 // Keys count from `base`, which is no larger than any of them.
 #define DIGIT(key) ((((key) - base) >> shift) & (digits - 1))
@@ -23,9 +24,9 @@
 #endif
 
 // keys (n) -> histograms (digits, groups)
-GROUP __kernel void radix_histogram(const uint n, const uint chunk, const uint base, const uint shift,
-                                    const uint digits, __global const uint *keys, __global uint *histograms,
-                                    __local uint *counters) {
+GROUP __kernel void radix_histogram(ELEMENTS(n), const uint chunk, const uint base, const uint shift, const uint digits,
+                                    __global const uint *keys, __global uint *histograms, __local uint *counters) {
+  FIND_ELEMENTS(n)
   const uint item = get_local_id(0);
   const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
   for (uint digit = item; digit < digits; digit += ITEMS) counters[digit] = 0;
@@ -58,7 +59,7 @@ GROUP __kernel void radix_offsets(const uint groups, const uint digits, const ui
 }
 
 #define SCATTER                                                                                                        \
-  const uint n, const uint chunk, const uint base, const uint shift, const uint digits, const int identity,            \
+  ELEMENTS(n), const uint chunk, const uint base, const uint shift, const uint digits, const int identity,             \
       __global const uint *keys, __global const uint *values, __global const uint *histograms,                         \
       __global const uint *totals, __global uint *keys_out, __global uint *values_out, __local uint *places
 
@@ -66,6 +67,7 @@ GROUP __kernel void radix_offsets(const uint groups, const uint digits, const ui
 // identity != 0 takes positions for values. places[digit]: where the next key with the digit goes.
 #if ITEMS == 1
 GROUP __kernel void radix_scatter(SCATTER) {
+  FIND_ELEMENTS(n)
   const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
   uint before = 0;
   for (uint digit = 0; digit < digits; ++digit) {
@@ -128,6 +130,7 @@ static inline void sort_tile(uint shift, __local uint *tile, __local uint *count
 
 // Digits of at most 8 bits.
 GROUP __kernel void radix_scatter(SCATTER) {
+  FIND_ELEMENTS(n)
   __local uint tile[GAPPED(TILE)]; // digit << 16 | position in the tile
   __local uint counters[GAPPED(WORDS * ITEMS)];
   __local uint scratch[ITEMS];

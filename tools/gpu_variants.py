@@ -134,7 +134,8 @@ class Rehearsed:
         buffers._Buffer = _Buffer  # type: ignore[assignment,misc]  # noqa: SLF001
         DeviceArray.read_into = read_into  # type: ignore[assignment,method-assign]
 
-        def begin_get(array: DeviceArray) -> Any:
+        def begin_get(array: DeviceArray, into: object = None) -> Any:
+            del into
             note(array, "read")
             return lambda: np.zeros(array.shape, array.dtype)
 
@@ -163,6 +164,7 @@ def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
     gaussians = Gaussians(*(np.zeros((count, *group), np.float32) for group in groups))
     photograph = np.zeros((height, width, 3), np.uint8)
     trainer = trainer_of(Subject("rehearsed", gaussians, camera, photograph), device, RasterizerConfig())
+    trainer.pending.on = False  # launches of as many items as have work, for bytes and times
 
     def forward() -> None:
         trainer.rasterizer.forward(trainer.parameters, camera, np.zeros(3, np.float32), backward=False)

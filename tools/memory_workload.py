@@ -27,7 +27,7 @@ from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device import buffers, launch, program
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device, all_devices
-from clsplat.device.layout import WIDEST_SLOTS
+from clsplat.device.layout import READBACK, WIDEST_SLOTS
 from clsplat.device.shapes import Shape
 from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.rendering.rasterizer import Rasterizer
@@ -113,7 +113,10 @@ def frames(device: Device) -> None:
 def by_two_launches(device: Device) -> None:
     """Adam by gradients that are in memory, as where a step is looked at: all rows, and those in view."""
     models = [allocate_gaussians(device, 11, 4, zero=True) for _ in range(4)]
-    counts, readback = upload(device, np.arange(11, dtype=np.uint32) % 3), upload(device, np.zeros(8, np.uint32))
+    counts, readback = (
+        upload(device, np.arange(11, dtype=np.uint32) % 3),
+        upload(device, np.zeros(len(READBACK), np.uint32)),
+    )
     for sparse in (False, True):
         adam(device, 1, dict.fromkeys(GROUPS, 0.1), OptimiserConfig(sparse=sparse), *models, counts, readback)
     if not all(np.isfinite(models[0][group].get()).all() for group in GROUPS):
@@ -147,7 +150,8 @@ def pictures(device: Device) -> None:
 
 
 def training(device: Device) -> None:
-    """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset."""
+    """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset. Some
+    by capacity, of which one has too little."""
     view = camera(20, 17)
     paper = TrainConfig(
         iterations=6,
@@ -173,13 +177,19 @@ def training(device: Device) -> None:
             max_gaussians=60,
         ),
     )
-    for config, channels in ((paper, 3), (wide, 4)):
+    ahead, rooms = replace(paper, iterations=3, warmup=()), iter((0, 2000, 1))
+    for config, channels in ((paper, 3), (wide, 4), (ahead, 3)):
         pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
         if channels == 3:
             pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
         start = cloud(18, view, 5, degree=0)
         trainer = Trainer(scene_of(view, pixels), config, device, start)
+        if config is ahead:
+            trainer.pending.on = True
+            trainer.pending.room = lambda *_: next(rooms)  # type: ignore[method-assign]
         losses = [trainer.train_step().read()[0] for _ in range(config.iterations)]
+        if trainer.pending.redone != (config is ahead):
+            raise SystemExit(f"{trainer.pending.redone} steps were made again")
         if not np.isfinite(losses).all():
             raise SystemExit(f"the training went wrong: losses {losses}")
 

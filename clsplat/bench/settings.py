@@ -114,6 +114,7 @@ def compare(
         return rasterizer.forward(held, camera, background, backward=False)
 
     def step(rasterizer: Rasterizer) -> None:
+        trainer.settle()
         trainer.rasterizer = rasterizer
         trainer.train_step()
 

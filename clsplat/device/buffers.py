@@ -90,10 +90,10 @@ class DeviceArray:
             self._note("read", event)
             self.device.under_way.clear()  # the queue is in order: all that came before is done
 
-    def begin_get(self) -> Callable[[], NDArray[Any]]:
+    def begin_get(self, into: NDArray[Any] | None = None) -> Callable[[], NDArray[Any]]:
         """Start a copy to the host behind what is on the queue now. The result waits for no more than that, and returns
-        the copy."""
-        host = np.empty(self.shape, self.dtype)
+        the copy. into: memory of that shape for it, such as `pinned`."""
+        host = np.empty(self.shape, self.dtype) if into is None else into
         self.device.calls.reads += 1
         event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False)
         self._note("read", event)
@@ -181,6 +181,16 @@ def shared(device: Device, values: NDArray[Any]) -> DeviceArray:
     the device's. It must not change for as long as the result lives."""
     buffer = cl.Buffer(device.context, cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR, hostbuf=values)
     return DeviceArray(device, buffer, values.shape, values.dtype)
+
+
+def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """An array on the host that a device copies to by itself. A driver may make the host wait for copies to other
+    memory, asked to or not."""
+    nbytes = prod(shape) * np.dtype(dtype).itemsize
+    buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR, nbytes)
+    flags = cl.map_flags.READ | cl.map_flags.WRITE
+    host, _ = cl.enqueue_map_buffer(device.queue, buffer, flags, 0, shape, dtype, is_blocking=True)
+    return host  # type: ignore[no-any-return]  # it keeps the mapping, and that the buffer
 
 
 class Workspace:

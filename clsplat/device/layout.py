@@ -62,9 +62,10 @@ REFUSED = ("parameters", "gradients", "moments", "steps")
 
 COUNTED = ("VISIBLE", "PAIRS", "KEY_COMPLEMENT", "LARGEST_KEY")
 
-READBACK = (*COUNTED, *(f"REFUSED_{reason.upper()}" for reason in REFUSED))
+READBACK = (*COUNTED, "STOPPED", *(f"REFUSED_{reason.upper()}" for reason in REFUSED))
 """Numbers that a forward pass reads back, in one copy: of its own the totals of visible Gaussians and of pairs, the
-complement of the smallest depth key and the largest one; and what `adam` has counted since."""
+complement of the smallest depth key and the largest one; 1 from where a pass by capacity has stopped (duplicate.cl);
+and what `adam` has counted since."""
 
 
 DEEP = ("RED", "GREEN", "BLUE", "ALPHA", "FIRST", "LAST")

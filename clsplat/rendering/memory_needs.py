@@ -51,13 +51,14 @@ def plan_step(
     fields: SlotFields,
     agreement: bool,
     photographs: int = 0,
+    turns: int = 1,
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
-    photographs: pixels of all that may stay on the device. Raises CapacityError."""
+    photographs: pixels of all that may stay on the device; turns: of `loss`. Raises CapacityError."""
     planes = 0
     for camera in cameras:
         pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES)
-        planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE))
+        planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, turns))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
     screen = project.SCREEN_BYTES + 4 * fields.contributions
     statistics = density.gaussian_bytes(agreement=agreement, contributions=fields.contributions)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from clsplat.camera import PROJECTIONS, Camera
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device.buffers import DeviceArray, Workspace, allocate
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, pinned
 from clsplat.device.context import Device
 from clsplat.device.layout import CAMERA, PLAIN_SLOTS, READBACK, WIDEST_SLOTS, SlotFields
 from clsplat.errors import InputError
@@ -31,6 +31,7 @@ from clsplat.stages.duplicate import (
     Pairs,
     count,
     count_band,
+    count_by_capacity,
     duplicate,
     duplicate_and_sort,
     plan_bands,
@@ -48,6 +49,18 @@ class Part:
     counted: Counted
     pairs: Pairs
     lists: TileLists
+
+
+TURNS = 3
+"""Passes by capacity whose counts are kept apart: that under way, the one before, and the one that is redone."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """Arrays of a pass by capacity: for so many pairs; turn: below TURNS, that of its counts."""
+
+    pairs: int
+    turn: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +103,7 @@ class Rasterizer:
         self._camera, self._background = self._view.reshaped(len(CAMERA)), self._view.rows(aligned, aligned + 3)
         self.readback = allocate(device, (len(READBACK),), np.uint32)
         self.readback.fill(0)
+        self._arriving: NDArray[np.uint32] | None = None
         self._all_bits = self._switches.key_bits == "all"
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS)
 
@@ -99,6 +113,11 @@ class Rasterizer:
         if self.work.tight:
             self.work.clear()
         self.capacity = plan.pairs
+
+    @property
+    def takes_room(self) -> bool:
+        """True if a pass may be by capacity: there is memory to spare, and the order by depth is that of Gaussians."""
+        return not self.work.tight and self._switches.depth_sort != "pairs"
 
     def _send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Camera and background on the device, where a background on the host goes up with the camera, in one copy."""
@@ -120,16 +139,21 @@ class Rasterizer:
         background: NDArray[np.float32] | DeviceArray,
         *,
         backward: bool = True,
+        room: Room | None = None,
     ) -> Frame:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
         background: (3,) float32, on the host or the device; backward: True if the gradient will be asked for. Without
-        it, what only that needs is left out.
+        it, what only that needs is left out. room: do not wait for the number of pairs, and have nothing of the pass
+        come to anything where there are more (docs/decisions/0025-launch-by-capacity.md).
         """
         device, work = self.device_of(camera), self.work
         camera_array, background = self._send(camera, background)
         projected = project(device, work, gaussians, camera, camera_array)
-        counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
+        if room is None:
+            counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
+        else:
+            counted = count_by_capacity(device, work, projected, self.readback, room.pairs, self._host(room.turn))
         bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
         record = backward and len(bands) == 1 and self._switches.record_cells
         part = None
@@ -140,6 +164,13 @@ class Rasterizer:
             blended = blend(device, work, part.lists, *pixels, record=record, camera_array=camera_array)
         assert part is not None, "an image has a tile"
         return Frame(camera, camera_array, background, projected, bands, part, blended, counted.refused)
+
+    def _host(self, turn: int) -> NDArray[np.uint32]:
+        """Memory on the host for a copy of the counts."""
+        if self._arriving is None:
+            self._arriving = pinned(self.device, (TURNS, len(READBACK)), np.uint32)
+        row: NDArray[np.uint32] = self._arriving[turn]
+        return row
 
     def part(self, frame: Frame, band: Band) -> Part:
         """The band with its pairs and lists; where there are several bands it takes the memory of the one before."""

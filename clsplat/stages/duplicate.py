@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups, launch_items
-from clsplat.device.layout import COUNTED, TILE
+from clsplat.device.layout import COUNTED, READBACK, REFUSED, TILE
 from clsplat.device.profile import stage
 from clsplat.errors import CapacityError, amount
 from clsplat.stages.project import Projected
-from clsplat.stages.scan import chunking, scan
+from clsplat.stages.scan import Elements, chunking, scan
 from clsplat.stages.sort import SORT_BYTES, sort
 
 MAX_PAIRS = 2**31 - 1024
@@ -51,7 +54,11 @@ class Band:
 class Counted:
     """tile_counts, first_slots (n): a Gaussian's tiles, and their scan; gaussian_from_visible, depth_keys (visible):
     in order of Gaussians; visible and pairs: the totals, pairs capped at 2^32 - 1; least_key and key_bits: what every
-    depth key has at least, and how many low bits of the rest can be set; refused: what `adam` had counted."""
+    depth key has at least, and how many low bits of the rest can be set; refused: what `adam` had counted.
+
+    Of a pass by capacity visible and pairs are the most that there can be; on_device: the READBACK in which its kernels
+    find the totals; arriving: a function that waits for a copy of that, and returns it.
+    """
 
     tile_counts: DeviceArray
     first_slots: DeviceArray
@@ -62,14 +69,22 @@ class Counted:
     least_key: int
     key_bits: int
     refused: tuple[int, ...] = ()
+    on_device: DeviceArray | None = None
+    arriving: Callable[[], NDArray[Any]] | None = None
+
+    def elements(self, most: int, name: str) -> Elements:
+        """The number `name` of READBACK, as kernels take it; most: it, or what it is at most."""
+        return Elements(most, self.on_device, READBACK.index(name))
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """tile_keys (pairs), pair_ids (pairs, 2): slot and Gaussian, both by depth, ties by index of the Gaussian."""
+    """tile_keys (pairs), pair_ids (pairs, 2): slot and Gaussian, both by depth, ties by index of the Gaussian;
+    elements: the pairs that there are of these."""
 
     tile_keys: DeviceArray
     pair_ids: DeviceArray
+    elements: Elements
 
 
 @stage("duplicate")
@@ -86,23 +101,12 @@ def count(
 
     readback (READBACK_SIZE,) uint32: the array that is read, if what `adam` has counted there is to be read with it.
     """
-    tile_counts = projected.tile_counts
-    (n,) = tile_counts.shape
-    shown = projected.shown or tile_counts
-    first_slots = work.array("first_slots", (n,), np.uint32)
-    gaussian_from_visible = work.array("gaussian_from_visible", (n,), np.uint32)
-    depth_keys = work.array("depth_keys", (n,), np.uint32)
     readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
-    groups, chunk = chunking(device, n)
-    sums = work.array("visible_sums", (2, groups), np.uint32)
-    kernels, chunks = device.kernels("duplicate"), (groups, device.shape.items, n, chunk)
-    launch_groups(device, kernels.visible_sums, *chunks, shown, tile_counts, sums, readback)
-    arrays = (shown, tile_counts, projected.splats, sums, first_slots, gaussian_from_visible, depth_keys, readback)
-    launch_groups(device, kernels.compact_visible, *chunks, *arrays)
-    visible, pairs, complement, largest, *refused = (int(value) for value in readback.get())
+    first_slots, gaussian_from_visible, depth_keys = _compact(device, work, projected, readback)
+    visible, pairs, complement, largest, *others = (int(value) for value in readback.get())
     least = 0 if all_bits else 2**32 - 1 - complement
     return Counted(
-        tile_counts,
+        projected.tile_counts,
         first_slots,
         gaussian_from_visible.reshaped(visible),
         depth_keys.reshaped(visible),
@@ -110,8 +114,49 @@ def count(
         pairs,
         least,
         32 if all_bits else max(largest - least, 1).bit_length(),
-        tuple(refused),
+        tuple(others[-len(REFUSED) :]),
     )
+
+
+@stage("duplicate")
+def count_by_capacity(
+    device: Device,
+    work: Workspace,
+    projected: Projected,
+    readback: DeviceArray,
+    capacity: int,
+    host: NDArray[np.uint32],
+) -> Counted:
+    """`count` without waiting, for at most `capacity` pairs; a pass that has more of them stops (kernels/duplicate.cl).
+
+    readback (READBACK_SIZE,) uint32: as `project_step` gets it; host: memory for its copy. Depths are sorted by 32
+    bits, which is as many passes of a GPU as of the bits in which those of a scene differ.
+    """
+    (n,) = projected.tile_counts.shape
+    arrays = (projected.tile_counts, *_compact(device, work, projected, readback, capacity))
+    return Counted(*arrays, n, capacity, 0, 32, (), readback, readback.begin_get(host))
+
+
+def _compact(
+    device: Device, work: Workspace, projected: Projected, readback: DeviceArray, capacity: int | None = None
+) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+    """Fill readback, and the first slots (n), the visible Gaussians (n) and their depth keys (n), which it returns."""
+    tile_counts = projected.tile_counts
+    (n,) = tile_counts.shape
+    shown = projected.shown or tile_counts
+    by_gaussian = (
+        work.array("first_slots", (n,), np.uint32),
+        work.array("gaussian_from_visible", (n,), np.uint32),
+        work.array("depth_keys", (n,), np.uint32),
+    )
+    groups, chunk = chunking(device, n)
+    sums = work.array("visible_sums", (2, groups), np.uint32)
+    limit, defines = ((), {}) if capacity is None else ((capacity,), {"BY_CAPACITY": True})
+    kernels, chunks = device.kernels("duplicate", **defines), (groups, device.shape.items, n, chunk)
+    launch_groups(device, kernels.visible_sums, *chunks, shown, tile_counts, sums, readback)
+    arrays = (shown, tile_counts, projected.splats, sums, *by_gaussian, readback, *limit)
+    launch_groups(device, kernels.compact_visible, *chunks, *arrays)
+    return by_gaussian
 
 
 @stage("duplicate")
@@ -165,19 +210,21 @@ def duplicate(
 ) -> Pairs:
     """Sort the visible Gaussians by depth and emit their pairs in that order."""
     visible, pairs = counted.visible, counted.pairs
-    kernels = device.kernels("duplicate")
-    _, order = sort(device, work, "depth", counted.depth_keys, counted.key_bits, counted.least_key)
+    shown, listed = counted.elements(visible, "VISIBLE"), counted.elements(pairs, "PAIRS")
+    kernels = device.kernels("duplicate", **shown.defines)
+    _, order = sort(device, work, "depth", counted.depth_keys, counted.key_bits, counted.least_key, shown)
     gaussian_from_rank = work.array("gaussian_from_rank", (visible,), np.uint32)
     counts = work.array("rank_counts", (visible,), np.uint32)
-    by_index = (counted.gaussian_from_visible, counted.tile_counts)
-    launch_items(device, kernels.order_counts, visible, visible, order, *by_index, gaussian_from_rank, counts)
+    ranked = (order, counted.gaussian_from_visible, counted.tile_counts, gaussian_from_rank, counts)
+    all_rows = () if counted.on_device is None else (visible,)
+    launch_items(device, kernels.order_counts, visible, *shown.arguments, *ranked, *all_rows)
     offsets = work.array("offsets", (visible,), np.uint32)
-    scan(device, work, counts, offsets, work.array("pairs_total", (1,), np.uint32))
+    scan(device, work, counts, offsets, work.array("pairs_total", (1,), np.uint32), shown)
     tile_keys = work.array("tile_keys", (pairs,), np.uint32)
     pair_ids = work.array("pair_ids", (pairs, 2), np.uint32)
     extent, arrays = (*tiles, band.first, band.end), (gaussian_from_rank, offsets, counted.first_slots, splats)
-    launch_items(device, kernels.duplicate, visible, visible, *extent, *arrays, tile_keys, pair_ids)
-    return Pairs(tile_keys, pair_ids)
+    launch_items(device, kernels.duplicate, visible, *shown.arguments, *extent, *arrays, tile_keys, pair_ids)
+    return Pairs(tile_keys, pair_ids, listed)
 
 
 @stage("duplicate")
@@ -199,4 +246,4 @@ def duplicate_and_sort(
     pair_ids = work.array("pair_ids", (pairs, 2), np.uint32)
     ordered = (slot_from_pair, tile_from_slot, gaussian_from_slot, tile_keys, pair_ids)
     launch_items(device, kernels.order_pairs, pairs, pairs, *ordered)
-    return Pairs(tile_keys, pair_ids)
+    return Pairs(tile_keys, pair_ids, counted.elements(pairs, "PAIRS"))

@@ -55,10 +55,10 @@ def _blocks(device: Device, height: int, stride: int) -> _Blocks:
     return _Blocks(rows, columns, groups, field, partials=groups * LOSS_RING * 3 * field, sums=9 * height * across)
 
 
-def scratch_bytes(device: Device, height: int, stride: int) -> int:
-    """Bytes of the partial derivatives and the partial sums."""
+def scratch_bytes(device: Device, height: int, stride: int, turns: int = 1) -> int:
+    """Bytes of the partial derivatives and, of each turn, the partial sums."""
     blocks = _blocks(device, height, stride)
-    return 4 * (blocks.partials + blocks.sums)
+    return 4 * (blocks.partials + turns * blocks.sums)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,13 +92,15 @@ def loss(
     width: int,
     height: int,
     weight: float,
+    turn: int = 0,
 ) -> Loss:
-    """(1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero right of and below the image."""
+    """(1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero right of and below the image. turn: those
+    of another turn keep their sums."""
     _, rows, stride = image.shape
     samples, blocks, items = 3 * width * height, _blocks(device, height, stride), device.shape.items
     partials = work.array("loss_partials", (blocks.partials,))
     gradient = work.array("image_gradient", (3, rows, stride))
-    sums = work.array("loss_sums", (3, blocks.sums // 3))
+    sums = work.array(f"loss_sums{turn or ''}", (3, blocks.sums // 3))
     sizes, pictures, results = (width, height, stride, rows * stride), (image, target), (partials, gradient, sums)
     weights = ((1 - weight) / samples, weight / samples)
     if items == 1:

@@ -35,13 +35,14 @@ class TileLists:
 def tile_lists(device: Device, work: Workspace, pairs: Pairs, band: Band, *, all_bits: bool = False) -> TileLists:
     """A stable sort by tile of pairs that are in order of depth: each tile's Gaussians front to back. By as many bits
     as the tiles need, or with `all_bits` by 32."""
-    count = pairs.tile_keys.shape[0]
+    count, elements = pairs.tile_keys.shape[0], pairs.elements
     bits = 32 if all_bits else max(band.tiles - 1, 1).bit_length()
-    keys, pair_from_sorted = sort(device, work, "tile", pairs.tile_keys, bits)
+    keys, pair_from_sorted = sort(device, work, "tile", pairs.tile_keys, bits, elements=elements)
     ranges = work.array("ranges", (band.tiles, 2), np.uint32)
     ranges.fill(0)
     slot_from_sorted = work.array("slot_from_sorted", (count,), np.uint32)
     gaussian_from_sorted = work.array("gaussian_from_sorted", (count,), np.uint32)
     arrays = (keys, pair_from_sorted, pairs.pair_ids, ranges, slot_from_sorted, gaussian_from_sorted)
-    launch_items(device, device.kernels("ranges").ranges, count, count, *arrays)
+    kernel = device.kernels("ranges", **elements.defines).ranges
+    launch_items(device, kernel, count, *elements.arguments, *arrays)
     return TileLists(band, ranges, gaussian_from_sorted, slot_from_sorted)

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
 from clsplat.device.buffers import DeviceArray, Workspace
@@ -13,6 +16,26 @@ PER_ITEM = 16
 """Elements of a chunk for each item of a group, or a multiple of it."""
 MOST_GROUPS = 2048
 """Groups of more than one item that share a scan or sort: each reads what all before it have counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Elements:
+    """The number of elements that a kernel is for (kernels/shared/count.h): `most`, or with `counts` the number at
+    `place` there, which is not larger; a launch is for `most`."""
+
+    most: int
+    counts: DeviceArray | None = None
+    place: int = 0
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """The kernel's arguments for it."""
+        return (self.most,) if self.counts is None else (self.counts.buffer, self.place)
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """The defines of kernels that take these arguments."""
+        return {} if self.counts is None else {"BY_CAPACITY": True}
 
 
 def chunking(device: Device, n: int, items: int = 0) -> tuple[int, int]:
@@ -27,12 +50,21 @@ def chunking(device: Device, n: int, items: int = 0) -> tuple[int, int]:
     return max(-(-n // chunk), 1), chunk
 
 
-def scan(device: Device, work: Workspace, values: DeviceArray, out: DeviceArray, total: DeviceArray) -> None:
-    """out[i] = sum of values[:i], total[0] = sum of all; one launch where one group is enough, else two."""
-    n = values.shape[0]
-    groups, chunk = chunking(device, n)
+def scan(
+    device: Device,
+    work: Workspace,
+    values: DeviceArray,
+    out: DeviceArray,
+    total: DeviceArray,
+    elements: Elements | None = None,
+) -> None:
+    """out[i] = sum of values[:i], total[0] = sum of all; one launch where one group is enough, else two. elements: the
+    values that count, if not all do."""
+    elements = elements or Elements(values.shape[0])
+    groups, chunk = chunking(device, elements.most)
     sums = work.array("scan_sums", (groups,), np.uint32)
-    kernels, items = device.kernels("scan"), device.shape.items
+    kernels, items = device.kernels("scan", **elements.defines), device.shape.items
+    chunks = (groups, items, *elements.arguments, chunk)
     if groups > 1:
-        launch_groups(device, kernels.scan_sums, groups, items, n, chunk, values, sums)
-    launch_groups(device, kernels.scan_chunks, groups, items, n, chunk, values, sums, out, total)
+        launch_groups(device, kernels.scan_sums, *chunks, values, sums)
+    launch_groups(device, kernels.scan_chunks, *chunks, values, sums, out, total)

@@ -9,7 +9,7 @@ from clsplat.device import cl
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
-from clsplat.stages.scan import chunking
+from clsplat.stages.scan import Elements, chunking
 
 BITONIC_MAX = 2048
 """Number of keys that, with their positions, fill 16 KiB of local memory: half of what every device has."""
@@ -37,15 +37,23 @@ def scratch_bytes(device: Device, n: int) -> int:
 
 
 def radix_sort(
-    device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int, base: int = 0
+    device: Device,
+    work: Workspace,
+    name: str,
+    keys: DeviceArray,
+    bits: int,
+    base: int = 0,
+    elements: Elements | None = None,
 ) -> tuple[DeviceArray, DeviceArray]:
     """Sort by the lowest `bits` of the keys less `base`; (sorted keys, positions), in workspace arrays under `name`.
+    elements: the keys that count, if not all do.
 
     As few passes as the widest digit allows, and their digits of even width.
     """
     n, items = keys.shape[0], device.shape.sort_items
+    elements = elements or Elements(n)
     groups, chunk = chunking(device, n, items)
-    kernels = device.kernels("sort_radix", ITEMS=items)
+    kernels = device.kernels("sort_radix", ITEMS=items, **elements.defines)
     passes = max(-(-bits // _widest_digit(device, n)), 1)
     digit_bits = -(-bits // passes) or 1
     digits = 1 << digit_bits
@@ -55,7 +63,7 @@ def radix_sort(
     counters = cl.LocalMemory(4 * digits)
     positions = keys
     for index in range(passes):
-        chunks = (groups, items, n, chunk, base, index * digit_bits, digits)
+        chunks = (groups, items, *elements.arguments, chunk, base, index * digit_bits, digits)
         keys_out = work.array(f"{name}_keys{index % 2}", (n,), np.uint32)
         positions_out = work.array(f"{name}_positions{index % 2}", (n,), np.uint32)
         launch_groups(device, kernels.radix_histogram, *chunks, keys, histograms, counters)
@@ -67,25 +75,36 @@ def radix_sort(
     return keys, positions
 
 
-def bitonic_sort(device: Device, work: Workspace, name: str, keys: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-    """Sort at most BITONIC_MAX keys in one launch; (sorted keys, positions)."""
+def bitonic_sort(
+    device: Device, work: Workspace, name: str, keys: DeviceArray, elements: Elements | None = None
+) -> tuple[DeviceArray, DeviceArray]:
+    """Sort at most BITONIC_MAX keys in one launch; (sorted keys, positions). elements: the keys that count, if not all
+    do."""
     n = keys.shape[0]
     if n > BITONIC_MAX:
         raise ValueError(f"{n} keys: bitonic_sort takes at most {BITONIC_MAX}")
+    elements = elements or Elements(n)
     padded = 1 << max(n - 1, 0).bit_length()
     keys_out = work.array(f"{name}_keys0", (n,), np.uint32)
     positions_out = work.array(f"{name}_positions0", (n,), np.uint32)
     local = cl.LocalMemory(4 * padded)
-    kernel, arrays = device.kernels("sort_bitonic").bitonic_sort, (keys, keys_out, positions_out)
-    launch_groups(device, kernel, 1, device.shape.items, n, padded, *arrays, local, local)
+    kernel = device.kernels("sort_bitonic", **elements.defines).bitonic_sort
+    arrays = (keys, keys_out, positions_out, local, local)
+    launch_groups(device, kernel, 1, device.shape.items, *elements.arguments, padded, *arrays)
     return keys_out, positions_out
 
 
 def sort(
-    device: Device, work: Workspace, name: str, keys: DeviceArray, bits: int, base: int = 0
+    device: Device,
+    work: Workspace,
+    name: str,
+    keys: DeviceArray,
+    bits: int,
+    base: int = 0,
+    elements: Elements | None = None,
 ) -> tuple[DeviceArray, DeviceArray]:
     """Sort by the quicker of the two for this number of keys; `bits`: number of low bits of the keys less `base` that
-    can be set; `base`: no larger than any key."""
+    can be set; `base`: no larger than any key; elements: the keys that count, if not all do."""
     if keys.shape[0] <= BITONIC_WINS[device.kind]:
-        return bitonic_sort(device, work, name, keys)
-    return radix_sort(device, work, name, keys, bits, base)
+        return bitonic_sort(device, work, name, keys, elements)
+    return radix_sort(device, work, name, keys, bits, base, elements)

@@ -208,6 +208,7 @@ class Session:
     def draw(self, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
         """Image and alpha of the model as it is, before the background of evaluations."""
         trainer, background = self.trainer, background_colour(self.trainer.config.background)
+        trainer.settle()
         result = self.renderer.render(trainer.parameters, trainer.local(camera), background)
         return result.image, result.alpha
 

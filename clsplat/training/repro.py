@@ -99,6 +99,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
         bundle = Bundle(record, trainer.config, camera, photograph, incident.background, models)
         return bool(first_trouble(replay(bundle, device)))
 
+    trainer.settle()
     models, alone = {}, False
     if len(incident.gaussians.get("parameters/means", ())):
         models = _unmarked({kind: host_model(incident.gaussians, kind) for kind in _KINDS})

@@ -15,7 +15,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
 from clsplat.device.layout import SlotFields
-from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.rendering.rasterizer import Frame, Rasterizer, Room
 from clsplat.stages.adam import adam, updates_sh_rest
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 from clsplat.stages.loss import Loss, loss
@@ -68,7 +68,7 @@ class StepProbe:
 class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in the memory of a rasterizer.
 
-    fields: the fields of a slot that the step fills.
+    fields: the fields of a slot that the step fills; turn: of `loss`; room: of `Rasterizer.forward`.
     """
 
     device: Device
@@ -77,6 +77,8 @@ class GradientStep:
     step: int
     rates: Mapping[str, float]
     fields: SlotFields
+    turn: int = 0
+    room: Room | None = None
 
     def run(
         self,
@@ -95,11 +97,11 @@ class GradientStep:
         looks at them; the bits of the model are the same without; reads_loss: the loss will be read.
         """
         device, rasterizer, work = self.device, self.rasterizer, self.rasterizer.work
-        frame = rasterizer.forward(model[0], camera, background)
+        frame = rasterizer.forward(model[0], camera, background, room=self.room)
         probe.forward(frame)
         planes = target(device, work, photograph, frame.background)
         size = (camera.width, camera.height)
-        result = loss(device, work, frame.blended.image, planes, *size, self.config.dssim_weight)
+        result = loss(device, work, frame.blended.image, planes, *size, self.config.dssim_weight, self.turn)
         if reads_loss:
             result = result.fetched()
         probe.loss(result)

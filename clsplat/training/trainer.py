@@ -19,7 +19,7 @@ from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.memory_needs import plan_step
-from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.rendering.rasterizer import Frame, Rasterizer, Room
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.initialise import from_scene
 from clsplat.stages.adam import updates_sh_rest
@@ -50,6 +50,7 @@ from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strat
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.health import Patience
 from clsplat.training.monitor import LastStep, Remedy, Watch
+from clsplat.training.pending import Pending
 from clsplat.training.photographs import Photographs
 from clsplat.training.resolution import sizes_of
 from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
@@ -84,6 +85,7 @@ class _Watched(StepProbe):
     def forward(self, frame: Frame) -> None:
         """Take the counts of the step before, which this pass has read back."""
         self.trainer.watch.notice(frame.refused)
+        self.trainer.pending.seen(frame)
 
     def loss(self, result: Loss) -> None:
         """Remember the step, to look at if it turns out to have had trouble."""
@@ -121,7 +123,8 @@ class _Watched(StepProbe):
 class Trainer:
     """A model in training: parameters, moments, statistics and the random state, all of which a checkpoint holds.
 
-    watch: what is not finite in it, and how much of that there was; mark: where `step_back` leads, None from where the
+    watch: what is not finite in it, and how much of that there was; pending: the steps that are launched and not yet
+    known to have been made; mark: where `step_back` leads, None from where the
     state changes on.
     """
 
@@ -143,6 +146,7 @@ class Trainer:
         self.background: NDArray[np.float32] = np.zeros(3, np.float32)
         self.given = initial
         self.watch = Watch(self.rasterizer.readback, [view.name for view in self.views])
+        self.pending = Pending(device, self.watch, self._begin_again)
         self._start()
 
     def _start(self) -> None:
@@ -177,6 +181,7 @@ class Trainer:
             fields=slot_fields(needs),
             agreement=needs.agreement,
             photographs=sum(view.camera.width * view.camera.height for view in self.views),
+            turns=self.pending.turns,
         )
         self.rasterizer.follow(self.plan)
         self.photographs.follow(self.plan.photographs)
@@ -232,14 +237,37 @@ class Trainer:
         camera = self._camera(view, image.shape[1], image.shape[0])
         self.background = self._background_colour()
         needs = self.strategy.needs(self.step)
-        step = GradientStep(self.device, self.rasterizer, config, self.step, self.rates(), slot_fields(needs))
-        probe = _Watched(self, step, view, camera, self.background, needs)
-        model = (self.parameters, self.first, self.second)
-        result = step.run(model, image, camera, self.background, probe, reads_loss=reads_loss)
+        exact = GradientStep(self.device, self.rasterizer, config, self.step, self.rates(), slot_fields(needs))
+        background = self.background
+
+        def run(turn: int, room: Room | None) -> Loss:
+            step = replace(exact, turn=turn, room=room)
+            probe = _Watched(self, step, view, camera, background, needs)
+            model = (self.parameters, self.first, self.second)
+            return step.run(model, image, camera, background, probe, reads_loss=reads_loss)
+
+        result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
         self.controlled = False
         self._note()
         self._rearrange(self.strategy.after_gradient(self._state()))
         return result
+
+    def _room(self, factor: float) -> int:
+        """Pairs to launch the next step for, or 0 for the exact number, as where the strategy looks at each step's
+        model."""
+        looked_at = type(self.strategy).after_gradient is not Strategy.after_gradient
+        if not self.pending.on or looked_at or not self.rasterizer.takes_room:
+            return 0
+        return self.pending.room(self.rasterizer, (factor, self.rasterizer), self.parameters.count)
+
+    def _begin_again(self) -> None:
+        """Preparation for a step that is made again: there is no way back from here."""
+        self.mark = None
+        self.mend()
+
+    def settle(self) -> None:
+        """Wait until all steps are known to have been made, or make them again (`Pending`)."""
+        self.pending.settle()
 
     def _note(self, *, begun: bool = False) -> None:
         """Mark the state as it is now: until something of it is changed, `step_back` leads here. begun: the step's
@@ -260,6 +288,7 @@ class Trainer:
         """Mend the Gaussians in which something was not finite, if that has been noticed; look: read the counts
         first."""
         if look:
+            self.settle()
             self.watch.look()
         self._apply(self.watch.examine(self.models()))
 
@@ -290,6 +319,8 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.queue:
             self.queue = [int(index) for index in self.rng.permutation(len(self.views))]
+            if self.statistics.whole_totals is not None:
+                self.settle()
             self.mark = None
             self.statistics = self.statistics.next_epoch()
             self._note(begun=True)
@@ -306,6 +337,7 @@ class Trainer:
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
         coefficients = (degree + 1) ** 2
         if coefficients > self.parameters.coefficients:
+            self.settle()
             models = [*self.models().values()] if self.plan.gathers else self._take_down()
             wider = (self._placed(widen(self.device, model, coefficients)) for model in models)
             self.parameters, self.first, self.second = wider
@@ -369,6 +401,7 @@ class Trainer:
 
     def gaussians(self) -> Gaussians:
         """The model so far, on the host, with room for the SH degree it is trained to."""
+        self.settle()
         model = download_gaussians(self.parameters)
         full = np.zeros((len(model), (self.config.sh_degree + 1) ** 2, 3), np.float32)
         full[:, : model.sh.shape[1]] = model.sh
@@ -394,6 +427,7 @@ class Trainer:
 
     def restart(self) -> None:
         """Begin again, at the rates that `watch.patience` allows."""
+        self.pending.forget()
         del self.parameters, self.first, self.second, self.statistics
         self.watch.forget()
         self._start()
@@ -415,6 +449,7 @@ class Trainer:
         self.controlled, self.mark = bool(checkpoint.state.get("controlled", False)), None
         self.watch.patience = patience
         self.watch.forget()
+        self.pending.forget()
         del self.parameters, self.first, self.second, self.statistics
         self._make_plan(loaded[0].count)
         self._set_parameters(*(self._placed(model) for model in loaded))

@@ -111,6 +111,7 @@ class LiveModel:
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
         """The picture, and a remark on it. Raises InputError where a limited training leaves too little memory."""
         trainer = self.trainer
+        trainer.settle()
         degree = round(trainer.parameters.coefficients**0.5) - 1
         key = look.changes(degree)
         if (key is not None or look.mode in ("depth", "count")) and (

@@ -53,7 +53,7 @@ def test_blending_reads_splats_and_rays_alike() -> None:
 
 
 def test_what_is_read_back_has_names_in_the_kernels() -> None:
-    assert (*COUNTED, *(f"REFUSED_{reason.upper()}" for reason in REFUSED)) == READBACK
+    assert (*COUNTED, "STOPPED", *(f"REFUSED_{reason.upper()}" for reason in REFUSED)) == READBACK
     for place, name in enumerate(READBACK):
         assert f"#define READBACK_{name} {place}\n" in header()
         assert re.search(rf"\bREADBACK_{name}\b", KERNELS), name
