@@ -74,6 +74,14 @@ class HostArray:
         """Copy from another array."""
         self.values[...] = values
 
+    def get_rows(self, start: int, stop: int) -> NDArray[Any]:
+        """A copy of the rows from start to before stop."""
+        return self.values[start:stop].copy()
+
+    def set_rows(self, start: int, values: NDArray[Any]) -> None:
+        """Copy from another array to the rows from start on."""
+        self.values[start : start + len(values)] = values
+
     def fill(self, value: float) -> None:
         """Set every element."""
         self.values.fill(value)
