@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -95,6 +95,13 @@ class HostGaussians(_ByGroup[HostArray]):
 
 
 AnyGaussians = DeviceGaussians | HostGaussians
+
+
+def groups_of(model: AnyGaussians, *names: str) -> AnyGaussians:
+    """The model with these arrays alone, the same ones."""
+    if isinstance(model, HostGaussians):
+        return replace(model, arrays={name: model[name] for name in names})
+    return replace(model, arrays={name: model[name] for name in names})
 
 
 def parts(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edges of the rules by which Gaussians are marked: x > edge decides as the comparison that it stands for, to the ulp."""
+"""Edges of the rules by which Gaussians are marked: x > edge decides as the comparison that it is for, to the ulp."""
 
 from __future__ import annotations
 
