@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What density control makes of every Gaussian: NumPy twin of kernels/density.cl, in float32, where it is decided."""
+"""Marks and lists of density control: NumPy twin of kernels/density.cl, in float32, in which it is decided."""
 
 from __future__ import annotations
 

@@ -159,7 +159,7 @@ class Marker:
         return _scored(self.device, self, rules).scores.get()
 
     def rows(self, rules: MarkRules) -> RowList:
-        """What becomes of the rows by the rules."""
+        """List of the rows as they become by the rules."""
         return _listed(self.device, self, rules)
 
 

@@ -50,7 +50,7 @@ class Marker(Protocol):
         """Mean gradients (n,) of what may be densified, less than 0 for the rest."""
 
     def rows(self, rules: MarkRules) -> RowList:
-        """What becomes of the rows by the rules: that which stays, clones, first and second halves."""
+        """List of the rows as they become by the rules: those that stay, clones, first and second halves."""
 
 
 class HostCopy(Protocol):

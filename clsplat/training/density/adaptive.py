@@ -131,8 +131,8 @@ def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
 
 
 def _strongest(config: DensityConfig, model: ModelState, rules: MarkRules) -> tuple[float, int]:
-    """The weakest of the Gaussians that there is room to clone or split, as `MarkRules` has it. The device's scores are
-    looked at only where room may be short."""
+    """Score and row of the weakest Gaussian that there is room to clone or split, for `MarkRules`. Scores are looked at
+    only where room may be short."""
     room = config.max_gaussians - model.count
     if config.growth == "budget":
         room = budget(config, model.step, model.count) - model.count
