@@ -1,4 +1,4 @@
-// Statistics that adaptive density control reads, and the moving of rows that it orders.
+// Statistics that adaptive density control reads, the marking of rows by them, and the moving that it orders.
 //
 // Owner: A work-item owns a Gaussian, in gather_rows a row that is written.
 // Launch: One work-item for each Gaussian or row, in groups of 64; those beyond the last do nothing.
@@ -54,11 +54,70 @@ __kernel void contribution_statistics(const uint n, const float area, __global c
   largest[i] = largest[i] > contribution ? largest[i] : contribution;
 }
 
-// rows (count): which row of `from` each row of `to` is; 0xffffffff for a row of zeros.
-__kernel void gather_rows(const uint count, const uint width, __global const uint *rows, __global const float *from,
-                          __global float *to) {
+// Mean gradients of what may be densified. seen, agreeing (n): views; agreeing has to be over its edge; least_total,
+// least_row: what has less, or as much and no later row, is useless, as is what no view has over contribution_edge ->
+// scores (n): the mean gradient where it is over its edge; else UNWANTED; USELESS. Where a mean is not finite it is 0.
+__kernel void density_scores(const uint n, const float gradient_edge, const float agreeing_edge,
+                             const float contribution_edge, const float least_total, const uint least_row,
+                             __global const float *gradient_sums, __global const float *seen,
+                             __global const float *agreeing, __global const float *whole_totals,
+                             __global const float *whole_largest, __global const float *current_largest,
+                             __global float *scores) {
+  const size_t i = get_global_id(0);
+  if (i >= n) return;
+  const float mean = gradient_sums[i] / (seen[i] < 1.0f ? 1.0f : seen[i]);
+  const float gradient = fabs(mean) < INFINITY ? mean : 0.0f;
+  const bool wanted = gradient > gradient_edge && agreeing[i] > agreeing_edge;
+  const float total = whole_totals[i];
+  const bool useless = (current_largest[i] <= contribution_edge && whole_largest[i] <= contribution_edge) ||
+                       total < least_total || (total == least_total && i <= least_row);
+  scores[i] = useless ? USELESS : wanted ? gradient : UNWANTED;
+}
+
+// What becomes of rows first to first + count of the n. scores, radii (n); log_scales (count, 3), logits (count): of
+// these rows; strongest, strongest_row: a score has to be more, or as much in no later row -> marks (3, n), 0 or 1: the
+// row stays, it gets a clone, it becomes two halves.
+__kernel void density_marks(const uint n, const uint first, const uint count, const float strongest,
+                            const uint strongest_row, const float large_edge, const float transparent_edge,
+                            const float oversized_edge, const float oversized_half_edge, const float radius_edge,
+                            __global const float *scores, __global const float *radii, __global const float *log_scales,
+                            __global const float *logits, __global uint *marks) {
+  const size_t j = get_global_id(0), i = first + j;
+  if (j >= count) return;
+  const float a = log_scales[3 * j], b = log_scales[3 * j + 1], c = log_scales[3 * j + 2], ab = a > b ? a : b;
+  const float largest = a == a && b == b ? (ab > c ? ab : c) : -INFINITY;
+  const float score = scores[i];
+  const bool wanted = score >= 0.0f && (score > strongest || (score == strongest && i <= strongest_row));
+  const bool large = largest > large_edge, gone = score == USELESS || logits[j] <= transparent_edge;
+  const bool stays = !gone && !(largest > oversized_edge);
+  marks[i] = stays && !(wanted && large) && !(radii[i] > radius_edge);
+  marks[(size_t)n + i] = stays && wanted && !large;
+  marks[2 * (size_t)n + i] = !gone && wanted && large && !(largest > oversized_half_edge);
+}
+
+// marks (3, n), places (3, n): their prefix sums, counts[0]: their sum -> rows (2 n): which row of the n each new one
+// is a copy of; those that stay in order, then clones, then all first halves, then all second ones, with FRESH but for
+// the first kind; counts[1]: rows that are split.
+__kernel void density_rows(const uint n, __global const uint *marks, __global const uint *places, __global uint *rows,
+                           __global uint *counts) {
+  const size_t i = get_global_id(0);
+  if (i >= n) return;
+  const uint splits = counts[0] - places[2 * (size_t)n];
+  for (uint kind = 0; kind < 3; ++kind) {
+    const size_t at = kind * (size_t)n + i;
+    if (marks[at] == 0) continue;
+    rows[places[at]] = (uint)i | (kind == 0 ? 0 : FRESH);
+    if (kind == 2) rows[places[at] + splits] = (uint)i | FRESH;
+  }
+  if (i == 0) counts[1] = splits;
+}
+
+// rows (count): which row of `from` each row of `to` is a copy of; those with FRESH are full of `fresh` where `renews`.
+__kernel void gather_rows(const uint count, const uint width, const uint renews, const float fresh,
+                          __global const uint *rows, __global const float *from, __global float *to) {
   const uint j = get_global_id(0);
   if (j >= count) return;
-  const uint row = rows[j];
-  for (uint k = 0; k < width; ++k) to[(size_t)width * j + k] = row == 0xffffffff ? 0.0f : from[(size_t)width * row + k];
+  const bool renewed = renews && (rows[j] & FRESH);
+  const uint row = rows[j] & ~FRESH;
+  for (uint k = 0; k < width; ++k) to[(size_t)width * j + k] = renewed ? fresh : from[(size_t)width * row + k];
 }

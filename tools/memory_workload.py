@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from clsplat.bench.stages import _Picture
 from clsplat.camera import Camera
+from clsplat.config.marking import MarkRules
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device import buffers, launch, program
@@ -36,7 +37,8 @@ from clsplat.scenes.data_set import Lens
 from clsplat.scenes.scene import Scene
 from clsplat.stages.adam import adam
 from clsplat.stages.blend import count_pairs, tile_items
-from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
+from clsplat.stages.density import Marker, carry, gather, new_statistics
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
 from clsplat.stages.limit import _splats
 from clsplat.stages.scan import scan
 from clsplat.stages.sort import bitonic_sort, radix_sort
@@ -222,6 +224,23 @@ def sorts(device: Device) -> None:
         raise SystemExit("2100 values were not added up")
 
 
+def density(device: Device) -> None:
+    """Rows that are marked, listed and gathered, of a model on the device and of one on the host, in parts."""
+    count = 3 * device.row_alignment + 1
+    gaussians = cloud(count, camera(20, 17), 9, degree=1)
+    statistics = new_statistics(device, count, agreement=True, contributions=True)
+    statistics.load({name: np.linspace(0, 2, count, dtype=np.float32) for name in statistics.named()})
+    rules = MarkRules(gradient=0.5, strongest=(0.8, 9), large=-2.0, transparent=-5.0, contribution=0.01, radius=1.9)
+    for model in (upload_gaussians(device, gaussians), host_gaussians(gaussians, device.row_alignment)):
+        listed = Marker(device, Workspace(device), model, statistics).rows(rules)
+        after = new_statistics(device, listed.count, agreement=True, contributions=True)
+        carry(device, listed.rows, statistics, after, densified=True)
+        if isinstance(model, DeviceGaussians):
+            gather(device, listed.rows, model, renews=True)["means"].get()
+        if not 0 < listed.halves < listed.count or not np.isinf(after.named()["whole_totals"].get()).any():
+            raise SystemExit("nothing is split, or nothing is new")
+
+
 def limits(device: Device) -> None:
     """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the probes of the
     tests and of the self-test."""
@@ -338,7 +357,7 @@ def main(arguments: list[str]) -> int:
     print("probe_fma", flush=True)  # which a device runs before its first kernel, where it has lanes
     if shape.items == 1:
         opened.kind = "cpu"  # the launches too are then those of a CPU
-    for part in (sorts, limits, frames, by_two_launches, rendering, pictures, training):
+    for part in (sorts, limits, frames, by_two_launches, rendering, pictures, density, training):
         part(opened)
     return 0
 

@@ -78,9 +78,9 @@ class DeviceArray:
             event = cl.enqueue_fill_buffer(self.device.queue, self.buffer, pattern, 0, self.nbytes)
             self._note("fill", event)
 
-    def _note(self, name: str, event: cl.Event) -> None:
+    def _note(self, name: str, event: cl.Event, nbytes: int | None = None) -> None:
         if self.device.recorder.on:
-            self.device.recorder.add(name, event, self.nbytes)
+            self.device.recorder.add(name, event, self.nbytes if nbytes is None else nbytes)
 
     def read_into(self, host: NDArray[Any]) -> None:
         """Copy to a C-contiguous array of the same shape on the host; waits for the device."""
@@ -103,6 +103,27 @@ class DeviceArray:
             return host
 
         return finish
+
+    def get_rows(self, start: int, stop: int) -> NDArray[Any]:
+        """A copy of the rows from start to before stop on the host, from any start; waits for the device."""
+        host = np.empty((stop - start, *self.shape[1:]), self.dtype)
+        if host.size:
+            self.device.calls.blocking_reads += 1
+            begin = start * (self.nbytes // self.shape[0])
+            event = cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=begin, is_blocking=True)
+            self._note("read", event, host.nbytes)
+            self.device.under_way.clear()
+        return host
+
+    def set_rows(self, start: int, values: NDArray[Any]) -> None:
+        """Copy from the host to the rows from any start on; waits for the device."""
+        if values.size:
+            self.device.calls.blocking_writes += 1
+            begin = start * (self.nbytes // self.shape[0])
+            host = np.ascontiguousarray(values, self.dtype)
+            event = cl.enqueue_copy(self.device.queue, self.buffer, host, dst_offset=begin, is_blocking=True)
+            self._note("write", event, host.nbytes)
+            self.device.under_way.clear()
 
     def rows(self, start: int, stop: int) -> DeviceArray:
         """The rows [start, stop) in place. `start` has to be a multiple of `Device.row_alignment`."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from clsplat.config.marking import FRESH, UNWANTED, USELESS
+
 TILE = 16
 """Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
@@ -99,6 +101,7 @@ def header() -> str:
     """The declarations as OpenCL C."""
     lines = [f"#define TILE {TILE}", f"#define LOSS_RING {LOSS_RING}"]
     lines += [f"#define LOSS_COLUMNS {LOSS_COLUMNS}", f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}"]
+    lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
     layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK, "DEEP": DEEP}
     for prefix, fields in layouts.items():
         lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]

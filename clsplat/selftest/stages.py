@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
+from clsplat.config.marking import MarkRules
 from clsplat.config.training import OptimiserConfig
-from clsplat.device.buffers import DeviceArray, upload
+from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.launch import launch_items
 from clsplat.device.layout import READBACK, SLOT, SLOT_PLAIN, SPLAT, TILE
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference import adam as reference_adam
 from clsplat.reference import blend as reference_blend
+from clsplat.reference import density as reference_density
 from clsplat.reference import loss as reference_loss
 from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters
@@ -28,7 +30,7 @@ from clsplat.selftest.picture_stages import PICTURES
 from clsplat.selftest.scenes import evenly, keys, padded
 from clsplat.stages.adam import adam
 from clsplat.stages.blend import blend, blend_grad
-from clsplat.stages.density import add_statistics, new_statistics
+from clsplat.stages.density import DensityStatistics, Marker, add_statistics, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.duplicate import Pairs, count, duplicate
 from clsplat.stages.loss import loss
@@ -409,8 +411,23 @@ def _statistics(bench: Bench) -> Outcome:
     radii = np.ceil(3 * np.sqrt(0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy))) * visible
     near = np.abs(norms - 1.0) < 1e-5
     wrong = int((got["seen"] != 2 * visible).sum()) + int((got["agreeing"] != 2 * (norms >= 1.0))[~near].sum())
+    wrong += _marks_wrong(bench, statistics)
     wrong += int((np.abs(got["radii"] - radii) > 1).sum()) + int((got["radii"] != radii).sum() > 1 + n // 100)
     return outcome.compared({"gradient sums": (got["gradient_sums"], 2 * norms)}, counts=wrong)
+
+
+def _marks_wrong(bench: Bench, statistics: DensityStatistics) -> int:
+    """Entries of the list of rows that are not the twin's, by edges that cut every statistic in two."""
+    device, model = bench.device, bench.model
+    known = {name: array.get() for name, array in statistics.named().items()}
+    scales, logits = model["log_scales"].get(), model["opacity_logits"].get()
+    middle, limit = 0.500001 * float(np.median(known["gradient_sums"])), float(np.median(scales.max(axis=1)))
+    rules = MarkRules(gradient=middle, large=limit, transparent=float(np.median(logits)) - 1, oversized=limit + 2)
+    rows, halves = reference_density.rows(rules, known, scales, logits)
+    got = Marker(device, Workspace(device), model, statistics).rows(rules)
+    if got.count != len(rows):
+        return abs(got.count - len(rows))
+    return int((got.rows.get() != rows).sum()) + abs(got.halves - halves)
 
 
 RUN: dict[str, Callable[[Bench], Outcome]] = {

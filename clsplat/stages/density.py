@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.device.buffers import DeviceArray, allocate, upload
+from clsplat.config.marking import FRESH, MarkRules
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
+from clsplat.device.layout import SPLAT
 from clsplat.device.profile import stage
 from clsplat.gaussians import group_shapes
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians, groups_of, parts
 from clsplat.stages.project import Projected, Screen
-
-NO_ROW = np.uint32(0xFFFFFFFF)
-"""Entry of a list of rows that stands for a row of zeros."""
+from clsplat.stages.scan import scan
 
 
 def gaussian_bytes(*, agreement: bool, contributions: bool) -> int:
@@ -28,6 +28,7 @@ def gaussian_bytes(*, agreement: bool, contributions: bool) -> int:
     return 4 * (3 + agreement + 4 * contributions)
 
 
+SCORED = ("whole_totals", "whole_largest", "current_largest")
 CONTRIBUTIONS = ("current_totals", "current_largest", "whole_totals", "whole_largest")
 
 
@@ -57,15 +58,6 @@ class DensityStatistics:
     def named(self) -> dict[str, DeviceArray]:
         """Every array by its name, which it has in a checkpoint too."""
         return {name: array for name, array in vars(self).items() if array is not None}
-
-    def moved(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_], *, densified: bool) -> dict[str, Float32]:
-        """The arrays that are kept, on the host by `named`, when row j becomes what row rows[j] was: contributions,
-        infinite for fresh rows; and everything else if nothing was densified."""
-        going_on = {name: array for name, array in self.named().items() if name in CONTRIBUTIONS or not densified}
-        values = {name: array.get()[rows] for name, array in going_on.items()}
-        for array in values.values():
-            array[fresh] = np.inf
-        return values
 
     def load(self, values: Mapping[str, Float32]) -> None:
         """Take those of the arrays `named` that `values` has from the host."""
@@ -138,32 +130,130 @@ def add_contributions(
     launch_items(device, kernel, n, n, area, *view, statistics.current_totals, statistics.current_largest)
 
 
+@dataclass(frozen=True, eq=False)
+class RowList:
+    """Rows of a model as they are to become, on the device: (m,) uint32, each the row that it is a copy of, and FRESH.
+    halves: how many, at its end, are halves: first one of each Gaussian that is split, then the other ones."""
+
+    rows: DeviceArray
+    halves: int
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return self.rows.shape[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """Marks the Gaussians of a model by their statistics. What it writes lies in the scratch of `work` where a frame
+    has its splats: there is no frame meanwhile, and the lists are good until the next one."""
+
+    device: Device
+    work: Workspace
+    parameters: AnyGaussians
+    statistics: DensityStatistics
+
+    def scores(self, rules: MarkRules) -> Float32:
+        """Mean gradients (n,) of what may be densified, less than 0 for the rest."""
+        return _scored(self.device, self, rules).scores.get()
+
+    def rows(self, rules: MarkRules) -> RowList:
+        """List of the rows as they become by the rules."""
+        return _listed(self.device, self, rules)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scratch:
+    """scores (n) f32; room for marks (3n), places (3n) and rows (2n), all u32."""
+
+    scores: DeviceArray
+    marks: DeviceArray
+    places: DeviceArray
+    rows: DeviceArray
+
+
+@stage("density")
+def _scored(device: Device, marker: Marker, rules: MarkRules) -> _Scratch:
+    n, statistics, unit = marker.parameters.count, marker.statistics, device.row_alignment
+    sizes = (n, 3 * n, 3 * n, 2 * n)
+    begins = [0, *np.cumsum([-(-size // unit) * unit for size in sizes]).tolist()]
+    space = marker.work.array("splats", (max(begins[-1], len(SPLAT) * n),), np.uint32)
+    scores, *rest = (space.rows(begin, begin + size) for begin, size in zip(begins, sizes, strict=False))
+    scratch = _Scratch(replace(scores, dtype=np.dtype(np.float32)), *rest)
+    views = (statistics.gradient_sums, statistics.seen)
+    known = [getattr(statistics, name) or statistics.seen for name in ("agreeing", *SCORED)]
+    edges = (rules.gradient, rules.agreeing, rules.contribution, *rules.least)
+    launch_items(device, device.kernels("density").density_scores, n, n, *edges, *views, *known, scratch.scores)
+    return scratch
+
+
+@stage("density")
+def _listed(device: Device, marker: Marker, rules: MarkRules) -> RowList:
+    n, model, kernels = marker.parameters.count, marker.parameters, device.kernels("density")
+    scratch, counts = _scored(device, marker, rules), allocate(device, (2,), np.uint32)
+    columns = groups_of(model, "log_scales", "opacity_logits")
+    edges = (rules.large, rules.transparent, rules.oversized, rules.oversized_half, rules.radius)
+    for start, stop, (part,) in parts(marker.work, columns):
+        some, arrays = stop - start, (scratch.scores, marker.statistics.radii, *part.arrays.values(), scratch.marks)
+        launch_items(device, kernels.density_marks, some, n, start, some, *rules.strongest, *edges, *arrays)
+    scan(device, marker.work, scratch.marks, scratch.places, counts)
+    launch_items(device, kernels.density_rows, n, n, scratch.marks, scratch.places, scratch.rows, counts)
+    total, splits = (int(number) for number in counts.get())
+    return RowList(scratch.rows.reshaped(total + splits), 2 * splits)
+
+
+def list_rows(device: Device, rows: NDArray[np.uint32], fresh: NDArray[np.bool_] | None) -> RowList:
+    """A list from the host: row j is a copy of row rows[j], and fresh where that says so."""
+    entries = rows.astype(np.uint32) if fresh is None else np.where(fresh, rows | FRESH, rows).astype(np.uint32)
+    return RowList(upload(device, entries), halves=0)
+
+
 def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
     """Launch what `gather` does, on arrays that are there already and of no use afterwards; for `launch.only_tried`."""
     if isinstance(source, DeviceGaussians):
-        array, kernel = source["opacity_logits"], device.kernels("density").gather_rows
-        few = min(count, source.count)
-        launch_items(device, kernel, few, few, 1, array, array, array)
+        array = source["opacity_logits"]
+        _gather_array(device, array.reshaped(min(count, source.count)), array, array, None)
 
 
-def gather(device: Device, rows: NDArray[np.uint32], source: AnyGaussians) -> AnyGaussians:
-    """New arrays, where the source is, of which row j is row rows[j] of the source, or zeros at NO_ROW. Parameters and
-    moments alike."""
-    count = len(rows)
-    if isinstance(source, HostGaussians):
-        host = {name: array.values[np.where(rows == NO_ROW, 0, rows)] for name, array in source.arrays.items()}
-        for values in host.values():
-            values[rows == NO_ROW] = 0.0
-        return replace(source, count=count, arrays={name: HostArray(values) for name, values in host.items()})
-    rows_array = upload(device, rows)
+@stage("density")
+def gather(
+    device: Device, rows: DeviceArray | NDArray[np.uint32], source: AnyGaussians, *, renews: bool = False
+) -> AnyGaussians:
+    """New arrays, where the source and the rows are, of which row j is row rows[j] of the source; renews: those that
+    are FRESH are zeros. Parameters and moments alike."""
+    count = rows.shape[0]
+    if isinstance(rows, DeviceArray):
+        assert isinstance(source, DeviceGaussians)
+        arrays = {}
+        for name, shape in group_shapes(count, source.coefficients).items():
+            arrays[name] = allocate(device, shape, np.float32)
+            _gather_array(device, rows, source[name], arrays[name], 0.0 if renews else None)
+        return DeviceGaussians(count, source.coefficients, arrays)
+    assert isinstance(source, HostGaussians)
+    host = {name: array.values[rows & ~FRESH] for name, array in source.arrays.items()}
+    for values in host.values() if renews else ():
+        values[rows >= FRESH] = 0.0
+    return replace(source, count=count, arrays={name: HostArray(values) for name, values in host.items()})
+
+
+@stage("density")
+def carry(
+    device: Device, rows: DeviceArray, source: DensityStatistics, to: DensityStatistics, *, densified: bool
+) -> None:
+    """Go on with statistics in arrays of new sizes: contributions, and everything else if nothing was densified; row j
+    is row rows[j] of the source, and infinite where it is FRESH."""
+    for name, array in to.named().items():
+        if name in CONTRIBUTIONS or not densified:
+            _gather_array(device, rows, source.named()[name], array, np.inf)
+
+
+def _gather_array(device: Device, rows: DeviceArray, source: DeviceArray, to: DeviceArray, fresh: float | None) -> None:
+    """Gather rows of an array. fresh: the value of those that are FRESH, None for copies."""
+    count, width = rows.shape[0], int(np.prod(source.shape[1:]))
     kernel = device.kernels("density").gather_rows
-    arrays = {}
-    for name, shape in group_shapes(count, source.coefficients).items():
-        arrays[name] = allocate(device, shape, np.float32)
-        width = int(np.prod(shape[1:]))
-        if width:
-            launch_items(device, kernel, count, count, width, rows_array, source[name], arrays[name])
-    return DeviceGaussians(count, source.coefficients, arrays)
+    if width:
+        launch_items(device, kernel, count, count, width, fresh is not None, float(fresh or 0.0), rows, source, to)
 
 
 def widen(device: Device, source: AnyGaussians, coefficients: int) -> AnyGaussians:

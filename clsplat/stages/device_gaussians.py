@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -74,6 +74,14 @@ class HostArray:
         """Copy from another array."""
         self.values[...] = values
 
+    def get_rows(self, start: int, stop: int) -> NDArray[Any]:
+        """A copy of the rows from start to before stop."""
+        return self.values[start:stop].copy()
+
+    def set_rows(self, start: int, values: NDArray[Any]) -> None:
+        """Copy from another array to the rows from start on."""
+        self.values[start : start + len(values)] = values
+
     def fill(self, value: float) -> None:
         """Set every element."""
         self.values.fill(value)
@@ -87,6 +95,13 @@ class HostGaussians(_ByGroup[HostArray]):
 
 
 AnyGaussians = DeviceGaussians | HostGaussians
+
+
+def groups_of(model: AnyGaussians, *names: str) -> AnyGaussians:
+    """The model with these arrays alone, the same ones."""
+    if isinstance(model, HostGaussians):
+        return replace(model, arrays={name: model[name] for name in names})
+    return replace(model, arrays={name: model[name] for name in names})
 
 
 def parts(

@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
+from clsplat.config.marking import FRESH
 from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.errors import InputError
@@ -24,11 +27,14 @@ from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.initialise import from_scene
 from clsplat.stages.adam import updates_sh_rest
 from clsplat.stages.density import (
-    NO_ROW,
     DensityStatistics,
+    Marker,
+    RowList,
     add_contributions,
     add_statistics,
+    carry,
     gather,
+    list_rows,
     new_statistics,
     try_gather,
     widen,
@@ -46,7 +52,7 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.stages.loss import Loss
-from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
+from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.health import Patience
 from clsplat.training.monitor import LastStep, Remedy, Watch
@@ -350,43 +356,61 @@ class Trainer:
 
     def _state(self) -> ModelState:
         model, statistics = self.parameters, self.statistics.named()
-        return ModelState(model.count, self.step, self.scene.extent, model.arrays, statistics, self.rng)
+        marker = Marker(self.device, self.rasterizer.work, model, self.statistics)
+        return ModelState(model.count, self.step, self.scene.extent, model.arrays, statistics, self.rng, marker)
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out what density control, or a repair, has planned for the rows of everything."""
         if plan is None:
             return
+        listed = plan.listed
         if plan.rows is not None:
-            self._move(plan.rows, plan.fresh, new_statistics=plan.new_statistics)
+            listed = list_rows(self.device, plan.rows, plan.fresh)
+        if listed is not None:
+            assert isinstance(listed, RowList)
+            self._move(listed.rows, new_statistics=plan.new_statistics)
+            if listed.halves and plan.halves is not None:
+                self._halve(listed, plan.halves)
         self.mark = None
         for group, (rows, values) in plan.values.items():
             changed = self.parameters[group].get()
             changed[rows] = values
             self.parameters[group].set(changed)
+        for group, change in plan.changes.items():
+            self.parameters[group].set(change(self.parameters[group].get()))
         for group in plan.restarted:
             self.first[group].fill(0.0)
             self.second[group].fill(0.0)
         if plan.forget_contributions:
             self.statistics.forget_contributions()
 
-    def _move(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_] | None, *, new_statistics: bool) -> None:
-        """Make row j of everything what row rows[j] was, with moments of zero where it is fresh."""
+    def _halve(self, listed: RowList, halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]]) -> None:
+        """Make the last rows, copies yet of what is split, the halves of that."""
+        count, half = listed.count, listed.halves // 2
+        split = {group: self.parameters[group].get_rows(count - half, count) for group in HALVED}
+        for group, values in halves(split).items():
+            self.parameters[group].set_rows(count - listed.halves, values)
+
+    def _move(self, listed: DeviceArray, *, new_statistics: bool) -> None:
+        """Make row j of everything what row listed[j] was, with moments of zero where it is FRESH."""
         device, gathers = self.device, self.plan.gathers
-        fresh = np.zeros(len(rows), bool) if fresh is None else fresh
         with only_tried(device):
-            try_gather(device, len(rows), self.parameters)
+            try_gather(device, listed.shape[0], self.parameters)
         self.mark = None
-        self._make_plan(len(rows))
-        models = [*self.models().values()] if gathers and self.plan.gathers else self._take_down()
-        statistics = self.statistics.moved(rows, fresh, densified=new_statistics)
-        del self.statistics
-        moment_rows = np.where(fresh, NO_ROW, rows)
-        rows_of = (rows, moment_rows, moment_rows)
-        parameters, first, second = (gather(device, r, model) for r, model in zip(rows_of, models, strict=True))
+        self._make_plan(listed.shape[0])
+        rows: DeviceArray | NDArray[np.uint32] = listed
+        models = [*self.models().values()]
+        if not (gathers and self.plan.gathers):
+            del models
+            models, rows = [*self._take_down()], listed.get()
+        statistics = self.statistics
+        moved = [gather(device, rows, model, renews=index > 0) for index, model in enumerate(models)]
         del models
-        self._set_parameters(*(self._placed(model) for model in (parameters, first, second)))
-        self.statistics.load(statistics)
-        self.strategy.rearranged(rows, fresh)
+        self._set_parameters(*(self._placed(model) for model in moved))
+        carry(device, listed, statistics, self.statistics, densified=new_statistics)
+        if type(self.strategy).rearranged is not Strategy.rearranged:
+            entries = listed.get()
+            self.strategy.rearranged(entries & ~FRESH, entries >= FRESH)
 
     def local(self, camera: Camera) -> Camera:
         """A camera in the world as one for the model in training: see `Gaussians.local`."""

@@ -59,6 +59,7 @@ BROKEN = {
     "adam: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
     "project_grad: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
     "density: fma1(gx, gx, gy * gy)": ("fma1(gx, gx, gx * gy)", "statistics"),
+    "density: stays && wanted && !large": ("stays && wanted && large", "statistics"),
 }
 """What is miscompiled: kernel and words, the words that stand there then, and the stage that is to notice."""
 

@@ -15,7 +15,7 @@ from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SLOT, SlotFields
 from clsplat.reference import render as reference
-from clsplat.stages.density import CONTRIBUTIONS, add_contributions, new_statistics
+from clsplat.stages.density import CONTRIBUTIONS, add_contributions, carry, list_rows, new_statistics
 from clsplat.stages.project import Projected
 
 WITH = SlotFields(contributions=True)
@@ -133,15 +133,13 @@ def test_what_goes_on_when_rows_move(device: Device) -> None:
         *("gradient_sums", "seen", "radii", "agreeing"),
         *("current_totals", "current_largest", "whole_totals", "whole_largest"),
     ]
-    rows = np.array([0, 2, 3, 2], np.uint32)
-    densified = statistics.moved(rows, np.array([False, False, False, True]), densified=True)
-    assert list(densified) == names[4:], "the rest starts again"
-    for index, values in enumerate(densified.values(), 4):
-        np.testing.assert_array_equal(values, np.array([0, 2, 3, np.inf]) + 10 * index)
-    pruned = statistics.moved(rows[:3], np.zeros(3, bool), densified=False)
-    for index, name in enumerate(names):
-        np.testing.assert_array_equal(pruned[name], np.array([0, 2, 3]) + 10 * index)
-    after = new_statistics(device, 3, agreement=True, contributions=True)
-    after.load(pruned)
-    for name, array in after.named().items():
-        np.testing.assert_array_equal(array.get(), pruned[name])
+    listed = list_rows(device, np.array([0, 2, 3, 2], np.uint32), np.array([False, False, False, True]))
+    densified = new_statistics(device, 4, agreement=True, contributions=True)
+    carry(device, listed.rows, statistics, densified, densified=True)
+    for index, (name, array) in enumerate(densified.named().items()):
+        wanted = np.array([0, 2, 3, np.inf]) + 10 * index if name in CONTRIBUTIONS else np.zeros(4)
+        np.testing.assert_array_equal(array.get(), wanted, f"{name}: all else starts again")
+    pruned = new_statistics(device, 3, agreement=True, contributions=True)
+    carry(device, list_rows(device, np.array([0, 2, 3], np.uint32), None).rows, statistics, pruned, densified=False)
+    for index, array in enumerate(pruned.named().values()):
+        np.testing.assert_array_equal(array.get(), np.array([0, 2, 3]) + 10 * index)

@@ -3,20 +3,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scenes
-from compare import assert_close
+from compare import assert_close, assert_same_bits
 from pipeline import Pipeline
 
 from clsplat.camera import Camera
-from clsplat.device.buffers import upload
+from clsplat.config.marking import MarkRules
+from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
 from clsplat.gaussians import GROUPS, Gaussians, group_shapes
+from clsplat.reference import density as twin
 from clsplat.reference import render as reference
-from clsplat.stages.density import NO_ROW, add_statistics, gather, new_statistics, widen
-from clsplat.stages.device_gaussians import DeviceGaussians
+from clsplat.stages.density import Marker, add_statistics, gather, list_rows, new_statistics, widen
+from clsplat.stages.device_gaussians import DeviceGaussians, to_host
 from clsplat.stages.project import Projected, Screen
 
 SIZES = (1, 2, 63, 64, 65, 127, 129, 1025)
@@ -41,16 +45,73 @@ def test_gather_takes_rows_and_zeros(device: Device, count: int, coefficients: i
     rng = np.random.default_rng(1)
     for length in (1, count, 2 * count + 1):
         rows = rng.integers(0, count, length).astype(np.uint32)
-        rows[::3] = NO_ROW
         rows[-1] = count - 1
-        got = gather(device, rows, source)
-        assert (got.count, got.coefficients) == (length, coefficients)
-        for name in GROUPS:
-            wanted = host[name][np.where(rows == NO_ROW, 0, rows)]
-            wanted[rows == NO_ROW] = 0
-            np.testing.assert_array_equal(got[name].get(), wanted, err_msg=name)
+        fresh = np.arange(length) % 3 == 0
+        listed = list_rows(device, rows, fresh)
+        for renews in (False, True):
+            got = gather(device, listed.rows, source, renews=renews)
+            on_host = gather(device, listed.rows.get(), to_host(source), renews=renews)
+            assert (got.count, got.coefficients) == (length, coefficients)
+            for name in GROUPS:
+                wanted = host[name][rows]
+                wanted[fresh & renews] = 0
+                np.testing.assert_array_equal(got[name].get(), wanted, err_msg=name)
+                np.testing.assert_array_equal(on_host[name].get(), wanted, err_msg=f"{name} on the host")
     for name in GROUPS:
         np.testing.assert_array_equal(source[name].get(), host[name], err_msg=f"{name} of the source")
+
+
+RULES = MarkRules(
+    gradient=2.0, agreeing=1.0, strongest=(3.0, 40), large=0.5, transparent=-1.0, oversized=2.0, oversized_half=1.5
+)
+
+
+@pytest.mark.parametrize("count", SIZES)
+@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize("streamed", [False, True])
+def test_marks_are_the_twins(device: Device, count: int, wide: bool, streamed: bool) -> None:
+    """Every statistic, scale and opacity is at an edge, next to it, or not a number, for some Gaussian."""
+    rng = np.random.default_rng(count)
+
+    def values(*around: float, size: tuple[int, ...] = (count,)) -> np.ndarray:
+        at = np.array(around, np.float32)
+        near = (at, *(np.nextafter(at, np.float32(side)) for side in (-np.inf, np.inf)))
+        return rng.choice(np.concatenate([*near, [-9, 0, 9, np.nan, np.inf, -np.inf]]).astype(np.float32), size)
+
+    statistics = new_statistics(device, count, agreement=wide, contributions=wide)
+    host = {name: values(0.25, 1, 4) for name in statistics.named()}
+    host["gradient_sums"], host["seen"] = values(2, 3, 6, 9), rng.integers(0, 4, count).astype(np.float32)
+    statistics.load(host)
+    source, parameters = numbered(device, count, 1)
+    parameters["log_scales"] = values(0.5, 1.5, 2, size=(count, 3))
+    parameters["opacity_logits"] = values(-1)
+    for name in ("log_scales", "opacity_logits"):
+        source[name].set(parameters[name])
+    work = Workspace(device)
+    model = replace(to_host(source), rows=device.row_alignment) if streamed else source
+    marker = Marker(device, work, model, statistics)
+    limits = (MarkRules(), RULES, replace(RULES, radius=4.0, contribution=0.25, least=(1.0, count // 2)))
+    for limit in (*limits, replace(limits[2], gradient=0.0, strongest=(-np.inf, 0))):
+        rules = limit
+        if not wide:
+            rules = replace(rules, agreeing=-np.inf, contribution=-np.inf, least=MarkRules.least)
+        scored = twin.scores(rules, host)
+        np.testing.assert_array_equal(marker.scores(rules), scored)
+        entries, halves = twin.rows(rules, host, parameters["log_scales"], parameters["opacity_logits"])
+        got = marker.rows(rules)
+        np.testing.assert_array_equal(got.rows.get(), entries)
+        assert (got.count, got.halves) == (len(entries), halves)
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_any_rows_are_read_and_written(device: Device, count: int) -> None:
+    host = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
+    array = upload(device, host)
+    for start in {0, 1, count // 2, count}:
+        assert_same_bits(array.get_rows(start, count), host[start:])
+        array.set_rows(start, -host[start:])
+        host[start:] *= -1
+        assert_same_bits(array.get(), host)
 
 
 @pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 9), (1, 16), (9, 16)])

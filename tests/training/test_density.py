@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from marking import TwinMarker, on_host
 from numpy.typing import ArrayLike
 
 from clsplat.config.training import DensityConfig
@@ -27,8 +28,9 @@ def logit(opacity: ArrayLike) -> np.ndarray:
 
 def state(step: int, extent: float, parameters: dict[str, np.ndarray], statistics: dict[str, np.ndarray]) -> ModelState:
     """A model whose arrays are on the host."""
-    on_host = ({name: HostArray(values) for name, values in arrays.items()} for arrays in (parameters, statistics))
-    return ModelState(len(parameters["opacity_logits"]), step, extent, *on_host, np.random.default_rng(0))
+    arrays = ({name: HostArray(values) for name, values in held.items()} for held in (parameters, statistics))
+    marker = TwinMarker(parameters, statistics)
+    return ModelState(len(parameters["opacity_logits"]), step, extent, *arrays, np.random.default_rng(0), marker)
 
 
 def make_plan(
@@ -53,7 +55,7 @@ def make_plan(
     }
     parameters = {"log_scales": log_scales, "opacity_logits": np.broadcast_to(logit(opacities), n)}
     parameters |= {"means": np.zeros((n, 3), np.float32), "quaternions": np.ones((n, 4), np.float32)}
-    return plan(config, state(step, EXTENT, parameters, statistics))
+    return on_host(plan(config, state(step, EXTENT, parameters, statistics)), parameters)
 
 
 def split_of(made: RowPlan) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from marking import on_host
 from numpy.typing import ArrayLike
 from test_density import state
 
@@ -51,7 +52,7 @@ def make_plan(
     if agreeing is not None:
         statistics["agreeing"] = np.asarray(agreeing, np.float32)
     parameters = {"log_scales": np.full((n, 3), np.log(0.05), np.float32), "opacity_logits": np.log(o / (1 - o))}
-    return plan(config, state(step, 10.0, parameters, {**statistics, **(known or {})}))
+    return on_host(plan(config, state(step, 10.0, parameters, {**statistics, **(known or {})})), parameters)
 
 
 def cloned(made: RowPlan) -> list[int]:
@@ -158,12 +159,12 @@ def test_pruning_alone_adds_nothing_and_asks_for_less() -> None:
     config = replace(CONFIG, min_contribution=0.5, prune_every=100)
     opacities = np.array([0.5, 0.004, 0.5, 0.5])
     logits = np.log(opacities / (1 - opacities)).astype(np.float32)
-    made = plan_pruning(config, state(20_000, 10.0, {"opacity_logits": logits}, contributions([9, 9, 0.4, 9])))
+    known = {"opacity_logits": logits}
+    made = on_host(plan_pruning(config, state(20_000, 10.0, known, contributions([9, 9, 0.4, 9]))), known)
     assert (made.rows.tolist(), made.fresh.any(), made.values) == ([0, 3], False, {})
     assert made.rows.dtype == np.uint32
-    made = plan_pruning(
-        replace(config, min_contribution=0.0), state(20_000, 10.0, {"opacity_logits": np.zeros(3, np.float32)}, {})
-    )
+    known = {"opacity_logits": np.zeros(3, np.float32)}
+    made = on_host(plan_pruning(replace(config, min_contribution=0.0), state(20_000, 10.0, known, {})), known)
     assert made.rows.tolist() == [0, 1, 2]
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import signal
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from compare import assert_close, assert_same_bits
+from marking import on_host
 from test_density import split_of
 from tiny import CONFIG, EVENTS, HEIGHT, WIDTH, hidden_model, short, write_scene
 
@@ -131,6 +133,12 @@ def test_evaluation_on_the_way_changes_nothing(
 # Repeating
 
 
+def looked_at(made: RowPlan, config: DensityConfig, trainer: Trainer) -> RowPlan:
+    """The plan on the host, with halves by another generator than the training's."""
+    drawn = partial(adaptive.draw_halves, config, rng=np.random.default_rng())
+    return on_host(replace(made, halves=drawn), host(trainer.parameters))
+
+
 def test_the_test_run_has_everything_in_it(
     scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,8 +148,9 @@ def test_the_test_run_has_everything_in_it(
 
     def plan(config: DensityConfig, model: ModelState) -> RowPlan:
         counts.append(model.count)
-        plans[model.step] = real(config, model)
-        return plans[model.step]
+        made = real(config, model)
+        plans[model.step] = looked_at(made, config, trainer)
+        return made
 
     monkeypatch.setattr(adaptive, "plan", plan)
     real_reset = adaptive.reset_opacities
@@ -363,10 +372,15 @@ def trained_to(scene: Scene, device: Device, step: int, config: TrainConfig = CO
 
 def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """After step 25 some are cloned, some split, some kept: what a row was is what it is, what is fresh has none."""
-    plans, real = [], adaptive.plan
-    monkeypatch.setattr(adaptive, "plan", lambda *args, **values: plans.append(real(*args, **values)) or plans[-1])
     trainer = trained_to(scene, default_device, 25)
-    plans.clear()
+    plans, real = [], adaptive.plan
+
+    def noted(config: DensityConfig, model: ModelState) -> RowPlan:
+        made = real(config, model)
+        plans.append(looked_at(made, config, trainer))
+        return made
+
+    monkeypatch.setattr(adaptive, "plan", noted)
     before = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
     trainer._control_density()
     (plan,) = plans

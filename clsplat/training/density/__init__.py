@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.config.marking import MarkRules
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,29 @@ class StatisticsNeeds:
     contributions: bool = False
 
 
+class RowList(Protocol):
+    """Rows of a model as they are to become, wherever the list is. halves: how many, at its end, are halves: first
+    those of every Gaussian that is split, then as many of the same."""
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+
+    @property
+    def halves(self) -> int:
+        """Number of rows that are halves."""
+
+
+class Marker(Protocol):
+    """Comparisons of every Gaussian of a model with rules, where its arrays are."""
+
+    def scores(self, rules: MarkRules) -> Float32:
+        """Mean gradients (n,) of what may be densified, less than 0 for the rest."""
+
+    def rows(self, rules: MarkRules) -> RowList:
+        """List of the rows as they become by the rules: those that stay, clones, first and second halves."""
+
+
 class HostCopy(Protocol):
     """An array on the device or the host."""
 
@@ -39,7 +63,7 @@ class HostCopy(Protocol):
 @dataclass(frozen=True, eq=False)
 class ModelState:
     """The model of `count` Gaussians after `step` steps, as a strategy sees it. extent: the scene's, in world units;
-    parameters by group; statistics by the names that they have in a checkpoint."""
+    parameters by group; statistics by the names that they have in a checkpoint; marker: compares them with rules."""
 
     count: int
     step: int
@@ -47,6 +71,11 @@ class ModelState:
     parameters: Mapping[str, HostCopy]
     statistics: Mapping[str, HostCopy]
     rng: np.random.Generator
+    marker: Marker
+
+
+HALVED = ("means", "quaternions", "log_scales")
+"""Groups that halves are made by."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +83,19 @@ class RowPlan:
     """The rows of the model as they are to become.
 
     rows (m,) uint32: the row that each is a copy of, None if all stay; fresh (m,) bool: rows whose moments start at
-    zero and whose contributions are not known; values: by parameter group, the indices of rows that change, counted as
-    they are then, and what they become (k, ...); restarted: groups whose moments start at zero in every row.
-    new_statistics: all but contributions start from zero; forget_contributions: of no row they are known.
+    zero and whose contributions are not known; listed: in place of both, what the model's marker has listed; values: by
+    parameter group, the indices of rows that change, counted as they are then, and what they become (k, ...); halves:
+    what becomes of the groups HALVED of a list's halves, by those of what is split; changes: by group, what becomes of
+    all of it; restarted: groups whose moments start at zero in every row. new_statistics: all but contributions start
+    from zero; forget_contributions: of no row they are known.
     """
 
     rows: NDArray[np.uint32] | None = None
     fresh: NDArray[np.bool_] | None = None
+    listed: RowList | None = None
     values: Mapping[str, tuple[NDArray[Any], Float32]] = field(default_factory=dict)
+    halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]] | None = None
+    changes: Mapping[str, Callable[[Float32], Float32]] = field(default_factory=dict)
     restarted: tuple[str, ...] = ()
     new_statistics: bool = False
     forget_contributions: bool = False

@@ -3,16 +3,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.config.marking import MarkRules, edge
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
-from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
+from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy
 
 
 class Adaptive(Strategy):
@@ -43,19 +45,17 @@ class Adaptive(Strategy):
 
     def before_step(self, model: ModelState) -> RowPlan:
         """Densify or prune, then reset opacities, whichever is due."""
-        config, step = self.config, model.step
-        logits, made = model.parameters["opacity_logits"].get(), RowPlan()
+        config, step, made = self.config, model.step, RowPlan()
         if (densifies := is_due(config, step)) or is_pruning_due(config, step):
             made = plan(config, model) if densifies else plan_pruning(config, model)
-            logits = logits[made.rows]
-            if len(logits) == 0:
+            if made.listed is not None and made.listed.count == 0:
                 raise ClsplatError(
                     f"step {step}: every Gaussian was pruned; lower --density.min-opacity"
                     + (" or --density.min-contribution" if config.min_contribution > 0 else "")
                 )
         if is_reset_due(config, step, white=self.white):
-            values = {**made.values, "opacity_logits": (np.arange(len(logits)), reset_opacities(config, logits))}
-            made = replace(made, values=values, restarted=("opacity_logits",), forget_contributions=True)
+            changes = {"opacity_logits": partial(reset_opacities, config)}
+            made = replace(made, changes=changes, restarted=("opacity_logits",), forget_contributions=True)
         return made
 
 
@@ -82,88 +82,69 @@ def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
 def plan(config: DensityConfig, model: ModelState) -> RowPlan:
     """Clone the small and split the large among those with a large mean gradient; prune the transparent, the oversized
     and what hardly contributes. Kept ones come first and in order; fresh are clones and halves of splits."""
-    gradient_sums, seen, radii = (model.statistics[name].get() for name in ("gradient_sums", "seen", "radii"))
-    useless = _useless(config, model)
-    with np.errstate(invalid="ignore"):
-        gradients = np.asarray(gradient_sums / np.maximum(seen, 1), np.float32)
-    gradients[~np.isfinite(gradients)] = 0  # statistics that something has spoilt ask for nothing
-    wanted = _wanted(config, model, gradients, useless)
-    sizes = np.exp(model.parameters["log_scales"].get().max(axis=1))
-    large = sizes > config.dense_fraction * model.extent
-    to_clone, to_split = np.flatnonzero(wanted & ~large), np.flatnonzero(wanted & large)
-    kept = np.flatnonzero(~(wanted & large))
-
-    rows = np.concatenate([kept, to_clone, to_split, to_split])
-    origin = np.repeat([0, 1, 2], [len(kept), len(to_clone), 2 * len(to_split)])
-    sizes_after = np.where(origin == 2, sizes[rows] / config.split_factor, sizes[rows])
-    prune = _transparent(config, model)[rows] | useless[rows]
+    # Each rule in the float widths of a comparison of arrays: of float32 with a Python number.
+    too_large, dense = config.max_world_fraction * model.extent, config.dense_fraction * model.extent
+    rules = replace(
+        _pruning(config, model),
+        gradient=0.0 if config.growth == "budget" else edge(lambda mean: mean >= config.gradient_threshold),
+        large=edge(lambda log_scale: np.exp(log_scale) > dense),
+    )
+    if config.views_agree > 1 and "agreeing" in model.statistics:
+        rules = replace(rules, agreeing=edge(lambda views: views >= config.views_agree))
     if config.opacity_reset_every > 0 and model.step > config.opacity_reset_every:
-        prune |= sizes_after > config.max_world_fraction * model.extent
+        rules = replace(
+            rules,
+            oversized=edge(lambda log_scale: np.exp(log_scale) > too_large),
+            oversized_half=edge(lambda log_scale: np.exp(log_scale) / config.split_factor > too_large),
+        )
         if config.max_screen_radius > 0:
-            prune |= (radii[rows] > config.max_screen_radius) & (origin == 0)
-    rows, origin = rows[~prune].astype(np.uint32), origin[~prune]
-    return RowPlan(rows, origin > 0, _halves(config, model, rows, np.flatnonzero(origin == 2)), new_statistics=True)
+            rules = replace(rules, radius=edge(lambda radius: radius > config.max_screen_radius))
+    listed = model.marker.rows(replace(rules, strongest=_strongest(config, model, rules)))
+    return RowPlan(listed=listed, halves=partial(draw_halves, config, rng=model.rng), new_statistics=True)
 
 
 def plan_pruning(config: DensityConfig, model: ModelState) -> RowPlan:
     """Prune the transparent and what hardly contributes, and nothing else."""
-    rows = np.flatnonzero(~(_transparent(config, model) | _useless(config, model))).astype(np.uint32)
-    return RowPlan(rows, np.zeros(len(rows), bool))
+    return RowPlan(listed=model.marker.rows(_pruning(config, model)))
 
 
-def _halves(
-    config: DensityConfig, model: ModelState, rows: NDArray[np.uint32], halves: NDArray[np.intp]
-) -> dict[str, tuple[NDArray[Any], Float32]]:
-    """New means and log scales of the halves of what is split, which are some of `rows`."""
-    if len(halves) == 0:
-        return {}
-    names = ("means", "quaternions", "log_scales")
-    origins = {name: model.parameters[name].get()[rows[halves]] for name in names}
-    means, log_scales = split_halves(config, **origins, rng=model.rng)
-    return {"means": (halves, means), "log_scales": (halves, log_scales)}
-
-
-def _transparent(config: DensityConfig, model: ModelState) -> NDArray[np.bool_]:
-    logits = model.parameters["opacity_logits"].get()
-    transparent: NDArray[np.bool_] = logits < np.log(config.min_opacity / (1 - config.min_opacity))
-    return transparent
-
-
-def _useless(config: DensityConfig, model: ModelState) -> NDArray[np.bool_]:
-    """Gaussians that no view needs, and at the steps of `prune_at` a fraction of those whose use is known.
+def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
+    """The rules by which the transparent go and those that no view needs, and at the steps of `prune_at` a fraction of
+    those whose use is known.
 
     Contributions are in pixels, and infinite where they are not known yet. Totals are over the views of the last whole
     epoch, the largest are of any view in that epoch and the one under way.
     """
+    opaque = np.log(config.min_opacity / (1 - config.min_opacity))
+    rules = MarkRules(transparent=edge(lambda logit: logit >= opaque))
     if "whole_totals" not in model.statistics:
-        return np.zeros(model.count, bool)
-    totals, whole, current = (
-        model.statistics[name].get() for name in ("whole_totals", "whole_largest", "current_largest")
-    )
-    useless: NDArray[np.bool_] = (config.min_contribution > 0) & (np.maximum(current, whole) < config.min_contribution)
+        return rules
+    if config.min_contribution > 0:
+        rules = replace(rules, contribution=edge(lambda largest: largest >= config.min_contribution))
     if model.step in config.prune_at:
+        totals = model.statistics["whole_totals"].get()
         known = np.flatnonzero(np.isfinite(totals))
         least = np.argsort(totals[known], kind="stable")[: int(config.prune_fraction * len(known))]
-        useless[known[least]] = True
-    return useless
+        if len(least):
+            rules = replace(rules, least=(float(totals[known[least[-1]]]), int(known[least[-1]])))
+    return rules
 
 
-def _wanted(
-    config: DensityConfig, model: ModelState, gradients: Float32, useless: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Gaussians to clone or split, by mean gradients (n,)."""
-    room = config.max_gaussians - len(gradients)
+def _strongest(config: DensityConfig, model: ModelState, rules: MarkRules) -> tuple[float, int]:
+    """Score and row of the weakest Gaussian that there is room to clone or split, for `MarkRules`. Scores are looked at
+    only where room may be short."""
+    room = config.max_gaussians - model.count
     if config.growth == "budget":
-        wanted = (gradients > 0) & ~useless
-        room = budget(config, model.step, len(gradients)) - len(gradients)
-    else:
-        wanted = (gradients >= config.gradient_threshold) & ~useless
-    if config.views_agree > 1 and "agreeing" in model.statistics:
-        wanted &= model.statistics["agreeing"].get() >= config.views_agree
-    if wanted.sum() > room:
-        strongest = np.argsort(-np.where(wanted, gradients, -1), kind="stable")[: max(room, 0)]
-        wanted = wanted & np.isin(np.arange(len(gradients)), strongest)
-    return wanted
+        room = budget(config, model.step, model.count) - model.count
+    if room >= model.count:
+        return -inf, 0
+    if room <= 0:
+        return inf, 0
+    scores = model.marker.scores(rules)
+    if np.count_nonzero(scores >= 0) <= room:
+        return -inf, 0
+    last = int(np.argsort(-scores, kind="stable")[room - 1])
+    return float(scores[last]), last
 
 
 def budget(config: DensityConfig, step: int, count: int) -> int:
@@ -177,6 +158,12 @@ def budget(config: DensityConfig, step: int, count: int) -> int:
     before = max(step - config.every, config.start)
     left = ((last - step) / (last - before)) ** 2 if step < last else 0.0
     return config.max_gaussians - round((config.max_gaussians - count) * left)
+
+
+def draw_halves(config: DensityConfig, split: Mapping[str, Float32], *, rng: np.random.Generator) -> dict[str, Float32]:
+    """New means and log scales of all first halves and then all second ones, by the groups HALVED of what is split."""
+    means, log_scales = split_halves(config, **{name: np.tile(split[name], (2, 1)) for name in HALVED}, rng=rng)
+    return {"means": means, "log_scales": log_scales}
 
 
 def split_halves(

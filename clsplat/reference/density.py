@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Marks and lists of density control: NumPy twin of kernels/density.cl, in float32, in which it is decided."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
+from clsplat.config.marking import FRESH, UNWANTED, USELESS, MarkRules
+
+
+def scores(rules: MarkRules, statistics: Mapping[str, Float32]) -> Float32:
+    """Mean gradients (n,) of what may be densified; UNWANTED; USELESS. Statistics by the names in a checkpoint."""
+    with np.errstate(all="ignore"):
+        means = statistics["gradient_sums"] / np.maximum(statistics["seen"], np.float32(1))
+    means = np.where(np.isfinite(means), means, np.float32(0))
+    wanted = means > np.float32(rules.gradient)
+    if "agreeing" in statistics:
+        wanted &= statistics["agreeing"] > np.float32(rules.agreeing)
+    found = np.where(wanted, means, np.float32(UNWANTED))
+    if "whole_totals" in statistics:
+        totals, (value, row) = statistics["whole_totals"], rules.least
+        largest = np.maximum(statistics["current_largest"], statistics["whole_largest"])
+        useless = (largest <= np.float32(rules.contribution)) | (totals < np.float32(value))
+        useless |= (totals == np.float32(value)) & (np.arange(len(totals)) <= row)
+        found[useless] = USELESS
+    return found.astype(np.float32)
+
+
+def rows(
+    rules: MarkRules, statistics: Mapping[str, Float32], log_scales: Float32, opacity_logits: Float32
+) -> tuple[NDArray[np.uint32], int]:
+    """Row that each new one is a copy of, with FRESH: what stays, clones, first and second halves; number of halves."""
+    found, largest = scores(rules, statistics), log_scales.max(axis=1)
+    value, row = rules.strongest
+    wanted = (found > np.float32(value)) | ((found == np.float32(value)) & (np.arange(len(found)) <= row))
+    wanted &= found >= 0
+    large = largest > np.float32(rules.large)
+    gone = (found == USELESS) | (opacity_logits <= np.float32(rules.transparent))
+    oversized = gone | (largest > np.float32(rules.oversized))
+    stays = ~oversized & ~(wanted & large) & ~(statistics["radii"] > np.float32(rules.radius))
+    split = np.flatnonzero(wanted & large & ~gone & ~(largest > np.float32(rules.oversized_half)))
+    fresh = np.concatenate([np.flatnonzero(wanted & ~large & ~oversized), split, split])
+    return np.concatenate([np.flatnonzero(stays), fresh | int(FRESH)]).astype(np.uint32), 2 * len(split)

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans of density control on the host, for tests: made by the twin, or brought there from a device."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config.marking import FRESH, MarkRules
+from clsplat.reference import density as twin
+from clsplat.training.density import HALVED, RowPlan
+
+
+@dataclass(frozen=True, eq=False)
+class TwinRows:
+    """A list of rows in an array."""
+
+    rows: NDArray[np.uint32]
+    halves: int
+
+    @property
+    def count(self) -> int:
+        return len(self.rows)
+
+
+@dataclass(frozen=True, eq=False)
+class TwinMarker:
+    """Marks by the NumPy twin. Without radii none is over any edge."""
+
+    parameters: Mapping[str, NDArray[Any]]
+    statistics: Mapping[str, NDArray[Any]]
+
+    def _known(self) -> dict[str, NDArray[Any]]:
+        count = len(self.parameters["opacity_logits"])
+        zeros = {name: np.zeros(count, np.float32) for name in ("gradient_sums", "seen", "radii")}
+        return {**zeros, **self.statistics}
+
+    def scores(self, rules: MarkRules) -> NDArray[np.float32]:
+        return twin.scores(rules, self._known())
+
+    def rows(self, rules: MarkRules) -> TwinRows:
+        logits = self.parameters["opacity_logits"]
+        log_scales = self.parameters.get("log_scales", np.zeros((len(logits), 3), np.float32))
+        return TwinRows(*twin.rows(rules, self._known(), log_scales, logits))
+
+
+def on_host(plan: RowPlan, parameters: Mapping[str, NDArray[Any]]) -> RowPlan:
+    """The same plan in arrays alone: rows, fresh, and the values of halves, which are drawn now. parameters: before
+    it."""
+    listed: Any = plan.listed
+    entries = listed.rows if isinstance(listed, TwinRows) else listed.rows.get()
+    rows, values = entries & ~FRESH, dict(plan.values)
+    if listed.halves and plan.halves is not None:
+        split = rows[len(rows) - listed.halves // 2 :]
+        halves = np.arange(len(rows) - listed.halves, len(rows))
+        drawn = plan.halves({name: parameters[name][split] for name in HALVED})
+        values |= {name: (halves, found) for name, found in drawn.items()}
+    return replace(plan, rows=rows, fresh=entries >= FRESH, values=values, listed=None)
