@@ -51,9 +51,10 @@ def plan_step(
     fields: SlotFields,
     agreement: bool,
     photographs: int = 0,
+    models: int = _MODELS,
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
-    photographs: pixels of all that may stay on the device. Raises CapacityError."""
+    photographs: pixels of all that may stay on the device; models: arrays for each parameter. Raises CapacityError."""
     planes = 0
     for camera in cameras:
         pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES)
@@ -65,7 +66,7 @@ def plan_step(
         frame,
         row=frame.row + screen + statistics,
         banded=frame.banded + 4 * fields.floats,
-        model=_MODELS * frame.model,
+        model=models * frame.model,
         pair=frame.pair + blend.gradient_pair_bytes(fields),
         most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS),
         photographs=0 if device.shares_memory else target.SOURCE_BYTES * photographs,
