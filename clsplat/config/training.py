@@ -6,7 +6,7 @@ The training defaults are those of the paper's authors' 2024 code, with the pape
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from math import inf
 from typing import Literal
 
@@ -229,3 +229,12 @@ class TrainConfig:
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
+
+    def on_devices(self, count: int, *, told: bool) -> TrainConfig:
+        """The settings for `count` devices: a batch of a view for each, unless it is told. Raises InputError for a
+        batch that they cannot share evenly."""
+        if self.batch == 1 and not told:
+            return replace(self, batch=count)
+        if self.batch % count:
+            raise InputError(f"--batch {self.batch}: expected a multiple of {count}, as --device names {count} devices")
+        return self

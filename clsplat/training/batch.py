@@ -175,9 +175,7 @@ class Replica:
         own = (self.device, self.rasterizer, step.config, step.step, step.rates, step.fields)
         gradients = _gradients(self.rasterizer.work, parameters)
         pixels = (photograph, sample.camera, sample.background)
-        result = _FoundView(*own, arrays, found).run(
-            (parameters,), *pixels, StepProbe(), gradients, reads_loss=True
-        )
+        result = _FoundView(*own, arrays, found).run((parameters,), *pixels, StepProbe(), gradients, reads_loss=True)
         return Found(arrays, found, result)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:

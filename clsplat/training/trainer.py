@@ -358,7 +358,9 @@ class Trainer:
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics = self.parameters, self.statistics.named()
-        return ModelState(model.count, self.step if step is None else step, self.scene.extent, model.arrays, statistics, self.rng)
+        return ModelState(
+            model.count, self.step if step is None else step, self.scene.extent, model.arrays, statistics, self.rng
+        )
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out what density control, or a repair, has planned for the rows of everything."""
@@ -397,6 +399,11 @@ class Trainer:
         self._set_parameters(*(self._placed(model) for model in (parameters, first, second)))
         self.statistics.load(statistics)
         self.strategy.rearranged(rows, fresh)
+
+    def close(self) -> None:
+        """End what works beside this thread."""
+        if self.batch is not None:
+            self.batch.close()
 
     def local(self, camera: Camera) -> Camera:
         """A camera in the world as one for the model in training: see `Gaussians.local`."""
