@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from functools import partial
 from math import sqrt
 from typing import Any
 
@@ -243,8 +244,8 @@ class Batch:
         try:
             for replica, share in zip(self.replicas, others, strict=True):
                 for place, index in enumerate(share):
-                    view = (replica.view, place, samples[index], factor, added)
-                    pending.append((index, replica.thread.submit(*view, splats=statistics)))
+                    view = partial(replica.view, place, samples[index], factor, added, splats=statistics)
+                    pending.append((index, replica.thread.submit(view)))
             losses = [self._own((model[0], sums), samples[index], factor, added, probes) for index in mine]
             for taken in sent:
                 taken.result()
@@ -252,7 +253,8 @@ class Batch:
                 found = future.result()
                 losses.append(self._take(sums, found, added, probes(samples[index], added)))
         finally:  # what an error has ended goes on in no thread
-            wait([future for future in (*sent, *(future for _, future in pending)) if not future.cancel()])
+            under_way: list[Future[Any]] = [*sent, *(future for _, future in pending)]
+            wait([future for future in under_way if not future.cancel()])
         for start, stop, (parameters, first, second, gradients) in parts(work, *model, sums, keep=True):
             counts = self.rasterizer.readback if shown is None else shown.rows(start, stop)
             models = (parameters, gradients, first, second)

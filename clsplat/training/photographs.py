@@ -32,7 +32,7 @@ class Photographs:
     def beside(self, device: Device) -> Photographs:
         """The same for another device, with the same pixels on the host."""
         other = Photographs(self._views, device)
-        other._held = self._held  # noqa: SLF001  # of our own class
+        other._held = self._held
         return other
 
     def follow(self, allowed: int) -> None:

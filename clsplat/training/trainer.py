@@ -248,7 +248,7 @@ class Trainer:
         model = (self.parameters, self.first, self.second)
         result: Loss | Losses
         if self.batch is None:
-            (sample,) = samples
+            sample = samples[0]
             pixels, probe = (sample.photograph, sample.camera, sample.background), _Watched(self, step, sample, needs)
             result = step.run(model, *pixels, probe, reads_loss=reads_loss)
         else:
@@ -433,9 +433,8 @@ class Trainer:
             self._apply(remedy)
             arrays = self._arrays()
         state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(self.watch.patience)}
-        if self.last_views > 1:
-            state["views"] = self.last_views
-        return arrays, {**state, "controlled": True} if self.controlled else state
+        views = {"views": self.last_views} if self.last_views > 1 else {}
+        return arrays, {**state, **views, **({"controlled": True} if self.controlled else {})}
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
