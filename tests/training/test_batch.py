@@ -79,10 +79,10 @@ def test_halves_of_a_device_train_to_the_bytes_of_the_whole(
 @pytest.mark.parametrize(
     "config",
     [
-        short(batch=4, iterations=30, background="random"),  # the last step has two views
-        short(batch=2, optimiser=replace(CONFIG.optimiser, sparse=True)),
-        short(batch=2, optimiser=replace(CONFIG.optimiser, sh_rest_every=4), sh_degree_every=4),
-        short(batch=2, density={"min_contribution": 0.01, "prune_every": 7, "absolute_gradients": True}),
+        short(batch=4, iterations=22, background="random"),  # the last step has two views
+        short(batch=2, iterations=22, optimiser=replace(CONFIG.optimiser, sparse=True)),
+        short(batch=2, iterations=22, optimiser=replace(CONFIG.optimiser, sh_rest_every=4), sh_degree_every=4),
+        short(batch=2, iterations=22, density={"min_contribution": 0.01, "prune_every": 7, "absolute_gradients": True}),
     ],
     ids=["four", "sparse", "sh_rest", "contributions"],
 )
