@@ -50,7 +50,7 @@ def train(
     config = checked(scene, config, run, resume=resume)
     with nullcontext() if run is None else locked(run.path, "train"):
         first, *further = _opened(device, parse_bytes(max_device_mem))
-        config = config.on_devices(1 + len(further), told=resume)
+        config = config.on_devices(1 + len(further), explicit=resume)
         trainer = Trainer(begin(scene, config, run, resume=resume), config, first, further=further)
         with closing(trainer):
             session = Session(trainer, run, on_step, on_plan)

@@ -61,8 +61,8 @@ class Train(Verb):
     def completed(self, given: Collection[str]) -> Train:
         """The settings are those of the run that is resumed, or of the preset and the schedule, for these devices."""
         verb = self._with_settings(given)
-        told = self.resume or "batch" in given
-        return replace(verb, config=verb.config.on_devices(self.device.count, told=told))
+        explicit = self.resume or "batch" in given
+        return replace(verb, config=verb.config.on_devices(self.device.count, explicit=explicit))
 
     def _with_settings(self, given: Collection[str]) -> Train:
         if not self.resume and (self.preset, self.schedule) == ("default", None):

@@ -230,10 +230,10 @@ class TrainConfig:
         self.density.check()
         self.rasterizer.check()
 
-    def on_devices(self, count: int, *, told: bool) -> TrainConfig:
+    def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
         """The settings for `count` devices: a batch of a view for each, unless it is told. Raises InputError for a
         batch that they cannot share evenly."""
-        if self.batch == 1 and not told:
+        if self.batch == 1 and not explicit:
             return replace(self, batch=count)
         if self.batch % count:
             raise InputError(f"--batch {self.batch}: expected a multiple of {count}, as --device names {count} devices")

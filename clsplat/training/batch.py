@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of several views, on one device or several: gradients are added in the order of the views, then Adam.
+"""A step of several views, on one device or several: gradients are step_of_view in the order of the views, then Adam.
 
 The first device has the model. The others have copies of its parameters, each with a thread, and hand back what their
 views found. So which is quicker changes no bit, nor does their number.
@@ -58,8 +58,8 @@ def scaled_rates(rates: Mapping[str, float], batch: int) -> dict[str, float]:
 
 def shares(count: int, devices: int) -> list[range]:
     """The views of a step that each device has, those of a device following each other."""
-    each = -(-count // devices)
-    return [range(min(k * each, count), min((k + 1) * each, count)) for k in range(devices)]
+    size = -(-count // devices)
+    return [range(min(k * size, count), min((k + 1) * size, count)) for k in range(devices)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +94,9 @@ class _AddedView(GradientStep):
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """What a view has found, on the host, kept until the next step: by name the arrays of its rows, and its gradients
-    by group; the loss."""
+class Outcome:
+    """Results of a view on another device, on the host until the next step: by name the arrays of its rows, and its
+    gradients by group; the loss."""
 
     arrays: dict[str, NDArray[Any]]
     gradients: dict[str, NDArray[np.float32]]
@@ -104,11 +104,11 @@ class Found:
 
 
 @dataclass(frozen=True, eq=False)
-class _FoundView(GradientStep):
+class _RemoteView(GradientStep):
     """A view on another device than the model, whose results go to the host."""
 
     arrays: dict[str, NDArray[Any]]
-    found: dict[str, NDArray[np.float32]]
+    outcome: dict[str, NDArray[np.float32]]
 
     def update(self, rows: StepRows) -> None:
         """Copy the rows' results to the host."""
@@ -123,7 +123,7 @@ class _FoundView(GradientStep):
             array = on_device[name]
             assert array is not None, name
             array.read_into(host[rows.start : rows.stop])
-        for group, host in self.found.items():
+        for group, host in self.outcome.items():
             shape = (rows.stop - rows.start, *host.shape[1:])
             rows.gradients[group].reshaped(*shape).read_into(host[rows.start : rows.stop])
 
@@ -132,7 +132,7 @@ class Replica:
     """A further device of a training, with a copy of the parameters, and a thread."""
 
     def __init__(self, device: Device, config: TrainConfig, photographs: Photographs) -> None:
-        self.device, self.config, self.photographs = device, config, photographs.beside(device)
+        self.device, self.config, self.photographs = device, config, photographs.for_device(device)
         self.rasterizer = Rasterizer(device, config.rasterizer)
         self.thread = ThreadPoolExecutor(1, f"clsplat-{device.name}")
         self.plan: Plan | None = None
@@ -159,25 +159,27 @@ class Replica:
         for group, array in values.items():
             self.parameters[group].set(array)
 
-    def view(self, place: int, sample: Sample, factor: float, step: GradientStep, *, splats: bool) -> Found:
+    def view(self, place: int, sample: Sample, factor: float, step: GradientStep, *, splats: bool) -> Outcome:
         """Forward, loss and backward of a view; place: its number among this device's; factor: of its resolution;
         splats: True if density control goes by its gradients."""
         parameters, photograph = self.parameters, self.photographs.bring(sample.view, factor)
         assert parameters is not None, "taken before the view"
         n, sh_rest = parameters.count, updates_sh_rest(step.config.optimiser, step.step)
         shapes = group_shapes(n, parameters.coefficients)
-        found = {g: self._host(place, g, shapes[g]) for g in GROUPS if g != "sh_rest" or sh_rest}
+        gradients = {g: self._host(place, g, shapes[g]) for g in GROUPS if g != "sh_rest" or sh_rest}
         arrays = {"tile_counts": self._host(place, "tile_counts", (n,), np.uint32)}
         if splats:
             arrays["splats"] = self._host(place, "splats", (n, len(SPLAT)))
             arrays["screen"] = self._host(place, "screen", (n, 2))
         if step.fields.contributions:
             arrays["contributions"] = self._host(place, "contributions", (n,))
-        own = (self.device, self.rasterizer, step.config, step.step, step.rates, step.fields)
-        gradients = _gradients(self.rasterizer.work, parameters)
+        settings = (self.device, self.rasterizer, step.config, step.step, step.rates, step.fields)
+        room = _gradients(self.rasterizer.work, parameters)
         pixels = (photograph, sample.camera, sample.background)
-        result = _FoundView(*own, arrays, found).run((parameters,), *pixels, StepProbe(), gradients, reads_loss=True)
-        return Found(arrays, found, result)
+        result = _RemoteView(*settings, arrays, gradients).run(
+            (parameters,), *pixels, StepProbe(), room, reads_loss=True
+        )
+        return Outcome(arrays, gradients, result)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
         """Room on the host, the same from step to step: fresh pages would cost as much as the copy."""
@@ -237,27 +239,27 @@ class Batch:
         optimiser, number = scaled(self.config.optimiser, batch), -(-step.step // batch)
         config, rates = replace(self.config, optimiser=optimiser), scaled_rates(step.rates, batch)
         sums, shown = self._room_for(device, model[0])
-        added = _AddedView(device, self.rasterizer, config, number, rates, step.fields, shown)
-        mine, *others = shares(len(samples), 1 + len(self.replicas))
-        sent = self._send(model[0])
-        pending: list[tuple[int, Future[Found]]] = []
+        step_of_view = _AddedView(device, self.rasterizer, config, number, rates, step.fields, shown)
+        first, *others = shares(len(samples), 1 + len(self.replicas))
+        transfers = self._send(model[0])
+        pending: list[tuple[int, Future[Outcome]]] = []
         try:
             for replica, share in zip(self.replicas, others, strict=True):
                 for place, index in enumerate(share):
-                    view = partial(replica.view, place, samples[index], factor, added, splats=statistics)
+                    view = partial(replica.view, place, samples[index], factor, step_of_view, splats=statistics)
                     pending.append((index, replica.thread.submit(view)))
-            losses = [self._own((model[0], sums), samples[index], factor, added, probes) for index in mine]
-            for taken in sent:
-                taken.result()
+            losses = [self._view((model[0], sums), samples[index], factor, step_of_view, probes) for index in first]
+            for transfer in transfers:
+                transfer.result()
             for index, future in pending:
-                found = future.result()
-                losses.append(self._take(sums, found, added, probes(samples[index], added)))
+                outcome = future.result()
+                losses.append(self._take(sums, outcome, step_of_view, probes(samples[index], step_of_view)))
         finally:  # what an error has ended goes on in no thread
-            under_way: list[Future[Any]] = [*sent, *(future for _, future in pending)]
+            under_way: list[Future[Any]] = [*transfers, *(future for _, future in pending)]
             wait([future for future in under_way if not future.cancel()])
-        for start, stop, (parameters, first, second, gradients) in parts(work, *model, sums, keep=True):
+        for start, stop, (parameters, moments, squares, gradients) in parts(work, *model, sums, keep=True):
             counts = self.rasterizer.readback if shown is None else shown.rows(start, stop)
-            models = (parameters, gradients, first, second)
+            models = (parameters, gradients, moments, squares)
             adam(device, number, rates, optimiser, *models, counts, self.rasterizer.readback)
         self._sent = None if updates_sh_rest(optimiser, number) else model[0]
         return Losses(tuple(losses))
@@ -275,7 +277,7 @@ class Batch:
             sums = self._sums
         if not self.config.optimiser.sparse:
             return sums, None
-        shown = self.rasterizer.work.array("shown", (count,), np.uint32)
+        shown = self.rasterizer.work.array("shown_in_batch", (count,), np.uint32)
         shown.fill(0)
         return sums, shown
 
@@ -297,7 +299,7 @@ class Batch:
         array.read_into(held)
         return held
 
-    def _own(
+    def _view(
         self,
         model: tuple[AnyGaussians, AnyGaussians],
         sample: Sample,
@@ -310,22 +312,22 @@ class Batch:
         pixels = (self.photographs.bring(sample.view, factor), sample.camera, sample.background)
         return step.run(model, *pixels, probes(sample, step), gradients, reads_loss=True)
 
-    def _take(self, sums: AnyGaussians, found: Found, step: _AddedView, probe: StepProbe) -> Loss:
+    def _take(self, sums: AnyGaussians, outcome: Outcome, step: _AddedView, probe: StepProbe) -> Loss:
         """Add what a view has found on another device, in the memory of a view on this one."""
         device, work = step.device, self.rasterizer.work
-        probe.loss(found.loss)
+        probe.loss(outcome.loss)
         for start, stop, (part,) in parts(work, sums, keep=True):
-            here = {name: _brought(work, device, name, values[start:stop]) for name, values in found.arrays.items()}
+            rows = {name: _brought(work, device, name, values[start:stop]) for name, values in outcome.arrays.items()}
             arrays = {
                 group: _brought(work, device, f"view_{group}", values[start:stop])
-                for group, values in found.gradients.items()
+                for group, values in outcome.gradients.items()
             }
-            gradients, counts = DeviceGaussians(part.count, part.coefficients, arrays), here["tile_counts"]
+            gradients, counts = DeviceGaussians(part.count, part.coefficients, arrays), rows["tile_counts"]
             shown = None if step.shown is None else step.shown.rows(start, stop)
             add_view(device, counts, gradients, part, shown, sh_rest="sh_rest" in arrays)
-            screen = Screen(here.get("screen", counts), here.get("contributions"))
-            probe.after_rows(ViewRows(start, stop, Projected(here.get("splats", counts), counts), screen))
-        return found.loss
+            screen = Screen(rows.get("screen", counts), rows.get("contributions"))
+            probe.after_rows(ViewRows(start, stop, Projected(rows.get("splats", counts), counts), screen))
+        return outcome.loss
 
 
 def _gradients(work: Workspace, parameters: AnyGaussians) -> DeviceGaussians:

@@ -29,7 +29,7 @@ class Photographs:
         self._on_device: dict[int, DeviceArray] = {}
         self._taken = self.allowed = 0
 
-    def beside(self, device: Device) -> Photographs:
+    def for_device(self, device: Device) -> Photographs:
         """The same for another device, with the same pixels on the host."""
         other = Photographs(self._views, device)
         other._held = self._held
@@ -45,8 +45,8 @@ class Photographs:
         """View `index` at 1/factor of its size, (H, W, 3 or 4), straight alpha; not to be written to."""
         if factor != self._factor:
             self._factor = factor
-            for other in [key for key in self._held if key[1] != factor]:
-                del self._held[other]
+            for key in [key for key in self._held if key[1] != factor]:
+                del self._held[key]
             self._leave_device()
         if (index, factor) not in self._held:
             camera = self._views[index].camera

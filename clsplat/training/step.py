@@ -133,12 +133,12 @@ class GradientStep:
         slots = rasterizer.pair_gradients(frame, result.gradient, fields=self.fields)
         probe.pair_gradients(slots)
         for start, stop, part in parts(work, *model, keep=True):
-            projected, own_slots = frame.projected.rows(start, stop), slots.rows(start, stop)
+            projected, row_slots = frame.projected.rows(start, stop), slots.rows(start, stop)
             screen = rasterizer.screen(stop - start, self.fields)
-            rows = StepRows(start, stop, projected, screen, part, frame.camera_array, own_slots, gradients)
+            rows = StepRows(start, stop, projected, screen, part, frame.camera_array, row_slots, gradients)
             if gradients is not None:
                 sh_rest = updates_sh_rest(self.config.optimiser, self.step)
-                arrays = (part[0], frame.camera_array, projected, own_slots, gradients, screen)
+                arrays = (part[0], frame.camera_array, projected, row_slots, gradients, screen)
                 project_grad(rasterizer.device, *arrays, fields=self.fields, sh_rest=sh_rest)
             probe.before_rows(rows)
             self.update(rows)

@@ -348,11 +348,11 @@ class Trainer:
             self.parameters, self.first, self.second = wider
 
     def _control_density(self) -> None:
-        """What was due after any of the last step's views."""
-        due = [step for step in range(self.step - self.last_views + 1, self.step + 1) if self.strategy.is_due(step)]
-        for step in due if self.step > 0 else ():
+        """Do what is due after any of the last step's views."""
+        steps = [step for step in range(self.step - self.last_views + 1, self.step + 1) if self.strategy.is_due(step)]
+        for step in steps if self.step > 0 else ():
             self.mend(look=True)
-            if step == due[0]:
+            if step == steps[0]:
                 self._note()
             self._rearrange(self.strategy.before_step(self._state(step)))
 

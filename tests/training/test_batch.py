@@ -27,7 +27,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.adam import corrected
 from clsplat.stages.device_gaussians import allocate_gaussians
-from clsplat.training.batch import Batch, Found, Replica, scaled, scaled_rates, shares
+from clsplat.training.batch import Batch, Outcome, Replica, scaled, scaled_rates, shares
 from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
 from clsplat.training.trainer import Trainer
 
@@ -70,7 +70,7 @@ def test_halves_of_a_device_train_to_the_bytes_of_the_whole(
     devices = halves(device.index)
     wanted = train(scene, TWO, device=device)
     if late == "first":
-        monkeypatch.setattr(Batch, "_own", slow(Batch._own, 0.01))
+        monkeypatch.setattr(Batch, "_view", slow(Batch._view, 0.01))
     if late == "second":
         monkeypatch.setattr(Replica, "view", slow(Replica.view, 0.01))
     assert_same_model(train(scene, TWO, device=devices), wanted)
@@ -230,7 +230,7 @@ def test_trouble_on_a_further_device_ends_the_training(
 ) -> None:
     devices, begun, ended = halves(default_device.index), Event(), Event()
 
-    def fail(*_: Any, **__: Any) -> Found:
+    def fail(*_: Any, **__: Any) -> Outcome:
         begun.set()
         time.sleep(0.05)
         ended.set()
@@ -244,7 +244,7 @@ def test_trouble_on_a_further_device_ends_the_training(
         begun.wait()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Batch, "_own", interrupted)
+    monkeypatch.setattr(Batch, "_view", interrupted)
     begun.clear()
     ended.clear()
     with pytest.raises(KeyboardInterrupt):
