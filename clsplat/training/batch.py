@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of several views, on one device or several: gradients are step_of_view in the order of the views, then Adam.
+"""A step of several views, on one device or several: gradients are added in the order of the views, then Adam.
 
 The first device has the model. The others have copies of its parameters, each with a thread, and hand back what their
 views found. So which is quicker changes no bit, nor does their number.
