@@ -459,7 +459,7 @@ class Trainer:
                 raise ValueError(f"a queue of {queue[:3]}")
             patience = Patience(**checkpoint.state.get("patience", {}))
             last_views = checkpoint.state.get("views", 1)
-            if type(last_views) is not int or last_views < 1:
+            if type(last_views) is not int or not 1 <= last_views <= max(checkpoint.step, 1):
                 raise ValueError(f"a step of {last_views!r:.20} views")
         except (KeyError, TypeError, ValueError, IndexError) as error:
             why = f"{type(error).__name__}: {error}"
