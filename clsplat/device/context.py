@@ -284,8 +284,6 @@ def select(selector: str | None) -> cl.Device:
 
     Without one: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
     """
-    if not isinstance(selector, str | None):
-        raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
     patience()  # what the environment says of drivers is looked at before it is needed
     devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
@@ -308,6 +306,13 @@ def find_device(selector: str | None) -> DeviceInfo:
     """The entry of the device that `selector` names (see `select`). Raises DeviceError."""
     chosen = select(selector)
     return list_devices()[all_devices().index(chosen)]
+
+
+def _names(selector: str | None) -> list[str]:
+    """The names of devices in `selector`. Raises DeviceError for what is no text."""
+    if not isinstance(selector, str | None):
+        raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
+    return device_names(selector)
 
 
 def _part_of(name: str) -> tuple[str, int | None]:
@@ -355,7 +360,7 @@ def open_devices(
     queues measure. Raises DeviceError where a device is named twice.
     """
     chosen: list[tuple[int, int | None]] = []
-    for name in device_names(selector):
+    for name in _names(selector):
         whole, number = _part_of(name)
         index = all_devices().index(select(whole if selector or number is not None else None))
         if any(index == other and (number == part or None in (number, part)) for other, part in chosen):
@@ -371,6 +376,6 @@ def open_devices(
 
 def open_device(selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False) -> Device:
     """Open the one device that `selector` names (see `open_devices`)."""
-    if len(device_names(selector)) > 1:
+    if len(_names(selector)) > 1:
         raise DeviceError(f"--device {selector}: expected one device here, only train and render take several")
     return open_devices(selector, memory_limit, profile=profile)[0]
