@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
 
 from clsplat.config.checks import parse_bytes
 from clsplat.config.training import TrainConfig
-from clsplat.device.context import Device, open_device
+from clsplat.device.context import Device, open_devices
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.memory_plan import Plan
 from clsplat.report.page import write_last
@@ -23,7 +24,7 @@ def train(
     scene: Scene,
     config: TrainConfig | None = None,
     *,
-    device: Device | str | None = None,
+    device: Device | str | Sequence[Device] | None = None,
     max_device_mem: str | int | None = None,
     run: Run | None = None,
     resume: bool = False,
@@ -34,8 +35,9 @@ def train(
     """Train on a scene; returns the model.
 
     config: the run's, or else the defaults, unless given; a given one is written to the run. device: an open one, or a
-    name as `clsplat devices` lists them. max_device_mem: the most of its memory to use, such as "256MiB". run: a folder
-    for metrics, checkpoints, held-out renders and the model; None writes nothing. resume: go on from the run's latest
+    name as `clsplat devices` lists them; several, or names with commas between, share the views of a step
+    (`TrainConfig.batch`). max_device_mem: the most of each one's memory to use, such as "256MiB". run: a folder for
+    metrics, checkpoints, held-out renders and the model; None writes nothing. resume: go on from the run's latest
     checkpoint; without it a run that has been trained is refused. on_step: called every REPORT_EVERY steps. on_plan:
     called with the use of device memory, before the first step and when it changes. between: called before each step;
     it may render the trainer's model, and its time is not counted.
@@ -47,16 +49,24 @@ def train(
     """
     config = checked(scene, config, run, resume=resume)
     with nullcontext() if run is None else locked(run.path, "train"):
-        limit = parse_bytes(max_device_mem)
-        if not isinstance(device, Device):
-            device = open_device(device, limit)
-        elif limit is not None:
-            device = device.with_memory_limit(limit)
-        trainer = Trainer(begin(scene, config, run, resume=resume), config, device)
-        session = Session(trainer, run, on_step, on_plan)
-        if resume:
-            session.resume()
-        model = session.train(between)
+        first, *further = _opened(device, parse_bytes(max_device_mem))
+        config = config.on_devices(1 + len(further), explicit=resume)
+        trainer = Trainer(begin(scene, config, run, resume=resume), config, first, further=further)
+        with closing(trainer):
+            session = Session(trainer, run, on_step, on_plan)
+            if resume:
+                session.resume()
+            model = session.train(between)
         if run is not None and config.report:
             write_last(run, scene, model)
     return model
+
+
+def _opened(device: Device | str | Sequence[Device] | None, limit: int | None) -> list[Device]:
+    """The devices, with `limit` bytes of memory each. Raises InputError for what is none."""
+    if device is None or isinstance(device, str):
+        return open_devices(device, limit)
+    devices = [device] if isinstance(device, Device) else list(device) if isinstance(device, Sequence) else []
+    if not devices or not all(isinstance(one, Device) for one in devices):
+        raise InputError(f"device is {device!r:.100}, expected open devices, or names with commas between")
+    return devices if limit is None else [one.with_memory_limit(limit) for one in devices]

@@ -1,7 +1,10 @@
 // Adam on one parameter group, by gradients that are in memory: where they are looked at before. A step of training has
 // it in project_grad.cl. It leaves the gradients zero, as project_grad writes the rows of visible Gaussians alone.
 //
-// Owner: A work-item owns LANES elements that follow each other (adam), or LANES rows (adam_visible).
+// The gradients of a batch of views are added up here as well, one view after the other.
+//
+// Owner: A work-item owns LANES elements that follow each other (adam), or LANES rows (adam_visible), an element
+//   (add_view) or a row (join_view).
 // Launch: One work-item for each such piece, in groups of 64; those beyond the last piece do nothing.
 // Buffers: The group's parameters in its own units, their gradients, the moments `first` and `second`; `readback`
 //   (READBACK_SIZE) counts. Scalars are those of Step. Shapes are above each kernel.
@@ -60,4 +63,18 @@ __kernel void adam_visible(const uint n, const float rate, const float root, con
       }
   }
 }
+
+// One view's gradients added to those of the views before it, an element a work-item. The gradients of rows that the
+// view does not show are not looked at. tile_counts (n / WIDTH): 0 where hidden; gradients, sums (n).
+__kernel void add_view(const ulong n, __global const uint *tile_counts, __global const float *gradients,
+                       __global float *sums) {
+  const size_t i = get_global_id(0);
+  if (i < n && tile_counts[i / WIDTH] > 0) sums[i] += gradients[i];
+}
 #endif
+
+// tile_counts (n) of one view -> shown (n): not 0 where this view or one before it shows the Gaussian.
+__kernel void join_view(const uint n, __global const uint *tile_counts, __global uint *shown) {
+  const size_t i = get_global_id(0);
+  if (i < n) shown[i] |= tile_counts[i];
+}

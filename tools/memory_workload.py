@@ -35,7 +35,7 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.data_set import Lens
 from clsplat.scenes.scene import Scene
-from clsplat.stages.adam import adam
+from clsplat.stages.adam import adam, add_view
 from clsplat.stages.blend import count_pairs, tile_items
 from clsplat.stages.density import Marker, carry, gather, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
@@ -113,7 +113,8 @@ def frames(device: Device) -> None:
 
 
 def by_two_launches(device: Device) -> None:
-    """Adam by gradients that are in memory, as where a step is looked at: all rows, and those in view."""
+    """Adam by gradients that are in memory, as where a step is looked at: all rows, and those in view. Gradients of
+    several views."""
     models = [allocate_gaussians(device, 11, 4, zero=True) for _ in range(4)]
     counts, readback = (
         upload(device, np.arange(11, dtype=np.uint32) % 3),
@@ -121,6 +122,7 @@ def by_two_launches(device: Device) -> None:
     )
     for sparse in (False, True):
         adam(device, 1, dict.fromkeys(GROUPS, 0.1), OptimiserConfig(sparse=sparse), *models, counts, readback)
+    add_view(device, counts, models[1], models[2], upload(device, np.zeros(11, np.uint32)))
     if not all(np.isfinite(models[0][group].get()).all() for group in GROUPS):
         raise SystemExit("Adam's step is not finite")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from clsplat.config.checks import parse_bytes
+from clsplat.config.checks import device_names, parse_bytes
 from clsplat.config.verbs import HOST, PORT
 
 if TYPE_CHECKING:
@@ -68,6 +68,27 @@ class DeviceOptions(DeviceChoice):
     def check(self) -> None:
         """Raise InputError for a limit that is no size, before anything is read."""
         parse_bytes(self.max_device_mem)
+
+
+@dataclass(frozen=True)
+class SeveralDevices(DeviceOptions):
+    """The devices to work on, and how much of the memory of each to use."""
+
+    selector: Annotated[str | None, arg(name="device", metavar="DEVICE,...")] = None
+    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them; several, with commas,
+    have a view of each step (see --batch), and 0/0,0/1 are the halves of device 0, where its driver divides it.
+    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+
+    @property
+    def count(self) -> int:
+        """Number of devices that are named."""
+        return len(device_names(self.selector))
+
+    def open_all(self, services: Services) -> list[Device]:
+        """The devices with their memory limits, not yet tested. Raises InputError and DeviceError."""
+        if self.count == 1:
+            return [self.open(services)]
+        return services.open_devices(self.selector, parse_bytes(self.max_device_mem))
 
 
 @dataclass(frozen=True)

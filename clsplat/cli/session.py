@@ -36,6 +36,7 @@ class Services:
 
     load_scene: Callable[..., Scene] = imported("clsplat.scenes.scene.load_scene")
     open_device: Callable[..., Device] = imported("clsplat.device.context.open_device")
+    open_devices: Callable[..., list[Device]] = imported("clsplat.device.context.open_devices")
     require: Callable[..., Device] = imported("clsplat.selftest.trust.require")
     reconstruct: Callable[..., Path] = imported("clsplat.scenes.sfm.reconstruct")
     train: Callable[..., Gaussians] = imported("clsplat.api.train")

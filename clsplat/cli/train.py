@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from clsplat.cli.eval import print_summary, tell_of_lpips
-from clsplat.cli.options import DeviceOptions, Flag, Output, PageOptions, Verb, with_given
+from clsplat.cli.options import Flag, Output, PageOptions, SeveralDevices, Verb, with_given
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.presets import Preset, Schedule, bundled
 from clsplat.config.training import TrainConfig
@@ -44,7 +44,7 @@ class Train(Verb):
     """With --resume: go on though the scene is another than the run began with, or a photograph has changed."""
     overwrite: Flag = False
     """Replace the run in the output folder; files that clsplat did not write stay."""
-    device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
+    device: Annotated[SeveralDevices, arg(name="")] = field(default_factory=SeveralDevices)
     view: Flag = False
     """Show the model as it grows on a page in the browser, where training can be paused too (see clsplat view)."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
@@ -59,7 +59,12 @@ class Train(Verb):
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
 
     def completed(self, given: Collection[str]) -> Train:
-        """The settings are those of the run that is resumed, or of the preset and the schedule."""
+        """The settings are those of the run that is resumed, or of the preset and the schedule, for these devices."""
+        verb = self._with_settings(given)
+        explicit = self.resume or "batch" in given
+        return replace(verb, config=verb.config.on_devices(self.device.count, explicit=explicit))
+
+    def _with_settings(self, given: Collection[str]) -> Train:
         if not self.resume and (self.preset, self.schedule) == ("default", None):
             return self
         if not self.resume:
@@ -110,7 +115,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         source = source or earlier.scene
     if source is None:
         raise InputError("SCENE is missing, expected the folder of the scene to train on")
-    device = verb.device.open(services)
+    devices = verb.device.open_all(services)
     scene = load_scene(services, source, verb.config.resolution, verb.config.test_every)
     _check_scene(scene)
     if verb.resume and (done := max((step for step, _ in earlier.checkpoints()), default=0)) > verb.config.iterations:
@@ -122,26 +127,31 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     changed = verb.resume and scene_record.check(
         earlier, scene, source, verb.config.resolution, accept=verb.accept_changes
     )
-    device = services.require(device)
+    devices = [services.require(device) for device in devices]
     verb.output.mkdir(parents=True, exist_ok=True)
     locks.enter_context(locked(verb.output, "train"))
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
     if changed:
         scene_record.write(run, scene)
+    on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
     print(
         f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
-        f"{len(scene.points):,} points; on {device.name}, {device.driver.split('  ')[0].strip()} (the first steps may "
-        "wait for kernels to be built)",
+        f"{len(scene.points):,} points; on {on} (the first steps may wait for kernels to be built)",
         file=sys.stderr,
     )
     if scene.test_views:
         tell_of_lpips()
 
     def print_plan(plan: Plan) -> None:
-        if device.memory.limit is not None or any(plan.pieces):
+        if devices[0].memory.limit is not None or any(plan.pieces):
             print(f"{plan.need.gaussians:,} Gaussians: {plan}", file=sys.stderr)
 
-    how = {"device": device, "run": run, "resume": run.resuming, "on_plan": print_plan}
+    how = {
+        "device": devices if len(devices) > 1 else devices[0],
+        "run": run,
+        "resume": run.resuming,
+        "on_plan": print_plan,
+    }
     try:
         with page(scene) if page else nullcontext() as between, TrainProgress(run.config.iterations) as progress:
             services.train(scene, run.config, **how, on_step=progress, between=between)

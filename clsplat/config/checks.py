@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from math import inf
@@ -82,3 +83,10 @@ def parse_bytes(text: str | int | None) -> int | None:
     if size < 1:
         raise InputError(f"--max-device-mem {text}: expected a size such as 256MiB, 1.5G or a number of bytes")
     return size
+
+
+def device_names(selector: str | None) -> list[str]:
+    """The names of devices in `selector`, or without one in CLSPLAT_DEVICE, which have commas between; an empty one
+    where there is neither."""
+    text = selector or os.environ.get("CLSPLAT_DEVICE") or ""
+    return [name.strip() for name in text.split(",") if name.strip()] or [text]

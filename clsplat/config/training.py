@@ -6,7 +6,7 @@ The training defaults are those of the paper's authors' 2024 code, with the pape
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from math import inf
 from typing import Literal
 
@@ -161,8 +161,12 @@ class TrainConfig:
     """One training run."""
 
     iterations: int = 30_000
-    """Number of training steps. Learning rates and density control do not depend on it, but for --optimiser.cooldown,
-    --schedule short and --preset fast."""
+    """Number of training steps, each of which is one view. Learning rates and density control do not depend on it, but
+    for --optimiser.cooldown, --schedule short and --preset fast."""
+    batch: int = 1
+    """Views whose gradients are added up before the model changes. Each still counts as a step; with more of them
+    learning rates and Adam's constants are scaled for it (Zhao et al. 2024). With several devices, if not given: one
+    for each."""
     seed: int = 0
     """Seed of everything random; the same seed on the same device gives the same model."""
     sh_degree: int = 3
@@ -206,7 +210,7 @@ class TrainConfig:
         rules: tuple[Rule, ...] = (
             (("sh_degree",), lambda value: 0 <= value <= 3, "0 to 3"),
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
-            (("iterations", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
+            (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
             (
                 ("seed", "frequency_steps", "resolution", "test_every", "checkpoint_every", "stages_every"),
                 lambda value: value >= 0,
@@ -225,3 +229,12 @@ class TrainConfig:
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
+
+    def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
+        """The settings for `count` devices: a batch of a view for each, unless it is told. Raises InputError for a
+        batch that they cannot share evenly."""
+        if self.batch == 1 and not explicit:
+            return replace(self, batch=count)
+        if self.batch % count:
+            raise InputError(f"--batch {self.batch}: expected a multiple of {count}, as --device names {count} devices")
+        return self

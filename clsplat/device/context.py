@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pyopencl as cl
 
+from clsplat.config.checks import device_names
 from clsplat.device.account import Memory
 from clsplat.device.child import TIMEOUT, patience
 from clsplat.device.known import tell_once
@@ -22,7 +23,7 @@ from clsplat.device.profile import Calls, Recorder
 from clsplat.device.program import Kernel, Kernels, build, variant_of
 from clsplat.device.quirks import compiles_by_size, no_device, title
 from clsplat.device.rehearsal import Rehearsal
-from clsplat.device.shapes import Shape, asked_shape, shape_of, shape_text
+from clsplat.device.shapes import Shape, asked_shape, default_shape, shape_of, shape_text
 from clsplat.device.source import kernel_source
 from clsplat.device.traits import pretended, traits_of
 from clsplat.errors import DeviceError, DriverError, switched_on
@@ -106,12 +107,22 @@ class Device:
     why: the warning that this is not the wanted shape, given when the device is used; only_tries: a launch is
     rehearsed, if it has to be, and not made (`launch.only_tried`); waits: for each kernel, as SYNC asks; shares_memory:
     its memory is the host's; calls: what its queue was given; under_way: events and buffers that keep arrays on the
-    host alive, which the device may still have to read.
+    host alive, which the device may still have to read; part: if it is a part of a listed device, that and its number;
+    index: in the list, of the whole.
     """
 
-    def __init__(self, device: cl.Device, shape: Shape | None = None, *, profile: bool = False, why: str = "") -> None:
-        self.cl_device = device
-        self.name = device.name.strip()
+    def __init__(
+        self,
+        device: cl.Device,
+        shape: Shape | None = None,
+        *,
+        profile: bool = False,
+        why: str = "",
+        part: tuple[cl.Device, int] | None = None,
+    ) -> None:
+        self.cl_device, self._part = device, part
+        self.index = all_devices().index(device if part is None else part[0])
+        self.name = device.name.strip() + ("" if part is None else f"/{part[1]}")
         self.driver = device.platform.version.strip()
         traits = traits_of(device)
         self.kind = traits.kind
@@ -134,7 +145,7 @@ class Device:
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
         self._switches: Mapping[str, object] = {}
         self.recorder = Recorder(self.queue)
-        self.rehearsal = Rehearsal(device, all_devices().index(device), self.shape.label)
+        self.rehearsal = Rehearsal(device, self.index, self.shape.label)
         self._fma: list[dict[str, object]] = [] if traits.contraction else [{}]
 
     def kernels(self, stem: str, **defines: object) -> Kernels:
@@ -164,7 +175,7 @@ class Device:
         shape = self.shape.relabelled(label) if label else self.shape
         if changes:
             shape = replace(shape, by_gaussian=False)
-        device = Device(self.cl_device, replace(shape, **changes), profile=self.profile)
+        device = Device(self.cl_device, replace(shape, **changes), profile=self.profile, part=self._part)
         device.memory.limit = self.memory.limit
         return device
 
@@ -277,8 +288,6 @@ def select(selector: str | None) -> cl.Device:
 
     Without one: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
     """
-    if not isinstance(selector, str | None):
-        raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
     patience()  # what the environment says of drivers is looked at before it is needed
     devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
@@ -303,16 +312,76 @@ def find_device(selector: str | None) -> DeviceInfo:
     return list_devices()[all_devices().index(chosen)]
 
 
+def _names(selector: str | None) -> list[str]:
+    """The names of devices in `selector`. Raises DeviceError for what is no text."""
+    if not isinstance(selector, str | None):
+        raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
+    return device_names(selector)
+
+
+def _part_of(name: str) -> tuple[str, int | None]:
+    """The name of a device and the number of its part, of NAME/NUMBER; None for the whole."""
+    whole, slash, number = name.rpartition("/")
+    return (whole, int(number)) if slash and whole and number.isdigit() else (name, None)
+
+
 @lru_cache(maxsize=8)
-def _open(index: int, shape: Shape, why: str, _pretended: str, *, profile: bool) -> Device:
-    return Device(all_devices()[index], shape, profile=profile, why=why)
+def _divided(index: int, parts: int) -> list[cl.Device]:
+    """Equal parts of the `index`-th device, by OpenCL's device fission; none where it cannot be divided so."""
+    device = all_devices()[index]
+    try:
+        units = device.max_compute_units // parts
+        return list(device.create_sub_devices([cl.device_partition_property.EQUALLY, units])) if units else []
+    except cl.Error:
+        return []
+
+
+@lru_cache(maxsize=8)
+def _open(
+    index: int, shape: Shape, why: str, _pretended: str, *, profile: bool, part: tuple[int, int] | None = None
+) -> Device:
+    device = all_devices()[index]
+    if part is None:
+        return Device(device, shape, profile=profile, why=why)
+    divided = _divided(index, part[1])
+    if len(divided) < part[1]:
+        units = f"{device.max_compute_units} compute unit{'' if device.max_compute_units == 1 else 's'}"
+        raise DeviceError(
+            f"--device {index}/{part[0]}: {title(device)}, with {units}, cannot be divided into {part[1]} equal parts; "
+            f"expected a device with parts, or --device {index}, the whole"
+        )
+    chosen = divided[part[0]]
+    shape = replace(shape, chunks=default_shape(chosen).chunks)
+    return Device(chosen, shape, profile=profile, why=why, part=(device, part[0]))
+
+
+def open_devices(
+    selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False
+) -> list[Device]:
+    """Open each of the devices that `selector` names, with commas between (see `select`); the same object for the same
+    device without a limit.
+
+    NAME/K is the K-th part, from 0, of a device that OpenCL divides equally: into as many parts as the largest K asks
+    for, at least two. memory_limit: bytes that the buffers of each object's users may take together; profile: the
+    queues measure. Raises DeviceError where a device is named twice.
+    """
+    chosen: list[tuple[int, int | None]] = []
+    for name in _names(selector):
+        whole, number = _part_of(name)
+        index = all_devices().index(select(whole if selector or number is not None else None))
+        if any(index == other and (number == part or None in (number, part)) for other, part in chosen):
+            raise DeviceError(f"--device {selector}: has {name} twice, expected different devices, or parts of them")
+        chosen.append((index, number))
+    opened = []
+    for index, number in chosen:
+        parts = max([2, *(part + 1 for other, part in chosen if other == index and part is not None)])
+        part = None if number is None else (number, parts)
+        opened.append(_open(index, *shape_of(all_devices()[index]), pretended(), profile=profile, part=part))
+    return opened if memory_limit is None else [device.with_memory_limit(memory_limit) for device in opened]
 
 
 def open_device(selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False) -> Device:
-    """Open the device that `selector` names (see `select`); the same object for the same device without a limit.
-
-    memory_limit: bytes that the buffers of this object's users may take together; profile: its queue measures.
-    """
-    chosen: Any = select(selector)
-    device = _open(all_devices().index(chosen), *shape_of(chosen), pretended(), profile=profile)
-    return device if memory_limit is None else device.with_memory_limit(memory_limit)
+    """Open the one device that `selector` names (see `open_devices`)."""
+    if len(_names(selector)) > 1:
+        raise DeviceError(f"--device {selector}: expected one device here, only train and render take several")
+    return open_devices(selector, memory_limit, profile=profile)[0]

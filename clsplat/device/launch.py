@@ -95,6 +95,8 @@ _UPDATED = {
     "view_agreement": 1,
     "contribution_statistics": 2,
     "add_slots": 1,
+    "add_view": 1,
+    "join_view": 1,
 }
 """Kernels that read and write some arrays in place: how many of their last ones."""
 

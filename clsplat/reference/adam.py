@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One step of Adam: float64 twin of kernels/adam.cl."""
+"""One step of Adam, and a batch's sum of gradients: float64 twin of kernels/adam.cl."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 
@@ -25,3 +28,11 @@ def adam(
     mean = first / (1 - beta1**step)
     spread = np.sqrt(second / (1 - beta2**step))
     return parameters - rate * mean / (spread + epsilon), first, second
+
+
+def add_views(gradients: Sequence[Float64], seen: Sequence[NDArray[np.bool_]]) -> Float64:
+    """Sum of the gradients of several views, each (n, ...), over the rows that each view shows, (n,) each."""
+    total = np.zeros_like(gradients[0])
+    for gradient, rows in zip(gradients, seen, strict=True):
+        total[rows] += gradient[rows]
+    return total

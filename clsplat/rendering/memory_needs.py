@@ -21,6 +21,8 @@ _CHANNEL_PLANES = 4
 """Planes of a frame with channels beside those of its features: median, first, count and index."""
 _MODELS = 3
 """Arrays of a training step for each parameter: itself and two moments."""
+_SHOWN = 4
+"""Bytes of each Gaussian where a step has several views: of the mark that any of them shows it."""
 _SMALL = 4096
 """Bytes of camera, background, totals and the like."""
 
@@ -52,9 +54,11 @@ def plan_step(
     agreement: bool,
     photographs: int = 0,
     turns: int = 1,
+    models: int = _MODELS,
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
-    photographs: pixels of all that may stay on the device; turns: of `loss`. Raises CapacityError."""
+    photographs: pixels of all that may stay on the device; turns: of `loss`; models: arrays for each parameter, where
+    they are not those of a step of one view. Raises CapacityError."""
     planes = 0
     for camera in cameras:
         pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES)
@@ -64,9 +68,9 @@ def plan_step(
     statistics = density.gaussian_bytes(agreement=agreement, contributions=fields.contributions)
     step = replace(
         frame,
-        row=frame.row + screen + statistics,
+        row=frame.row + screen + statistics + (_SHOWN if models > _MODELS else 0),
         banded=frame.banded + 4 * fields.floats,
-        model=_MODELS * frame.model,
+        model=models * frame.model,
         pair=frame.pair + blend.gradient_pair_bytes(fields),
         most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS),
         photographs=0 if device.shares_memory else target.SOURCE_BYTES * photographs,

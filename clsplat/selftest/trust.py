@@ -141,7 +141,7 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
     """The driver's abort or hang in the device's shape, in words, or nothing; what passed is remembered. Raises
     DriverError where the test itself could not be made, and DeviceError like `require`."""
     wanted = [name for name in STAGES if name in FORWARD or name in stages]
-    report = examine(all_devices().index(device.cl_device), device.shape, wanted, quick=True)
+    report = examine(device.index, device.shape, wanted, quick=True)
     if report.crashed:
         return report.end
     if report.end:

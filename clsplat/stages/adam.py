@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches adam.cl on every parameter group. A step of training has Adam in `stages.project.project_step`."""
+"""Launches adam.cl on every parameter group. A step of one view has Adam in `stages.project.project_step`."""
 
 from __future__ import annotations
 
@@ -66,3 +66,25 @@ def adam(
             kernel = device.kernels("adam").adam
             # Of SH more than 32 bits count, from 95 million Gaussians on.
             launch_items(device, kernel, -(-size // lanes), np.uint64(size), *constants, *arrays)
+
+
+@stage("adam")
+def add_view(
+    device: Device,
+    tile_counts: DeviceArray,
+    gradients: DeviceGaussians,
+    sums: DeviceGaussians,
+    shown: DeviceArray | None = None,
+    *,
+    sh_rest: bool = True,
+) -> None:
+    """Add the rows of `gradients` that a view shows, by its tile_counts (n,) uint32, to those of the views before it;
+    sh_rest: the higher bands of SH too; shown (n,) uint32, if given: not 0 where any of the views shows a Gaussian."""
+    rows = tile_counts.shape[0]
+    for group in GROUPS:
+        size = sums[group].size
+        if size and (sh_rest or group != "sh_rest"):
+            kernel = device.kernels("adam", WIDTH=size // rows).add_view
+            launch_items(device, kernel, size, np.uint64(size), tile_counts, gradients[group], sums[group])
+    if shown is not None:
+        launch_items(device, device.kernels("adam").join_view, rows, rows, tile_counts, shown)

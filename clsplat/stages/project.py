@@ -163,7 +163,7 @@ def project_step(
     step: int,
     rates: Mapping[str, float],
     config: OptimiserConfig,
-    model: tuple[DeviceGaussians, DeviceGaussians, DeviceGaussians],
+    model: tuple[DeviceGaussians, ...],
     camera_array: DeviceArray,
     projected: Projected,
     slots: Slots,

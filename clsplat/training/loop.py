@@ -36,6 +36,7 @@ from clsplat.scenes.initialise import is_colourless, photographed
 from clsplat.scenes.scene import Scene
 from clsplat.stages.loss import Loss
 from clsplat.training import telemetry
+from clsplat.training.batch import Losses
 from clsplat.training.health import RETURNS, WINDOW
 from clsplat.training.repro import write_bundle
 from clsplat.training.trainer import Trainer, unusable
@@ -51,7 +52,8 @@ should return."""
 
 @dataclass(frozen=True)
 class StepReport:
-    """step: number of steps done; loss and psnr of that step's view; seconds of training alone, so far."""
+    """step: number of steps done; loss and psnr of that step's view, or of all that its gradient is of; seconds of
+    training alone, so far."""
 
     step: int
     loss: float
@@ -194,7 +196,7 @@ class Session:
             self.on_plan(plan)
         self.announced = plan
 
-    def report(self, result: Loss) -> StepReport | None:
+    def report(self, result: Loss | Losses) -> StepReport | None:
         """Read the loss of the step just made; None where it is not finite."""
         start = time.perf_counter()
         value, squared = result.read()
@@ -252,27 +254,29 @@ class Session:
             if text := doubts.of_pictures(self.draw, self.trainer.views):
                 warnings.warn(f"step {self.trainer.step}: {text}")
 
-    def times_stages(self, step: int) -> bool:
-        """True if each stage of the step is to be timed: only where the times are written down."""
+    def times_stages(self, steps: range) -> bool:
+        """True if each stage of these steps, which are made together, is to be timed: only where the times are written
+        down."""
         config = self.trainer.config
         if config.stages_every == 0:
             return False
-        return step == config.iterations or (step % config.stages_every == 0 and step % REPORT_EVERY == 0)
+        return config.iterations in steps or (_reached(config.stages_every, steps) and _reached(REPORT_EVERY, steps))
 
-    def evaluates(self, step: int) -> bool:
-        """True if the held-out views are rendered after the step."""
-        return step in self.trainer.config.eval_at and bool(self.trainer.scene.test_views)
+    def evaluates(self, steps: range) -> bool:
+        """True if the held-out views are rendered after these steps."""
+        return any(step in steps for step in self.trainer.config.eval_at) and bool(self.trainer.scene.test_views)
 
-    def reports(self, step: int) -> bool:
-        """True if the step's loss is read."""
-        return step % REPORT_EVERY == 0 or step == self.trainer.config.iterations or self.evaluates(step)
+    def reports(self, steps: range) -> bool:
+        """True if the loss of these steps is read."""
+        return _reached(REPORT_EVERY, steps) or self.trainer.config.iterations in steps or self.evaluates(steps)
 
     def step(self) -> None:
-        """One step, and what is due after it."""
+        """One step, or those of a batch, and what is due after it."""
         trainer, config = self.trainer, self.trainer.config
         start, stages = time.perf_counter(), None
-        reports = self.reports(trainer.step + 1)
-        if self.run is not None and self.times_stages(trainer.step + 1):
+        steps = range(trainer.step + 1, trainer.step + 1 + trainer.views_ahead)
+        reports = self.reports(steps)
+        if self.run is not None and self.times_stages(steps):
             result, stages = telemetry.timed(trainer.device, lambda: trainer.train_step(reads_loss=reports))
         else:
             result = trainer.train_step(reads_loss=reports)
@@ -282,15 +286,14 @@ class Session:
             trainer.mend(look=True)
         if self.go_back():
             return
-        step = trainer.step
-        if step == doubts.LOOK_AT and step < config.iterations:
+        if doubts.LOOK_AT in steps and trainer.step < config.iterations:
             self.doubt()
-        if self.reports(step):
-            evaluating = self.evaluates(step)
+        if reports:
+            evaluating = self.evaluates(steps)
             report = self.report(result)
             if report is not None:
                 self.record(report, evaluating=evaluating, stages=stages)
-        if config.checkpoint_every > 0 and step % config.checkpoint_every == 0:
+        if config.checkpoint_every > 0 and _reached(config.checkpoint_every, steps):
             self.save()
 
     def train(self, between: Between | None) -> Gaussians:
@@ -329,6 +332,11 @@ class Session:
             if trainer.step < last:
                 raise Interrupted(interrupted())
             self.doubt()
+
+
+def _reached(every: int, steps: range) -> bool:
+    """True if one of the steps is a multiple of `every`."""
+    return steps[-1] // every > (steps[0] - 1) // every
 
 
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:

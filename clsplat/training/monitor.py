@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,18 @@ from clsplat.training.health import Incident, Patience
 
 @dataclass(frozen=True, eq=False)
 class LastStep:
-    """The step to look at if it turns out to have had trouble: its number, view and background; the sums of its loss,
-    which are there until the next step has one."""
+    """The step to look at if it turns out to have had trouble: its number, view and background; sums: returns those of
+    its loss, until the next step has one; others: its further views."""
 
     step: int
     view: int
     background: NDArray[np.float32]
-    sums: DeviceArray
+    sums: Callable[[], NDArray[np.float32]]
+    others: tuple[LastStep, ...] = ()
+
+    def with_bad_loss(self) -> LastStep | None:
+        """The first of its views whose loss is not finite."""
+        return next((one for one in (self, *self.others) if not np.isfinite(one.sums()).all()), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,15 +62,20 @@ class Watch:
         self.last = self._noticed = None
         self.readback.fill(0)
 
+    def begin(self, view: LastStep) -> None:
+        """Remember a view of the step under way, which has its loss now."""
+        last = self.last
+        same = last is not None and last.step == view.step
+        self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
+
     def notice(self, refused: Sequence[int]) -> None:
         """Take what `adam` counted (`REFUSED`) in the last step, whose loss must still be there."""
         if not any(refused) or self._noticed is not None or self.last is None:
             return
         counts = dict(zip(REFUSED, refused, strict=True))
         stage = "parameters" if counts["parameters"] else ("project_grad" if counts["gradients"] else "adam")
-        if not np.isfinite(self.last.sums.get()).all():
-            stage = "loss"
-        self._noticed = (self.last, stage, sum(refused))
+        culprit = self.last.with_bad_loss()
+        self._noticed = (culprit or self.last, "loss" if culprit else stage, sum(refused))
 
     def look(self) -> None:
         """Read the counts now, rather than wait for the next pass."""
@@ -74,7 +84,7 @@ class Watch:
     def loss_failed(self) -> None:
         """A loss was read that is not finite; where no Gaussian is, `adam` has nothing to refuse."""
         if self.last is not None and self._noticed is None:
-            self._noticed = (self.last, "loss", 0)
+            self._noticed = (self.last.with_bad_loss() or self.last, "loss", 0)
 
     def examine(self, models: Mapping[str, AnyGaussians]) -> Remedy | None:
         """The remedy for what was noticed, or None if nothing was; models: parameters, first and second moments."""

@@ -25,9 +25,15 @@ class Photographs:
     def __init__(self, views: list[View], device: Device) -> None:
         self._views, self._device = views, device
         self._factor = 0.0
-        self._held: dict[int, NDArray[Any]] = {}
+        self._held: dict[tuple[int, float], NDArray[Any]] = {}
         self._on_device: dict[int, DeviceArray] = {}
         self._taken = self.allowed = 0
+
+    def for_device(self, device: Device) -> Photographs:
+        """The same for another device, with the same pixels on the host."""
+        other = Photographs(self._views, device)
+        other._held = self._held
+        return other
 
     def follow(self, allowed: int) -> None:
         """Take at most so many bytes on the device from here on."""
@@ -39,9 +45,10 @@ class Photographs:
         """View `index` at 1/factor of its size, (H, W, 3 or 4), straight alpha; not to be written to."""
         if factor != self._factor:
             self._factor = factor
-            self._held.clear()
+            for key in [key for key in self._held if key[1] != factor]:
+                del self._held[key]
             self._leave_device()
-        if index not in self._held:
+        if (index, factor) not in self._held:
             camera = self._views[index].camera
             image: NDArray[np.float32] = self._views[index].load(
                 max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
@@ -51,8 +58,8 @@ class Photographs:
                 np.array_equal(levels * np.float32(1 / 255), image)  # as target.cl has it
                 and 0 <= levels.min() <= levels.max() <= 255
             )
-            self._held[index] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
-        return self._held[index]
+            self._held[index, factor] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
+        return self._held[index, factor]
 
     def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
         """The same, on the device where there is room for it: it goes up once, and stays. A device that shares the

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -25,24 +25,51 @@ from clsplat.training.density import StatisticsNeeds
 
 
 @dataclass(frozen=True, eq=False)
-class StepRows:
+class Sample:
+    """A view of a step: its index, photograph (H, W, 3 or 4), camera of that size, background; begins: with it a pass
+    through all views begins."""
+
+    view: int
+    photograph: NDArray[Any] | DeviceArray
+    camera: Camera
+    background: NDArray[np.float32]
+    begins: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ViewRows:
     """Rows of the model that are on the device at once, from start to before stop; all of them if the model fits.
 
-    camera_array, projected, slots: the step's view, what it shows of these rows, and the gradients of their pairs;
-    screen: the gradients on its screen, from where the rows have changed on; gradients: the rows' own, where they are
-    asked for.
+    projected: what the step's view shows of these rows; screen: the gradients on its screen, from where the rows have
+    changed on.
     """
 
     start: int
     stop: int
-    parameters: DeviceGaussians
-    first: DeviceGaussians
-    second: DeviceGaussians
-    camera_array: DeviceArray
     projected: Projected
-    slots: Slots
     screen: Screen
+
+
+@dataclass(frozen=True, eq=False)
+class StepRows(ViewRows):
+    """The same with all that a step has of them: model: their parameters, and their moments or whatever else the step
+    changes; camera_array, slots: the step's view, and the gradients of their pairs; gradients: the rows' own, where
+    they are asked for."""
+
+    model: tuple[DeviceGaussians, ...]
+    camera_array: DeviceArray
+    slots: Slots
     gradients: DeviceGaussians | None
+
+    @property
+    def parameters(self) -> DeviceGaussians:
+        """Their parameters."""
+        return self.model[0]
+
+    @property
+    def first(self) -> DeviceGaussians:
+        """Adam's first moments."""
+        return self.model[1]
 
 
 class StepProbe:
@@ -60,7 +87,7 @@ class StepProbe:
     def before_rows(self, rows: StepRows) -> None:
         """Adam is about to change these rows."""
 
-    def after_rows(self, rows: StepRows) -> None:
+    def after_rows(self, rows: ViewRows) -> None:
         """Adam has changed these rows."""
 
 
@@ -77,12 +104,13 @@ class GradientStep:
     step: int
     rates: Mapping[str, float]
     fields: SlotFields
+    _: KW_ONLY
     turn: int = 0
     room: Room | None = None
 
     def run(
         self,
-        model: tuple[AnyGaussians, AnyGaussians, AnyGaussians],
+        model: tuple[AnyGaussians, ...],
         photograph: NDArray[Any] | DeviceArray,
         camera: Camera,
         background: NDArray[np.float32],
@@ -107,13 +135,13 @@ class GradientStep:
         probe.loss(result)
         slots = rasterizer.pair_gradients(frame, result.gradient, fields=self.fields)
         probe.pair_gradients(slots)
-        for start, stop, (parameters, first, second) in parts(work, *model, keep=True):
-            view = (frame.camera_array, frame.projected.rows(start, stop), slots.rows(start, stop))
-            screen = rasterizer.screen(parameters.count, self.fields)
-            rows = StepRows(start, stop, parameters, first, second, *view, screen, gradients)
+        for start, stop, part in parts(work, *model, keep=True):
+            projected, row_slots = frame.projected.rows(start, stop), slots.rows(start, stop)
+            screen = rasterizer.screen(stop - start, self.fields)
+            rows = StepRows(start, stop, projected, screen, part, frame.camera_array, row_slots, gradients)
             if gradients is not None:
                 sh_rest = updates_sh_rest(self.config.optimiser, self.step)
-                arrays = (parameters, *view, gradients, screen)
+                arrays = (part[0], frame.camera_array, projected, row_slots, gradients, screen)
                 project_grad(rasterizer.device, *arrays, fields=self.fields, sh_rest=sh_rest)
             probe.before_rows(rows)
             self.update(rows)
@@ -124,13 +152,13 @@ class GradientStep:
         """Adam's step of some rows, with the gradient of projection where that is not known yet."""
         optimiser, readback = self.config.optimiser, self.rasterizer.readback
         if rows.gradients is not None:
-            models = (rows.parameters, rows.gradients, rows.first, rows.second)
+            parameters, first, second = rows.model
+            models = (parameters, rows.gradients, first, second)
             adam(self.device, self.step, self.rates, optimiser, *models, rows.projected.tile_counts, readback)
             return
-        model = (rows.parameters, rows.first, rows.second)
         view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
         device = self.rasterizer.device
-        project_step(device, self.step, self.rates, optimiser, model, *view, fields=self.fields)
+        project_step(device, self.step, self.rates, optimiser, rows.model, *view, fields=self.fields)
 
 
 def slot_fields(needs: StatisticsNeeds) -> SlotFields:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.memory_needs import plan_step
+from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Frame, Rasterizer, Room
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.initialise import from_scene
@@ -52,6 +53,7 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.stages.loss import Loss
+from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
 from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.health import Patience
@@ -59,7 +61,7 @@ from clsplat.training.monitor import LastStep, Remedy, Watch
 from clsplat.training.pending import Pending
 from clsplat.training.photographs import Photographs
 from clsplat.training.resolution import sizes_of
-from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
+from clsplat.training.step import GradientStep, Sample, StepProbe, StepRows, ViewRows, slot_fields
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
@@ -79,13 +81,12 @@ class _Mark:
 @dataclass(frozen=True, eq=False)
 class _Watched(StepProbe):
     """Follows a training step: notices what is not finite, rehearses what changes the state, adds the statistics that
-    density control goes by."""
+    density control goes by. number: of views, this one among them."""
 
     trainer: Trainer
     step: GradientStep
-    view: int
-    camera: Camera
-    background: NDArray[np.float32]
+    number: int
+    sample: Sample
     needs: StatisticsNeeds
 
     def forward(self, frame: Frame) -> None:
@@ -95,7 +96,8 @@ class _Watched(StepProbe):
 
     def loss(self, result: Loss) -> None:
         """Remember the step, to look at if it turns out to have had trouble."""
-        self.trainer.watch.last = LastStep(self.step.step, self.view, self.background, result.sums)
+        sums = result.copy or result.sums.get
+        self.trainer.watch.begin(LastStep(self.number, self.sample.view, self.sample.background, sums))
 
     def before_rows(self, rows: StepRows) -> None:
         """Before the first row changes, have every kernel rehearsed that changes the state: a driver may fail in
@@ -111,17 +113,17 @@ class _Watched(StepProbe):
             trainer.rehearsed.add(key)
         trainer.mark = None
 
-    def after_rows(self, rows: StepRows) -> None:
+    def after_rows(self, rows: ViewRows) -> None:
         """Add the rows to the statistics."""
         self.add_statistics(self.trainer.statistics.rows(rows.start, rows.stop), rows)
 
-    def add_statistics(self, statistics: DensityStatistics, rows: StepRows) -> None:
+    def add_statistics(self, statistics: DensityStatistics, rows: ViewRows) -> None:
         """Add the step to the statistics of some rows, as far as density control needs them."""
-        device, camera, screen = self.trainer.device, self.camera, rows.screen
+        device, camera, screen = self.trainer.device, self.sample.camera, rows.screen
         if self.needs.gradients:
             add_statistics(device, statistics, camera, rows.projected, screen, self.needs.threshold)
         if screen.contributions is not None and statistics.current_totals is not None:
-            full = self.trainer.views[self.view].camera
+            full = self.trainer.views[self.sample.view].camera
             area = full.width * full.height / (camera.width * camera.height)
             add_contributions(device, statistics, rows.projected, screen.contributions, area)
 
@@ -129,9 +131,9 @@ class _Watched(StepProbe):
 class Trainer:
     """A model in training: parameters, moments, statistics and the random state, all of which a checkpoint holds.
 
-    watch: what is not finite in it, and how much of that there was; pending: the steps that are launched and not yet
-    known to have been made; mark: where `step_back` leads, None from where the
-    state changes on.
+    step: views done; watch: what is not finite in the model, and how much of that there was; pending: the steps that
+    are launched and not yet known to have been made; mark: where `step_back` leads, None from where the state changes
+    on; further: devices beside the one that has the model.
     """
 
     def __init__(
@@ -141,11 +143,13 @@ class Trainer:
         device: Device,
         initial: Gaussians | None = None,
         strategy: Callable[[TrainConfig], Strategy] = Adaptive,
+        further: Sequence[Device] = (),
     ) -> None:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
         self.rasterizer = Rasterizer(device, config.rasterizer)
         self.photographs = Photographs(self.views, device)
+        self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.sizes = sizes_of(
             config.warmup, config.frequency_steps, len(self.views), lambda index: self.views[index].load()
         )
@@ -153,6 +157,7 @@ class Trainer:
         self.given = initial
         self.watch = Watch(self.rasterizer.readback, [view.name for view in self.views])
         self.pending = Pending(device, self.watch, self._begin_again)
+        self.pending.on         self.pending = Pending(device, self.watch, self._begin_again)= self.batch is None  # a batch reads its losses
         self._start()
 
     def _start(self) -> None:
@@ -160,7 +165,7 @@ class Trainer:
         self.rng = np.random.default_rng(self.config.seed)
         self.step = 0
         self.queue: list[int] = []
-        self.controlled = False
+        self.controlled, self.last_views = False, 1
         self.mark: _Mark | None = None
         self.rehearsed: set[tuple[object, ...]] = set()
         self.strategy = self._new_strategy(self.config)
@@ -177,20 +182,27 @@ class Trainer:
 
     def _make_plan(self, count: int) -> None:
         """Plan the device's memory for `count` Gaussians with all the SH coefficients that they will have."""
-        needs = self.strategy.needs()
-        self.plan = plan_step(
-            self.device,
-            count,
-            (self.config.sh_degree + 1) ** 2,
-            [view.camera for view in self.scene.views],
-            self.config.rasterizer,
-            fields=slot_fields(needs),
-            agreement=needs.agreement,
-            photographs=sum(view.camera.width * view.camera.height for view in self.views),
-            turns=self.pending.turns,
-        )
+        needs, batch = self.strategy.needs(), self.batch
+
+        def plan(device: Device, **models: int) -> Plan:
+            return plan_step(
+                device,
+                count,
+                (self.config.sh_degree + 1) ** 2,
+                [view.camera for view in self.scene.views],
+                self.config.rasterizer,
+                fields=slot_fields(needs),
+                agreement=needs.agreement,
+                photographs=sum(view.camera.width * view.camera.height for view in self.views),
+                turns=self.pending.turns,
+                **models,
+            )
+
+        self.plan = plan(self.device) if batch is None else plan(self.device, models=OWNER_MODELS)
         self.rasterizer.follow(self.plan)
         self.photographs.follow(self.plan.photographs)
+        if batch is not None:
+            batch.follow([plan(replica.device, models=REPLICA_MODELS) for replica in batch.replicas])
 
     def _set_parameters(
         self, parameters: AnyGaussians, first: AnyGaussians | None = None, second: AnyGaussians | None = None
@@ -222,38 +234,45 @@ class Trainer:
             return replace(model, rows=self.plan.rows) if self.plan.streamed else to_device(self.device, model)
         return model
 
-    def train_step(self, *, reads_loss: bool = False) -> Loss:
-        """Density control as the last step left it to do, then one view: forward, loss, backward, Adam. reads_loss: the
-        loss will be read, which then waits for no more than the loss.
+    @property
+    def views_ahead(self) -> int:
+        """Views of the next step."""
+        return max(min(self.config.batch, self.config.iterations - self.step), 1)
+
+    def train_step(self, *, reads_loss: bool = False) -> Loss | Losses:
+        """Density control as the last step left it to do, then one view, or a batch of them: forward, loss, backward,
+        Adam. reads_loss: the loss will be read, which then waits for no more than the loss.
 
         Kerbl et al. 2023, algorithm 1, but for where the loop is cut: a model is looked at, kept or finished before
         its Gaussians are split or made transparent, not just after.
         """
-        config = self.config
         self._note()
         self.mend()
         if not self.controlled:
             self._control_density()
             self.controlled = True
         self._note()
-        self.step += 1
+        views = self.views_ahead
+        self.step += views
         self._raise_sh_degree()
-        view, factor = self._next_view(), self.sizes.factor(self.step)
-        image = self.photographs.bring(view, factor)
-        camera = self._camera(view, image.shape[1], image.shape[0])
-        self.background = self._background_colour()
+        samples = [self._sample() for _ in range(views)]
         needs = self.strategy.needs(self.step)
-        exact = GradientStep(self.device, self.rasterizer, config, self.step, self.rates(), slot_fields(needs))
-        background = self.background
+        exact = GradientStep(self.device, self.rasterizer, self.config, self.step, self.rates(), slot_fields(needs))
+        factor, number = self.sizes.factor(self.step), self.step
 
         def run(turn: int, room: Room | None) -> Loss:
-            step = replace(exact, turn=turn, room=room)
-            probe = _Watched(self, step, view, camera, background, needs)
-            model = (self.parameters, self.first, self.second)
-            return step.run(model, image, camera, background, probe, reads_loss=reads_loss)
+            sample, step = samples[0], replace(exact, turn=turn, room=room)
+            probe, model = _Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
+            pixels = (sample.photograph, sample.camera, sample.background)
+            return step.run(model, *pixels, probe, reads_loss=reads_loss)
 
-        result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
-        self.controlled = False
+        result: Loss | Losses
+        if self.batch is None:
+            result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
+        else:
+            model, statistics = (self.parameters, self.first, self.second), needs.gradients
+            result = self.batch.run(exact, model, samples, factor, self._watched_in_batch, statistics=statistics)
+        self.controlled, self.last_views = False, views
         self._note()
         self._rearrange(self.strategy.after_gradient(self._state()))
         return result
@@ -275,9 +294,23 @@ class Trainer:
         """Wait until all steps are known to have been made, or make them again (`Pending`)."""
         self.pending.settle()
 
+    def _sample(self) -> Sample:
+        """The next view, its photograph on the device where it is one a step."""
+        begins, view, factor = not self.queue, self._next_view(), self.sizes.factor(self.step)
+        bring = self.photographs.bring if self.batch is None else self.photographs.load
+        image = bring(view, factor)
+        self.background = self._background_colour()
+        return Sample(view, image, self._camera(view, image.shape[1], image.shape[0]), self.background, begins)
+
+    def _watched_in_batch(self, sample: Sample, step: GradientStep) -> StepProbe:
+        """The probe of a view, when the statistics of those before it are complete."""
+        if sample.begins:
+            self._turn_epoch()
+        return _Watched(self, step, self.step, sample, self.strategy.needs(self.step))
+
     def _note(self, *, begun: bool = False) -> None:
         """Mark the state as it is now: until something of it is changed, `step_back` leads here. begun: the step's
-        number has risen."""
+        number has risen, by the one view that it has."""
         self.mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
 
     def step_back(self) -> bool:
@@ -325,12 +358,17 @@ class Trainer:
     def _next_view(self) -> int:
         if not self.queue:
             self.queue = [int(index) for index in self.rng.permutation(len(self.views))]
-            if self.statistics.whole_totals is not None:
-                self.settle()
-            self.mark = None
-            self.statistics = self.statistics.next_epoch()
-            self._note(begun=True)
+            if self.batch is None:  # a batch may have views of the epoch before to count
+                self._turn_epoch()
+                self._note(begun=True)
         return self.queue.pop()
+
+    def _turn_epoch(self) -> None:
+        """A pass through all views begins."""
+        if self.statistics.whole_totals is not None:
+            self.settle()
+        self.mark = None
+        self.statistics = self.statistics.next_epoch()
 
     def _background_colour(self) -> NDArray[np.float32]:
         if self.config.background == "random":
@@ -349,15 +387,18 @@ class Trainer:
             self.parameters, self.first, self.second = wider
 
     def _control_density(self) -> None:
-        if self.step > 0 and self.strategy.is_due(self.step):
+        """Do what is due after any of the last step's views."""
+        steps = [step for step in range(self.step - self.last_views + 1, self.step + 1) if self.strategy.is_due(step)]
+        for step in steps if self.step > 0 else ():
             self.mend(look=True)
-            self._note()
-            self._rearrange(self.strategy.before_step(self._state()))
+            if step == steps[0]:
+                self._note()
+            self._rearrange(self.strategy.before_step(self._state(step)))
 
-    def _state(self) -> ModelState:
+    def _state(self, step: int | None = None) -> ModelState:
         model, statistics = self.parameters, self.statistics.named()
-        marker = Marker(self.device, self.rasterizer.work, model, self.statistics)
-        return ModelState(model.count, self.step, self.scene.extent, model.arrays, statistics, self.rng, marker)
+        marker, step = Marker(self.device, self.rasterizer.work, model, self.statistics), step or self.step
+        return ModelState(model.count, step, self.scene.extent, model.arrays, statistics, self.rng, marker)
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out what density control, or a repair, has planned for the rows of everything."""
@@ -372,6 +413,8 @@ class Trainer:
             if listed.halves and plan.halves is not None:
                 self._halve(listed, plan.halves)
         self.mark = None
+        if self.batch is not None:
+            self.batch.changed()
         for group, (rows, values) in plan.values.items():
             changed = self.parameters[group].get()
             changed[rows] = values
@@ -412,6 +455,11 @@ class Trainer:
             entries = listed.get()
             self.strategy.rearranged(entries & ~FRESH, entries >= FRESH)
 
+    def close(self) -> None:
+        """End what works beside this thread."""
+        if self.batch is not None:
+            self.batch.close()
+
     def local(self, camera: Camera) -> Camera:
         """A camera in the world as one for the model in training: see `Gaussians.local`."""
         return camera.from_origin(self.origin).before(self.near)
@@ -441,7 +489,8 @@ class Trainer:
             self._apply(remedy)
             arrays = self._arrays()
         state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(self.watch.patience)}
-        return arrays, {**state, "controlled": True} if self.controlled else state
+        views = {"views": self.last_views} if self.last_views > 1 else {}
+        return arrays, {**state, **views, **({"controlled": True} if self.controlled else {})}
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
@@ -466,11 +515,15 @@ class Trainer:
             if not all(type(index) is int and index >= 0 for index in queue):
                 raise ValueError(f"a queue of {queue[:3]}")
             patience = Patience(**checkpoint.state.get("patience", {}))
+            last_views = checkpoint.state.get("views", 1)
+            if type(last_views) is not int or not 1 <= last_views <= max(checkpoint.step, 1):
+                raise ValueError(f"a step of {last_views!r:.20} views")
         except (KeyError, TypeError, ValueError, IndexError) as error:
             why = f"{type(error).__name__}: {error}"
             raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
         self.queue = queue if max(queue, default=0) < len(self.views) else []  # of a scene that had more of them
         self.controlled, self.mark = bool(checkpoint.state.get("controlled", False)), None
+        self.last_views = last_views
         self.watch.patience = patience
         self.watch.forget()
         self.pending.forget()

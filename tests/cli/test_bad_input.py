@@ -237,6 +237,29 @@ def test_an_unknown_device(verb: str, scene: Path, trained: Path, tmp_path: Path
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--device", "0,0"], "--device 0,0: has 0 twice, expected different devices, or parts of them"),
+        (["--device", "0/0,0"], "--device 0/0,0: has 0 twice"),
+        (["--device", "0,abacus"], "--device abacus: no such device"),
+        (["--device", "0/70000"], "cannot be divided into 70001 equal parts"),
+        (["--device", "0/0,0/1", "--batch", "3"], "--batch 3: expected a multiple of 2, as --device names 2 devices"),
+        (["--device", "0/0,0/1", "--batch", "1"], "--batch 1: expected a multiple of 2"),
+        (["--batch", "0"], "--batch 0: expected at least 1"),
+    ],
+)
+def test_several_devices(words: list[str], line: str, scene: Path, tmp_path: Path, capfd: Capture) -> None:
+    assert main(["train", str(scene), "-o", str(tmp_path / "run"), *words]) == 2
+    assert line in one_error(capfd)
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_device_where_one_is_expected(scene: Path, trained: Path, capfd: Capture) -> None:
+    assert main(["eval", str(trained / "model.ply"), "--scene", str(scene), "--device", "0,1"]) == 2
+    assert "--device 0,1: expected one device here, only train and render take several" in one_error(capfd)
+
+
 def test_overwriting_with_what_cannot_be_trained_keeps_the_run(scene: Path, tmp_path: Path, capfd: Capture) -> None:
     run = tmp_path / "run"
     assert train(scene, run, CONFIG) == 0

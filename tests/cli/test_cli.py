@@ -15,7 +15,7 @@ from fakes import Pipeline
 
 from clsplat.cli.eval import Eval
 from clsplat.cli.main import main, parse
-from clsplat.cli.options import DeviceOptions
+from clsplat.cli.options import SeveralDevices
 from clsplat.cli.session import Services
 from clsplat.cli.train import Train
 from clsplat.config.training import TrainConfig
@@ -57,7 +57,7 @@ def test_flags_become_the_config() -> None:
     line = "train S -o R --iterations 50 --eval-at 10,20,30 --warmup 5 --optimiser.beta1 0.8 --density.every 0"
     verb = parse([*line.split(), "--density.absolute-gradients", "--background", "random", "--device", "gpu"])
     assert isinstance(verb, Train)
-    assert (verb.scene, verb.output, verb.device) == (Path("S"), Path("R"), DeviceOptions("gpu"))
+    assert (verb.scene, verb.output, verb.device) == (Path("S"), Path("R"), SeveralDevices("gpu"))
     config = verb.config
     assert (config.iterations, config.eval_at, config.warmup) == (50, (10, 20, 30), (5,))
     assert (config.optimiser.beta1, config.density.every, config.density.absolute_gradients) == (0.8, 0, True)

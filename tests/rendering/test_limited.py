@@ -219,6 +219,24 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
     del statistics
 
 
+def test_the_needs_of_a_batch_are_those_of_its_arrays(scene: Scene, default_device: Device) -> None:
+    """On the device that has the model, and on another."""
+    devices = [with_limit(default_device, 2**40) for _ in range(2)]
+    config = short(batch=2, iterations=2, random_points=6000, sh_degree_every=0, warmup=())
+    trainer = Trainer(scene, config, devices[0], further=devices[1:])
+    trainer.train_step()
+    trainer.close()
+    assert trainer.batch is not None
+    rasterizers = (trainer.rasterizer, trainer.batch.replicas[0].rasterizer)
+    for rasterizer, device in zip(rasterizers, devices, strict=True):
+        plan = trainer.plan if rasterizer is trainer.rasterizer else trainer.batch.replicas[0].plan
+        assert plan is not None
+        pairs = rasterizer.work.array("tile_keys", (0,), np.uint32, kept=True).buffer.size // 4
+        estimate = plan.need.total + (pairs - plan.need.pairs) * plan.need.pair
+        # statistics are planned for on both devices, and kept on the first alone
+        assert 0.7 * estimate < device.memory.peak <= estimate
+
+
 def test_the_needs_of_a_frame_are_those_of_its_arrays(default_device: Device) -> None:
     device = with_limit(default_device, 2**40)
     gaussians, camera = random_cloud(6000, 11, 100, 80)

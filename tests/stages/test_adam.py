@@ -12,7 +12,8 @@ from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference.adam import adam as reference
-from clsplat.stages.adam import adam
+from clsplat.reference.adam import add_views
+from clsplat.stages.adam import adam, add_view
 from clsplat.stages.device_gaussians import allocate_gaussians
 
 
@@ -40,6 +41,31 @@ def test_steps(shaped_device: Device, count: int) -> None:
         # beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3: 1e-5 of a step, of which there were four.
         assert_close(p[group].get(), wanted[group][0], relative=1e-6, absolute=1e-4 * rates[group])
         assert not g[group].get().any(), "the gradient is to be left zero"
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 63, 64, 65])
+def test_views_are_added_in_order(shaped_device: Device, count: int) -> None:
+    """Rows that a view does not show are not looked at, whatever is there."""
+    rng = np.random.default_rng(count)
+    sums = allocate_gaussians(shaped_device, count, 4, zero=True)
+    shown, views = upload(shaped_device, np.zeros(count, np.uint32)), []
+    for _ in range(3):
+        seen = rng.random(count) < 0.6
+        gradients, values = allocate_gaussians(shaped_device, count, 4), {}
+        for group, shape in group_shapes(count, 4).items():
+            values[group] = rng.standard_normal(shape).astype(np.float32)
+            values[group][~seen] = np.nan
+            gradients[group].set(values[group])
+        views.append((seen, values))
+        add_view(shaped_device, upload(shaped_device, 5 * seen.astype(np.uint32)), gradients, sums, shown)
+    for group in GROUPS:
+        exact = add_views([values[group].astype(np.float64) for _, values in views], [seen for seen, _ in views])
+        # two roundings, of sums that are at most three times as large as their largest term
+        assert_close(sums[group].get(), exact, relative=1e-6, absolute=1e-6)
+    np.testing.assert_array_equal(shown.get() > 0, np.any([seen for seen, _ in views], axis=0))
+    before = sums["sh_rest"].get()
+    add_view(shaped_device, upload(shaped_device, np.ones(count, np.uint32)), sums, sums, sh_rest=False)
+    np.testing.assert_array_equal(sums["sh_rest"].get(), before)
 
 
 @pytest.mark.smoke
