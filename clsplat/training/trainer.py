@@ -157,7 +157,7 @@ class Trainer:
         self.given = initial
         self.watch = Watch(self.rasterizer.readback, [view.name for view in self.views])
         self.pending = Pending(device, self.watch, self._begin_again)
-        self.pending.on         self.pending = Pending(device, self.watch, self._begin_again)= self.batch is None  # a batch reads its losses
+        self.pending.on &= self.batch is None  # a batch reads its losses
         self._start()
 
     def _start(self) -> None:
