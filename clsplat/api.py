@@ -66,7 +66,8 @@ def _opened(device: Device | str | Sequence[Device] | None, limit: int | None) -
     """The devices, with `limit` bytes of memory each. Raises InputError for what is none."""
     if device is None or isinstance(device, str):
         return open_devices(device, limit)
-    devices = [device] if isinstance(device, Device) else list(device) if isinstance(device, Sequence) else []
-    if not devices or not all(isinstance(one, Device) for one in devices):
+    given = [device] if isinstance(device, Device) else device if isinstance(device, Sequence) else ()
+    devices = [one for one in given if isinstance(one, Device)]
+    if not devices or len(devices) < len(given):
         raise InputError(f"device is {device!r:.100}, expected open devices, or names with commas between")
     return devices if limit is None else [one.with_memory_limit(limit) for one in devices]
