@@ -46,6 +46,7 @@ from clsplat.training.trainer import Trainer
 
 STAND_INS = (
     "arrays are filled by a copy from the host, as what clEnqueueFillBuffer writes counts as uninitialised there",
+    "rows are written with the whole of their array, as its shadow of a write begins where the buffer does",
     "no buffer is released, as what is written to memory that is used again counts as uninitialised at times",
     "vectors made of shorter vectors are made of their elements, as its shadow of such a shuffle reads past the end",
     "the padding of an image gradient is masked by a choice in each lane, as its shadow of x & 0 is that of x",
@@ -296,6 +297,12 @@ def stand_in(lanes: int) -> None:
     def fill(self: DeviceArray, value: float) -> None:
         self.set(np.full(self.shape, value, self.dtype))
 
+    def set_rows(self: DeviceArray, start: int, values: NDArray[Any]) -> None:
+        whole = self.get()
+        whole[start : start + len(values)] = values
+        self.set(whole)
+
+    DeviceArray.set_rows = set_rows  # type: ignore[method-assign]
     buffers._Buffer = Kept  # type: ignore[misc]  # noqa: SLF001
     DeviceArray.fill = fill  # type: ignore[method-assign]
     real = program.kernel_source
