@@ -74,10 +74,10 @@ def test_sizes_rise_with_the_frequencies(scene: Scene, default_device: Device, m
     trainer = Trainer(scene, short(frequency_steps=30, density={"every": 0}), default_device)
     sizes, real = [], trainer.rasterizer.forward
 
-    def forward(gaussians: Any, camera: Any, background: Any) -> Any:
+    def forward(gaussians: Any, camera: Any, background: Any, **how: Any) -> Any:
         assert camera.fx / camera.width == pytest.approx(50 / WIDTH)
         sizes.append((camera.width, camera.height))
-        return real(gaussians, camera, background)
+        return real(gaussians, camera, background, **how)
 
     monkeypatch.setattr(trainer.rasterizer, "forward", forward)
     for _ in range(31):

@@ -316,12 +316,12 @@ def test_the_warm_up_doubles_the_resolution(
     trainer = Trainer(scene, CONFIG, default_device)
     sizes, real = [], trainer.rasterizer.forward
 
-    def forward(gaussians: Any, camera: Any, background: Any) -> Any:
+    def forward(gaussians: Any, camera: Any, background: Any, **how: Any) -> Any:
         # the same view on a coarser grid, not a part of it
         assert camera.fx / camera.width == pytest.approx(50 / WIDTH)
         assert camera.cy / camera.height == pytest.approx(0.5)
         sizes.append((camera.width, camera.height))
-        return real(gaussians, camera, background)
+        return real(gaussians, camera, background, **how)
 
     monkeypatch.setattr(trainer.rasterizer, "forward", forward)
     for _ in range(12):
