@@ -40,6 +40,8 @@ from processor import processor  # noqa: E402
 
 SHAPES = ("8x1", "16x1", "1x1", "1x32", "1x64", "1x128", "1x256", "1x32g", "1x64g")
 """Lanes x items, `g` for a gradient by Gaussian; the first is what the others are compared with."""
+TRAINED = ("8x1", "16x1", "1x1", "1x64")
+"""Shapes in which a model is trained, twice: kernels of other groups differ from 1x64 in what gradients show."""
 METHODS = {"loops": ("8x1", "1x64"), "loopvec": ("1x64",), "cbs": ("1x64",)}
 """POCL_WORK_GROUP_METHOD, beside the one that PoCL takes by itself, and shapes."""
 UNKNOWN_METHOD = "Unknown work group generation method"
@@ -127,7 +129,7 @@ def jobs(folder: Path) -> list[Job]:
     listed: list[Job] = []
     names = _names()
     for index, name in enumerate(names):
-        listed += [Job(name, index, shape, train=shape != "1x256", environment={}) for shape in SHAPES]
+        listed += [Job(name, index, shape, train=shape in TRAINED, environment={}) for shape in SHAPES]
     for index, name in enumerate(names):
         if name.startswith("PoCL"):
             for method, shapes in METHODS.items():
