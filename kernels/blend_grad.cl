@@ -195,9 +195,11 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
   last = end;
 #endif
 
-  for (int i = last + (int)get_local_id(0); i < end; i += ITEMS) {
-    __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[i];
-    for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = 0.0f;
+  for (int first = last; first < end; first += ITEMS) { // no item leaves it alone: Intel's runtime would read for it
+    const int i = first + (int)get_local_id(0);
+    __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[min(i, end - 1)];
+    if (i < end)
+      for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = 0.0f;
   }
 
 #if ITEMS == 1

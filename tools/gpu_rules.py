@@ -139,7 +139,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule("for (int j = 0; j < count", lambda run: 1),
     ),
     "blend_grad": (
-        Rule("for (int i = last + (int)get_local_id(0); i < end; i += ITEMS)", lambda run: 0),  # pairs beyond
+        Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # pairs beyond
         Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
         Rule("for (int batch = last", lambda run: run.batches),
         Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
@@ -152,7 +152,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
 }
 """Kernels that a group runs for a tile: rounds for a pair in each of the group's waves."""
 WALK: tuple[Rule, ...] = (
-    Rule("for (int i = last + (int)get_local_id(0); i < end; i += ITEMS)", lambda run: 0),  # pairs beyond
+    Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # pairs beyond
     Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
     Rule("for (int k = ITEM; k < TILE * TILE; k += ITEMS)", lambda run: 0),  # once a tile
     Rule("for (int turn = last", lambda run: 1 / run.items),
