@@ -74,7 +74,7 @@ __kernel void density_scores(const uint n, const float gradient_edge, const floa
   scores[i] = useless ? USELESS : wanted ? gradient : UNWANTED;
 }
 
-// What becomes of rows first to first + count of the n. scores, radii (n); log_scales (count, 3), logits (count): of
+// Marks of rows first to first + count of the n. scores, radii (n); log_scales (count, 3), logits (count): of
 // these rows; strongest, strongest_row: a score has to be more, or as much in no later row -> marks (3, n), 0 or 1: the
 // row stays, it gets a clone, it becomes two halves.
 __kernel void density_marks(const uint n, const uint first, const uint count, const float strongest,

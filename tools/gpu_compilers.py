@@ -68,7 +68,7 @@ class Source:
     @property
     def by_gaussian(self) -> bool:
         """True for the gradient of blending in which an item has a Gaussian."""
-        return "-DBY_GAUSSIAN" in self.options or "-DBY_GAUSSIAN=1" in self.options
+        return "-DBY_GAUSSIAN" in self.options
 
     @property
     def shape(self) -> str:

@@ -132,6 +132,10 @@ _HEADS = ("static ", "GROUP __kernel", "__kernel", "RARE ")
 """Beginnings of the head of a function."""
 
 
+_BEFORE_PAIRS = (
+    Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # pairs beyond
+    Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
+)
 BY_PAIR: dict[str, tuple[Rule, ...]] = {
     "blend": (
         Rule("for (int batch = begin", lambda run: run.batches, ends=("if (busy[turn] == 0) break;",)),
@@ -139,8 +143,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule("for (int j = 0; j < count", lambda run: 1),
     ),
     "blend_grad": (
-        Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # pairs beyond
-        Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
+        *_BEFORE_PAIRS,
         Rule("for (int batch = last", lambda run: run.batches),
         Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
         Rule("for (int first = 0; first < count; first += TOGETHER)", lambda run: 1 / run.together),
@@ -152,8 +155,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
 }
 """Kernels that a group runs for a tile: rounds for a pair in each of the group's waves."""
 WALK: tuple[Rule, ...] = (
-    Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # pairs beyond
-    Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
+    *_BEFORE_PAIRS,
     Rule("for (int k = ITEM; k < TILE * TILE; k += ITEMS)", lambda run: 0),  # once a tile
     Rule("for (int turn = last", lambda run: 1 / run.items),
     Rule("for (int round = 0; round < ITEMS; ++round)", lambda run: 1),

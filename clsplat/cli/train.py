@@ -146,12 +146,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         if devices[0].memory.limit is not None or any(plan.pieces):
             print(f"{plan.need.gaussians:,} Gaussians: {plan}", file=sys.stderr)
 
-    how = {
-        "device": devices if len(devices) > 1 else devices[0],
-        "run": run,
-        "resume": run.resuming,
-        "on_plan": print_plan,
-    }
+    how = {"device": devices, "run": run, "resume": run.resuming, "on_plan": print_plan}
     try:
         with page(scene) if page else nullcontext() as between, TrainProgress(run.config.iterations) as progress:
             services.train(scene, run.config, **how, on_step=progress, between=between)

@@ -50,11 +50,7 @@ class DeviceArray:
     def set(self, values: NDArray[Any]) -> None:
         """Copy from the host; waits for the device. Raises ValueError where shape or dtype differ."""
         self._check(values)
-        if values.size:
-            self.device.calls.blocking_writes += 1
-            event = cl.enqueue_copy(self.device.queue, self.buffer, np.ascontiguousarray(values), is_blocking=True)
-            self._note("write", event)
-            self.device.under_way.clear()
+        self._write(values, 0)
 
     def send(self, values: NDArray[Any]) -> None:
         """Copy from the host, without waiting: `values` must not change before the device is waited for. Raises
@@ -84,11 +80,7 @@ class DeviceArray:
 
     def read_into(self, host: NDArray[Any]) -> None:
         """Copy to a C-contiguous array of the same shape on the host; waits for the device."""
-        if host.size:
-            self.device.calls.blocking_reads += 1
-            event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=True)
-            self._note("read", event)
-            self.device.under_way.clear()  # the queue is in order: all that came before is done
+        self._read(host, 0)
 
     def begin_get(self, into: NDArray[Any] | None = None) -> Callable[[], NDArray[Any]]:
         """Start a copy to the host behind what is on the queue now. The result waits for no more than that, and returns
@@ -107,23 +99,33 @@ class DeviceArray:
     def get_rows(self, start: int, stop: int) -> NDArray[Any]:
         """A copy of the rows from start to before stop on the host, from any start; waits for the device."""
         host = np.empty((stop - start, *self.shape[1:]), self.dtype)
-        if host.size:
-            self.device.calls.blocking_reads += 1
-            begin = start * (self.nbytes // self.shape[0])
-            event = cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=begin, is_blocking=True)
-            self._note("read", event, host.nbytes)
-            self.device.under_way.clear()
+        self._read(host, start)
         return host
 
     def set_rows(self, start: int, values: NDArray[Any]) -> None:
         """Copy from the host to the rows from any start on; waits for the device."""
+        self._write(values, start)
+
+    def _read(self, host: NDArray[Any], start: int) -> None:
+        """Fill an array on the host with the rows from start on, and wait."""
+        if host.size:
+            self.device.calls.blocking_reads += 1
+            event = cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=self._at(start), is_blocking=True)
+            self._note("read", event, host.nbytes)
+            self.device.under_way.clear()  # the queue is in order: all that came before is done
+
+    def _write(self, values: NDArray[Any], start: int) -> None:
+        """Fill the rows from start on with an array on the host, and wait."""
         if values.size:
             self.device.calls.blocking_writes += 1
-            begin = start * (self.nbytes // self.shape[0])
             host = np.ascontiguousarray(values, self.dtype)
-            event = cl.enqueue_copy(self.device.queue, self.buffer, host, dst_offset=begin, is_blocking=True)
+            event = cl.enqueue_copy(self.device.queue, self.buffer, host, dst_offset=self._at(start), is_blocking=True)
             self._note("write", event, host.nbytes)
             self.device.under_way.clear()
+
+    def _at(self, row: int) -> int:
+        """The byte at which a row begins; an array without a first axis has row 0 alone."""
+        return row * (self.nbytes // self.shape[0]) if row else 0
 
     def rows(self, start: int, stop: int) -> DeviceArray:
         """The rows [start, stop) in place. `start` has to be a multiple of `Device.row_alignment`."""

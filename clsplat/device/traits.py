@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Traits of a device that decide which way a task is done, and CLSPLAT_PRETEND, which forces the other way.
 
-So that what a GPU, a small device or a plain compiler gets is tested where none is at hand.
+With it the ways of a GPU, a small device and a plain compiler are tested where none is at hand.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from clsplat.device.quirks import kind_of
 from clsplat.errors import DeviceError
@@ -38,16 +37,14 @@ class Traits:
     contraction: bool = True
 
 
-_WORDS: dict[str, Callable[[Traits], Traits]] = {
-    "gpu": lambda traits: replace(traits, kind="gpu"),
-    "no-exact-division": lambda traits: replace(traits, exact_division=False),
-    "no-contraction": lambda traits: replace(traits, contraction=False),
+_WORDS: dict[str, dict[str, Any]] = {
+    "gpu": {"kind": "gpu"},
+    "no-exact-division": {"exact_division": False},
+    "no-contraction": {"contraction": False},
 }
-_SIZES: dict[str, Callable[[Traits, int], Traits]] = {
-    "group": lambda traits, most: replace(traits, group=min(traits.group, most)),
-    "local-memory": lambda traits, most: replace(traits, local_memory=min(traits.local_memory, most)),
-    "allocation": lambda traits, most: replace(traits, allocation=min(traits.allocation, most)),
-}
+"""Traits by the word that pretends them."""
+_SIZES = {"group": "group", "local-memory": "local_memory", "allocation": "allocation"}
+"""Limits by the name that pretends a lower one."""
 
 
 def pretended() -> str:
@@ -68,9 +65,10 @@ def traits_of(device: cl.Device) -> Traits:
     for part in filter(None, pretended().split(",")):
         name, _, number = part.strip().partition("=")
         if name in _WORDS and not number:
-            traits = _WORDS[name](traits)
+            traits = replace(traits, **_WORDS[name])
         elif name in _SIZES and number.isascii() and number.isdigit() and int(number) > 0:
-            traits = _SIZES[name](traits, int(number))
+            limit = _SIZES[name]
+            traits = replace(traits, **{limit: min(getattr(traits, limit), int(number))})
         else:
             raise DeviceError(
                 f"{PRETEND}={pretended()}: {part.strip()!r} is none of {', '.join(_WORDS)}, "

@@ -18,7 +18,7 @@ from clsplat.device.launch import launch_items
 from clsplat.device.layout import SPLAT
 from clsplat.device.profile import stage
 from clsplat.gaussians import group_shapes
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians, groups_of, parts
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostArray, HostGaussians, parts
 from clsplat.stages.project import Projected, Screen
 from clsplat.stages.scan import scan
 
@@ -192,7 +192,7 @@ def _scored(device: Device, marker: Marker, rules: MarkRules) -> _Scratch:
 def _listed(device: Device, marker: Marker, rules: MarkRules) -> RowList:
     n, model, kernels = marker.parameters.count, marker.parameters, device.kernels("density")
     scratch, counts = _scored(device, marker, rules), allocate(device, (2,), np.uint32)
-    columns = groups_of(model, "log_scales", "opacity_logits")
+    columns = model.only("log_scales", "opacity_logits")
     edges = (rules.large, rules.transparent, rules.oversized, rules.oversized_half, rules.radius)
     for start, stop, (part,) in parts(marker.work, columns):
         some, arrays = stop - start, (scratch.scores, marker.statistics.radii, *part.arrays.values(), scratch.marks)

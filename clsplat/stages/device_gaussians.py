@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
@@ -48,6 +49,10 @@ class _ByGroup(Generic[A]):
 
     def __getitem__(self, group: str) -> A:
         return self.arrays[group]
+
+    def only(self, *groups: str) -> Self:
+        """The same with these arrays alone."""
+        return replace(self, arrays={group: self.arrays[group] for group in groups})
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +100,6 @@ class HostGaussians(_ByGroup[HostArray]):
 
 
 AnyGaussians = DeviceGaussians | HostGaussians
-
-
-def groups_of(model: AnyGaussians, *names: str) -> AnyGaussians:
-    """The model with these arrays alone, the same ones."""
-    if isinstance(model, HostGaussians):
-        return replace(model, arrays={name: model[name] for name in names})
-    return replace(model, arrays={name: model[name] for name in names})
 
 
 def parts(

@@ -140,7 +140,7 @@ def test_a_run_goes_on_with_its_batch_on_any_devices(scene: Scene, default_devic
 
 
 def test_steps_are_counted_in_views(scene: Scene, default_device: Device, tmp_path: Path) -> None:
-    """What comes by steps comes with the first step that has come so far, once."""
+    """Work that comes by steps comes with the first step that has come so far, once."""
     config = short(batch=3, iterations=40, eval_at=(20,), report=False)
     run = Run.create(tmp_path / "run", config)
     due: list[int] = []
