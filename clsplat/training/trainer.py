@@ -23,16 +23,12 @@ from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.memory_plan import Plan
-from clsplat.rendering.rasterizer import Frame, Rasterizer, Room
+from clsplat.rendering.rasterizer import Rasterizer, Room
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.initialise import from_scene
-from clsplat.stages.adam import updates_sh_rest
 from clsplat.stages.density import (
-    DensityStatistics,
     Marker,
     RowList,
-    add_contributions,
-    add_statistics,
     carry,
     gather,
     list_rows,
@@ -54,14 +50,15 @@ from clsplat.stages.device_gaussians import (
 )
 from clsplat.stages.loss import Loss
 from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
-from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy
+from clsplat.training.density import HALVED, ModelState, RowPlan, Strategy
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.health import Patience
-from clsplat.training.monitor import LastStep, Remedy, Watch
+from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.pending import Pending
 from clsplat.training.photographs import Photographs
 from clsplat.training.resolution import sizes_of
-from clsplat.training.step import GradientStep, Sample, StepProbe, StepRows, ViewRows, slot_fields
+from clsplat.training.step import GradientStep, Sample, StepProbe, slot_fields
+from clsplat.training.watched import Watched
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
@@ -76,56 +73,6 @@ class _Mark:
     rng: Mapping[str, Any]
     queue: list[int]
     controlled: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _Watched(StepProbe):
-    """Follows a training step: notices what is not finite, rehearses what changes the state, adds the statistics that
-    density control goes by. number: of views, this one among them."""
-
-    trainer: Trainer
-    step: GradientStep
-    number: int
-    sample: Sample
-    needs: StatisticsNeeds
-
-    def forward(self, frame: Frame) -> None:
-        """Take the counts of the step before, which this pass has read back."""
-        self.trainer.watch.notice(frame.refused)
-        self.trainer.pending.seen(frame)
-
-    def loss(self, result: Loss) -> None:
-        """Remember the step, to look at if it turns out to have had trouble."""
-        sums = result.copy or result.sums.get
-        self.trainer.watch.begin(LastStep(self.number, self.sample.view, self.sample.background, sums))
-
-    def before_rows(self, rows: StepRows) -> None:
-        """Before the first row changes, have every kernel rehearsed that changes the state: a driver may fail in
-        any."""
-        trainer, step, parameters = self.trainer, self.step, rows.parameters
-        sh_rest = updates_sh_rest(step.config.optimiser, step.step)
-        size = (parameters.count, parameters.coefficients)
-        key = (*size, sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
-        if key not in trainer.rehearsed:
-            with only_tried(trainer.device), only_tried(trainer.rasterizer.device):
-                step.update(rows)
-                self.add_statistics(trainer.statistics.rows(0, rows.stop - rows.start), rows)
-            trainer.rehearsed.add(key)
-        trainer.mark = None
-
-    def after_rows(self, rows: ViewRows) -> None:
-        """Add the rows to the statistics."""
-        self.add_statistics(self.trainer.statistics.rows(rows.start, rows.stop), rows)
-
-    def add_statistics(self, statistics: DensityStatistics, rows: ViewRows) -> None:
-        """Add the step to the statistics of some rows, as far as density control needs them."""
-        device, camera, screen = self.trainer.device, self.sample.camera, rows.screen
-        if self.needs.gradients:
-            add_statistics(device, statistics, camera, rows.projected, screen, self.needs.threshold)
-        if screen.contributions is not None and statistics.current_totals is not None:
-            full = self.trainer.views[self.sample.view].camera
-            area = full.width * full.height / (camera.width * camera.height)
-            add_contributions(device, statistics, rows.projected, screen.contributions, area)
 
 
 class Trainer:
@@ -262,7 +209,7 @@ class Trainer:
 
         def run(turn: int, room: Room | None) -> Loss:
             sample, step = samples[0], replace(exact, turn=turn, room=room)
-            probe, model = _Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
+            probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
             return step.run(model, *pixels, probe, reads_loss=reads_loss)
 
@@ -306,7 +253,7 @@ class Trainer:
         """The probe of a view, when the statistics of those before it are complete."""
         if sample.begins:
             self._turn_epoch()
-        return _Watched(self, step, self.step, sample, self.strategy.needs(self.step))
+        return Watched(self, step, self.step, sample, self.strategy.needs(self.step))
 
     def _note(self, *, begun: bool = False) -> None:
         """Mark the state as it is now: until something of it is changed, `step_back` leads here. begun: the step's

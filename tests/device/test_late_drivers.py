@@ -21,7 +21,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import load_scene
 from clsplat.training import loop as training
-from clsplat.training import trainer
+from clsplat.training import watched
 
 WITHOUT = replace(LATE, checkpoint_every=0, optimiser=replace(LATE.optimiser, sparse=True), report=False)
 """Adam has a kernel for each number of floats in a row: that of SH is built in step 12, behind the others."""
@@ -109,14 +109,14 @@ def test_what_is_half_changed_is_not_kept(
 ) -> None:
     """A launch that fails although its trial did not, behind the first that changes rows."""
     run = Run.create(tmp_path / "run", WITHOUT, scene=scene)
-    real = trainer._Watched.add_statistics
+    real = watched.Watched.add_statistics
 
     def add_statistics(self, statistics, rows):
         if self.trainer.step == 5 and self.trainer.mark is None:
             raise DriverError("it failed")
         return real(self, statistics, rows)
 
-    monkeypatch.setattr(trainer._Watched, "add_statistics", add_statistics)
+    monkeypatch.setattr(watched.Watched, "add_statistics", add_statistics)
     with pytest.raises(DriverError) as raised:
         train_on(load_scene(scene), WITHOUT, device=default_device, run=run)
     assert str(raised.value) == "it failed"
