@@ -222,8 +222,7 @@ class Device:
     ) -> cl.Event:
         """Put a kernel on the queue, and wait for it if asked to, or with CLSPLAT_SYNC=1. Raises DriverError."""
         try:
-            kernel.cl_kernel.set_args(*values)  # not a call of the kernel: its wrapper costs 3 microseconds more
-            event = cl.enqueue_nd_range_kernel(self.queue, kernel.cl_kernel, size, local)
+            event = kernel.cl_kernel(self.queue, size, local, *values)
             self.calls.launches += 1
             if self.waits:
                 self._wait_for(event, kernel)
