@@ -22,7 +22,7 @@ os.environ.setdefault("CLSPLAT_TRUST_DRIVER", "1")  # the test at a driver's fir
 from browser import browser  # noqa: F401  # a fixture
 from calls import train
 from drivers import KEPT, begin_session, check_some_are_kept, label
-from dying import standing  # noqa: F401  # a fixture
+from dying import standing, standing_device  # noqa: F401  # fixtures
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from needs import missing
 from pipeline import QUICK_SHAPES, shaped, shapes_of

@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import Capture
-from drivers import KEPT
-from dying import ALWAYS, Standing
+from dying import ALWAYS, DRIVER, Standing
 
 from clsplat.cli.main import main
 from clsplat.device import child, context, known, launch, rehearsal, shapes
@@ -115,10 +114,10 @@ def test_a_shape_that_one_device_cannot_take(elsewhere: Path, monkeypatch: pytes
 
 
 def test_only_what_is_used_warns_and_names_what_is_taken(
-    standing: Standing, default_device: Device, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    standing: Standing, standing_device: Device, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     standing("abort", ALWAYS)
-    device = default_device.cl_device
+    device = standing_device.cl_device
     first, second, third = shapes.shapes_in_turn(device)[:3]
     known.remember(device, first.label, failed="it failed")
     with warnings.catch_warnings():
@@ -137,10 +136,10 @@ def test_only_what_is_used_warns_and_names_what_is_taken(
 
 
 def test_a_failure_is_forgotten_when_what_failed_works(
-    standing: Standing, default_device: Device, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    standing: Standing, standing_device: Device, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     """The self-test does not come by every variant of every kernel."""
-    device, label, index = default_device.cl_device, default_device.shape.label, min(KEPT)
+    device, label, index = standing_device.cl_device, standing_device.shape.label, DRIVER
     standing("abort", 1)
     with pytest.raises(DriverError):
         context.open_device().kernels("scan")
@@ -222,7 +221,7 @@ def test_other_threads_do_not_wait_for_a_trial_either(standing: Standing) -> Non
     child.abandon()
     thread.join(timeout=20)
     assert ends == [child.TrialInterrupted]
-    (process,) = [each for each in rehearsal._processes.values() if each._index == min(KEPT)]
+    (process,) = [each for each in rehearsal._processes.values() if each._index == DRIVER]
     with process._lock:  # as if it hung; the end of this process does not wait for it
         begun = time.monotonic()
         process.end()
@@ -240,12 +239,12 @@ INTERRUPTED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", INTERRUPTED)
 def test_ctrl_c_while_a_driver_hangs(
-    verb: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, default_device: Device
+    verb: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, standing_device: Device
 ) -> None:
     if verb == "view":
         pytest.importorskip("viser")
     numbers = standing("hang", 1)
-    known.remember(default_device.cl_device, default_device.shape.label, stages=STAGES)
+    known.remember(standing_device.cl_device, standing_device.shape.label, stages=STAGES)
     words = INTERRUPTED[verb].format(scene=scene, run=trained, new=tmp_path / "new").split()
     process = subprocess.Popen([sys.executable, "-m", "clsplat", *words], stderr=subprocess.PIPE, text=True)
     while not numbers.exists() and process.poll() is None:

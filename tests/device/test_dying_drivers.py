@@ -14,8 +14,7 @@ from pathlib import Path
 
 import pytest
 from calls import Capture, train
-from drivers import KEPT
-from dying import ALWAYS, LATE, VERBS, Standing, call, error_of, forget, number_of
+from dying import ALWAYS, DRIVER, LATE, VERBS, Standing, call, error_of, forget, number_of
 from tiny import CONFIG
 
 from clsplat.cli.main import main
@@ -33,21 +32,21 @@ QUICK = [("abort", verb) for verb in VERBS]
 
 @pytest.mark.parametrize(("how", "verb"), [*QUICK, *SLOW])
 def test_a_driver_that_fails_in_every_shape(
-    how: str, verb: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, default_device: Device,
+    how: str, verb: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, standing_device: Device,
     capsys: Capture, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     standing(how, 1)
     if how == "hang":
         monkeypatch.setenv(TIMEOUT, "4")  # it does not come; what does come takes well under a second
-        device = default_device.cl_device
-        others = [shape.label for shape in shapes_in_turn(device) if shape != default_device.shape]
+        device = standing_device.cl_device
+        others = [shape.label for shape in shapes_in_turn(device) if shape != standing_device.shape]
         for label in others:  # one shape is enough to wait for
             known.remember(device, label, failed="it hung before")
     before = {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()}
     new = tmp_path / "new"
     assert call(verb, scene, trained, new) == 1
     line = error_of(capsys)
-    assert default_device.name in line
+    assert standing_device.name in line
     if verb not in ("tune", "selftest"):  # those have a table or a list of shapes
         assert "shape" in line
         assert ".cl" in line
@@ -60,23 +59,23 @@ def test_a_driver_that_fails_in_every_shape(
     [("launch", "eval"), *(pytest.param(how, "bench", marks=pytest.mark.slow) for how in ("abort", "hang"))],
 )
 def test_another_shape_is_taken(
-    how: str, verb: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, default_device: Device,
+    how: str, verb: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, standing_device: Device,
     capsys: Capture, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setenv(TIMEOUT, "20" if how == "hang" else "120")
     standing(how, 4, 4)
-    label = default_device.shape.label
+    label = standing_device.shape.label
     assert call(verb, scene, trained, tmp_path / "new") == 0
     (warning,) = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     assert f"kernels in the shape {label} failed: " in warning
     assert ".cl" in warning
     assert "is taken" in warning
     # the next process begins with it
-    failed = known.entries(default_device.cl_device)[label].failed
+    failed = known.entries(standing_device.cl_device)[label].failed
     assert failed in warning
     assert main(["devices", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found[min(KEPT)]["shape"] != f"{label.replace('x', ' lanes x ')} items"
+    assert found[DRIVER]["shape"] != f"{label.replace('x', ' lanes x ')} items"
 
 
 def test_a_program_without_kernels_is_built_anew(
@@ -122,48 +121,48 @@ def test_a_child_ends_with_its_parent_and_is_heard_whatever_else_is_said(tmp_pat
 
 @pytest.mark.skipif(os.name == "nt", reason="a process that is killed has no status of its own there")
 def test_what_the_system_kills_is_not_the_drivers_fault(
-    standing: Standing, default_device: Device, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
+    standing: Standing, standing_device: Device, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     standing("kill", 1)
     assert call("eval", scene, trained, tmp_path / "new") == 1
     assert "its test could not be made: the process was ended by signal 9 in probe.cl" in error_of(capsys)
-    assert not any(entry.failed for entry in known.entries(default_device.cl_device).values())
+    assert not any(entry.failed for entry in known.entries(standing_device.cl_device).values())
 
 
 @pytest.mark.parametrize(
     "how", [pytest.param("kill", marks=pytest.mark.skipif(os.name == "nt", reason="it has no signals")), "memory"]
 )
 def test_a_trial_that_there_is_no_memory_for_is_left_out(
-    how: str, standing: Standing, default_device: Device, monkeypatch: pytest.MonkeyPatch
+    how: str, standing: Standing, standing_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """That is no sign of a bad driver; nor is it tried at every launch, or told of more than once."""
     standing(how, 1)
     with pytest.warns(UserWarning, match="not enough memory to try every kernel") as told:
         context.open_device().kernels("scan")
     assert sum("not enough memory" in str(each.message) for each in told) == 1
-    assert not any(entry.failed or entry.kernels for entry in known.entries(default_device.cl_device).values())
+    assert not any(entry.failed or entry.kernels for entry in known.entries(standing_device.cl_device).values())
     monkeypatch.setattr(rehearsal._Process, "ask", lambda *_: pytest.fail("it was tried again"))
     context.open_device()._built("scan", context.open_device()._fma[0])
 
 
 def test_what_failed_in_every_shape_is_tried_anew(
-    standing: Standing, default_device: Device, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
+    standing: Standing, standing_device: Device, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     """Its reason may be gone, and nobody shall have to find out where it is remembered."""
     standing("abort", ALWAYS)
-    device = default_device.cl_device
+    device = standing_device.cl_device
     for shape in shapes_in_turn(device):
         known.remember(device, shape.label, failed="it did once")
     assert call("eval", scene, trained, tmp_path / "new") == 0
     assert "warning" not in capsys.readouterr().err
-    assert known.entries(device)[default_device.shape.label].failed == ""
+    assert known.entries(device)[standing_device.shape.label].failed == ""
 
 
 @pytest.mark.parametrize(
     ("how", "name"), [("launch", "gather_rows"), pytest.param("abort", "NO_SH_REST", marks=pytest.mark.slow)]
 )
 def test_training_goes_on_after_a_late_failure(
-    how: str, name: str, standing: Standing, scene: Path, tmp_path: Path, default_device: Device, capsys: Capture,
+    how: str, name: str, standing: Standing, scene: Path, tmp_path: Path, standing_device: Device, capsys: Capture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     numbers = standing(how, ALWAYS)
@@ -174,7 +173,7 @@ def test_training_goes_on_after_a_late_failure(
     standing(how, latest, latest)
     assert train(scene, run, LATE) == 1
     line = error_of(capsys)
-    assert f"kernels in the shape {default_device.shape.label}: " in line
+    assert f"kernels in the shape {standing_device.shape.label}: " in line
     assert ".cl" in line
     assert list((run / "checkpoints").iterdir())
     assert not (run / "model.ply").exists()
@@ -189,7 +188,7 @@ def test_training_goes_on_after_a_late_failure(
 
 @pytest.mark.slow
 def test_what_was_mended_gives_the_same_bytes(
-    standing: Standing, scene: Path, tmp_path: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
+    standing: Standing, scene: Path, tmp_path: Path, standing_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     numbers = standing("launch", ALWAYS)
     assert train(scene, tmp_path / "whole", LATE) == 0
@@ -199,8 +198,8 @@ def test_what_was_mended_gives_the_same_bytes(
     assert train(scene, tmp_path / "run", LATE) == 1
     monkeypatch.delenv("CLSPLAT_STAND_IN")
     forget()
-    assert main(["selftest", "--device", str(min(KEPT))]) == 0
-    assert known.entries(default_device.cl_device)[default_device.shape.label].failed == ""
+    assert main(["selftest", "--device", str(DRIVER)]) == 0
+    assert known.entries(standing_device.cl_device)[standing_device.shape.label].failed == ""
     assert main(["train", "-o", str(tmp_path / "run"), "--resume"]) == 0
     models = [(tmp_path / name / "model.ply").read_bytes() for name in ("whole", "run")]
     assert models[0] == models[1]
@@ -229,15 +228,15 @@ def test_a_time_that_makes_no_sense(
     assert f"{TIMEOUT}={text}: expected seconds" in error_of(capsys)
 
 
-def test_a_text_that_no_cache_has(default_device: Device) -> None:
+def test_a_text_that_no_cache_has(standing_device: Device) -> None:
     """The salt is seen by the compiler, not only by us: PoCL looks for what the preprocessor leaves of a text."""
-    values = {"LANES": default_device.shape.lanes, "ITEMS": default_device.shape.items}
+    values = {"LANES": standing_device.shape.lanes, "ITEMS": standing_device.shape.items}
     variant = variant_of("scan", values, "-cl-std=CL1.2")
     salted = variant.anew("abc")
     assert "anew_abc" in salted.source.splitlines()[-1]
     assert not salted.source.splitlines()[-1].lstrip().startswith("//")
     assert variant.anew("") is variant
-    program, salt = build(default_device.context, default_device.cl_device, salted)
+    program, salt = build(standing_device.context, standing_device.cl_device, salted)
     assert program.num_kernels == 2
     assert salt == ""
 

@@ -148,7 +148,7 @@ def test_the_checkpoint_of_a_late_failure_gives_the_same_bytes(
 @pytest.mark.slow
 @pytest.mark.parametrize(("verb", "how"), [("render", "hang"), ("eval", "empty"), ("convert", "launch")])
 def test_a_late_failure_of_other_verbs(
-    verb: str, how: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, default_device: Device,
+    verb: str, how: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, standing_device: Device,
     capsys: Capture, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """The last kernel that they come to; what they would write is whole or not there."""
@@ -166,7 +166,7 @@ def test_a_late_failure_of_other_verbs(
     else:
         assert status == 1
         line = error_of(capsys)
-        assert f"kernels in the shape {default_device.shape.label}: " in line
+        assert f"kernels in the shape {standing_device.shape.label}: " in line
         assert ".cl" in line
         assert not (tmp_path / "new.ply").exists()
         assert not list(tmp_path.rglob("*.clsplat-tmp"))
