@@ -25,7 +25,8 @@ class Gaussians:
     deviations; opacity_logits (N,); sh (N, K, 3), K = (degree + 1)^2 real SH coefficients per channel,
     colour = 0.5 + sum of basis times coefficient. All float32, C-contiguous. origin (3,) float64: the place in the
     world that the means count from; 0 but for scenes far from it, which float32 would blur (docs/decisions/0017). near:
-    where cameras without a near plane of their own begin to see, world units (docs/decisions/0019).
+    where cameras without a near plane of their own begin to see, world units (docs/decisions/0019). antialiased: True
+    for a model that is drawn with the filter of docs/gradients.md, section 13, as it was trained.
     """
 
     means: Float32
@@ -35,6 +36,7 @@ class Gaussians:
     sh: Float32
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
     near: float = NEAR
+    antialiased: bool = False
 
     def __len__(self) -> int:
         return len(self.means)

@@ -45,7 +45,11 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #endif
   Projection p;
   if (!project_gaussians(row, means, quaternions, log_scales, camera, &p)) return;
+#ifdef ANTIALIASED
+  const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0)) * compensation(p.det0, p.det);
+#else
   const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
+#endif
   floatL dx = FROM_CAMERA(means, X, 0), dy = FROM_CAMERA(means, Y, 1), dz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(dx, dx, fmaL(dy, dy, dz * dz)));
   const intL seen = (length > 0.0f) & (length < FARTHEST);

@@ -143,7 +143,17 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 
   // (58). The columns of M = J A S, whitened: w[k] times the scale. Of order one, and differences of nothing large.
   const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
+#ifdef ANTIALIASED
+  // (84). The compensated opacity falls with the determinant of the filtered covariance, and rises with the other's.
+  const intL compensated = p.det0 / p.det > LEAST_COMPENSATION * LEAST_COMPENSATION;
+  const floatL thinner = compensated ? m_g : (floatL)(0.0f), by_det0 = compensated ? m_g / p.det0 : (floatL)(0.0f);
+  const floatL uu = fmaL((floatL)(unwhiten), m[SLOT_GUU].all, -INVERSE_WHITEN2 * thinner),
+               uv = unwhiten * m[SLOT_GUV].all;
+  const floatL vv = fmaL((floatL)(unwhiten), m[SLOT_GVV].all, -INVERSE_WHITEN2 * thinner);
+  floatL across_x = (floatL)(0.0f), across_y = across_x;
+#else
   const floatL uu = unwhiten * m[SLOT_GUU].all, uv = unwhiten * m[SLOT_GUV].all, vv = unwhiten * m[SLOT_GVV].all;
+#endif
   floatL wu[3], wv[3];
   const floatL lean = l11 / p.syy;
   FOR_AXES(k) {
@@ -160,6 +170,14 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     const floatL nu = p.s[k] * wu[k], nv = p.s[k] * wv[k];
     const floatL tu = fmaL(uu, nu, uv * nv), tv = fmaL(uv, nu, vv * nv);
     d->scale[k].all = fmaL(nu, tu, nv * tv);
+#ifdef ANTIALIASED
+    const floatL area = p.s[l] * p.s[n], minor = area * p.c[k]; // (85) to (87)
+    const floatL other_l = p.s[n] * p.s[k] * p.c[l], other_n = p.s[k] * p.s[l] * p.c[n];
+    d->scale[k].all = fmaL(by_det0, fmaL(other_l, other_l, other_n * other_n), d->scale[k].all);
+    const floatL lever = by_det0 * minor * area;
+    across_x = fmaL(lever, fmaL(p.jx * p.rx, p.a2[k], p.b1[k]), across_x);
+    across_y = fmaL(lever, fmaL(p.jy * p.ry, p.a2[k], p.b2[k]), across_y);
+#endif
     d_size += d->scale[k].all;
     const floatL depth = p.s[k] * p.a2[k];
     along_u = fmaL(tu, depth, along_u);
@@ -167,6 +185,9 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     const floatL apart = scale_difference(GATHER(log_scales, 3, l) - GATHER(log_scales, 3, n), p.s[l], p.s[n]);
     const floatL au = apart * wu[l], av = apart * wv[l], sum = p.s[l] + p.s[n];
     turned[k] = fmaL(fmaL(uu, au, uv * av), sum * wu[n], fmaL(uv, au, vv * av) * (sum * wv[n]));
+#ifdef ANTIALIASED
+    turned[k] = fmaL(-(by_det0 * p.s[k] * p.c[l]), apart * sum * (p.s[k] * p.c[n]), turned[k]);
+#endif
   }
   const floatL w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
   const floatL turn = 2.0f / p.length;
@@ -178,8 +199,16 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, J moves with
   // z alone.
   const floatL rx = p.x / p.z, ry = p.y / p.z;
+#ifdef ANTIALIASED
+  const float hand = camera[CAMERA_HAND];
+  const floatL by_j02 = fmaL(l11, along_u, -(hand * (p.jy / p.jx) * across_x));
+  const floatL by_j12 = fmaL(l12, along_u, fmaL(l22, along_v, -(hand * (p.jx / p.jy) * across_y)));
+  const floatL d_j02 = rx == p.rx ? by_j02 : (floatL)(0.0f);
+  const floatL d_j12 = ry == p.ry ? by_j12 : (floatL)(0.0f);
+#else
   const floatL d_j02 = rx == p.rx ? l11 * along_u : (floatL)(0.0f);
   const floatL d_j12 = ry == p.ry ? fmaL(l12, along_u, l22 * along_v) : (floatL)(0.0f);
+#endif
   const floatL d_x = p.jx * (d_mx - d_j02 / p.z), d_y = p.jy * (d_my - d_j12 / p.z);
   const floatL d_z = -fmaL(d_x, rx, fmaL(d_y, ry, d_size / p.z));
 

@@ -155,7 +155,7 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
   const Double in_x = CAMERA_ROW(0), in_y = CAMERA_ROW(1), in_z = CAMERA_ROW(2);
   const float p[3] = {in_x.high, in_y.high, in_z.high};
   const float distance = sqrt(fma1(p[0], p[0], fma1(p[1], p[1], p[2] * p[2])));
-  const float opacity = sigmoidL(opacity_logits[i]);
+  float opacity = sigmoidL(opacity_logits[i]);
   if (!(distance > camera[CAMERA_NEAR] && distance < 1e15f && opacity > ALPHA_MIN)) return;
   const float f[3] = {p[0] / distance, p[1] / distance, p[2] / distance};
   Tangent t;
@@ -184,6 +184,9 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
     m2[3 + k] = blur * t.k[2 + k];
   }
   float sxx = 0.0f, sxy = 0.0f, syy = 0.0f, det = 0.0f;
+#ifdef ANTIALIASED
+  float det0 = 0.0f;
+#endif
   for (int k = 0; k < 5; ++k) {
     sxx = fma1(m1[k], m1[k], sxx);
     sxy = fma1(m1[k], m2[k], sxy);
@@ -191,9 +194,16 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
     for (int l = 0; l < k; ++l) {
       const float minor = fma1(m1[k], m2[l], -(m1[l] * m2[k]));
       det = fma1(minor, minor, det);
+#ifdef ANTIALIASED
+      if (k < 3) det0 = fma1(minor, minor, det0);
+#endif
     }
   }
   if (!(sxx < 1e15f && syy < 1e15f && syy > 0.0f && det > 0.0f && det < 1e30f)) return;
+#ifdef ANTIALIASED
+  opacity *= compensation(det0, det);
+  if (!(opacity > ALPHA_MIN)) return;
+#endif
 
   const float l11 = WHITEN * sqrt(syy / det), l12 = -(sxy / syy) * l11, l22 = WHITEN / sqrt(syy);
   const float log2o = log2L(opacity);

@@ -183,14 +183,14 @@ def training(device: Device) -> None:
         ),
     )
     ahead, rooms = replace(paper, iterations=3, warmup=()), iter((0, 2000, 1))
-    for config, channels in ((paper, 3), (wide, 4), (ahead, 3)):
+    for config, channels in ((paper, 3), (wide, 4), (ahead, 3), (replace(ahead, antialiased=True, iterations=2), 3)):
         pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
         if channels == 3:
             pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
         start = cloud(18, view, 5, degree=0)
         trainer = Trainer(scene_of(view, pixels), config, device, start)
+        trainer.pending.on = config is ahead
         if config is ahead:
-            trainer.pending.on = True
             trainer.pending.room = lambda *_: next(rooms)  # type: ignore[method-assign]
         losses = [trainer.train_step().read()[0] for _ in range(config.iterations)]
         if trainer.pending.redone != (config is ahead):

@@ -179,7 +179,8 @@ def front(points: list[tuple[float, float]]) -> list[bool]:
 def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, int, int]) -> Float64:
     """A part of the frame in float64, over black, (height, width, 3): the twin, but for Gaussians that cannot reach."""
     x, y, width, height = crop
-    projected = project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
+    degree, antialiased = gaussians.sh_degree, gaussians.antialiased
+    projected = project(**parameters(gaussians), camera=camera, sh_degree=degree, antialiased=antialiased)
     means = projected.means2d - (x, y)
     reach = 1.1 * projected.half_extents + 1.0
     near = (means > -reach).all(axis=1) & (means < np.array([width, height]) + reach).all(axis=1)

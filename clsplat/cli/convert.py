@@ -110,6 +110,11 @@ def run(verb: Convert, services: Services) -> int:
             f"{verb.target}: {target_format.name} has no place for the near plane, which is {edited.near:.4g}; readers "
             f"will take {read.near:.4g}"
         )
+    if read.antialiased != edited.antialiased:
+        warn(
+            f"{verb.target}: {target_format.name} has no place for antialiasing; readers will draw what is small or "
+            "far away too thick"
+        )
     written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
     result: dict[str, Any] = {
         "source": _described(source, format_of(source), original),

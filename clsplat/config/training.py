@@ -179,6 +179,9 @@ class TrainConfig:
     background: Background = "black"
     """Background behind the Gaussians and behind images with alpha; random: a new colour each step, and black in
     evaluations."""
+    antialiased: bool = False
+    """Train for pictures of any size (Mip-Splatting): a narrower low-pass that leaves a Gaussian its light, and no
+    Gaussian smaller than the photographs show. The model is drawn so too, and its file says it."""
     warmup: tuple[int, ...] = (250, 500)
     """Steps after which the training resolution doubles: with two of them training starts at a quarter of the size,
     with '' at the full size."""

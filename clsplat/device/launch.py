@@ -90,6 +90,7 @@ def _first(
 
 _UPDATED = {
     "adam": 4,
+    "limit_scales": 1,
     "project_step": 18,
     "density_statistics": 3,
     "view_agreement": 1,

@@ -101,6 +101,8 @@ def text(info: dict[str, Any]) -> str:
         lines.append(("origin", " ".join(map(repr, info["origin"]))))
     if info.get("near", NEAR) != NEAR:
         lines.append(("near plane", f"{info['near']:.6g}"))
+    if info.get("antialiased"):
+        lines.append(("antialiased", "yes: to be drawn with Mip-Splatting's low-pass"))
     lines.append(("colour space", info["colorspace"]))
     lines += [("comment", line) for line in info.get("comments", [])]
     if info.get("ignored"):

@@ -50,7 +50,9 @@ def render(
     """Front to back by depth. after: the camera that motion goes to. A pixel without a ray shows the background."""
     seen: Seen
     if camera.kind.flat:
-        seen = _Unbounded(**vars(project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)))
+        degree, antialiased = gaussians.sh_degree, gaussians.antialiased
+        projected = project(**parameters(gaussians), camera=camera, sh_degree=degree, antialiased=antialiased)
+        seen = _Unbounded(**vars(projected))
     else:
         seen = tangents(gaussians, camera)
     blended = blend(seen, camera.width, camera.height, background)

@@ -23,6 +23,8 @@ Bool = NDArray[np.bool_]
 
 ALPHA_MIN = 1.0 / 255.0
 LOW_PASS = 0.3
+LOW_PASS_ANTIALIASED = 0.1
+LEAST_COMPENSATION = 0.005
 COLOUR_LIMIT = 1e9
 BOX_SLACK = 0.1
 """Added to the reach q <= 2 ln(255 o) of a Gaussian's box, so that alphas down to 5 % under 1/255 are looked at
@@ -174,9 +176,12 @@ def project(
     sh: Float64,
     camera: Camera,
     sh_degree: int,
+    *,
+    antialiased: bool = False,
 ) -> Projected:
     """Eqs. (1) to (13), of an orthographic camera with (15) to (17) of docs/cameras.md: arrays as in `Gaussians`,
-    float64; sh_degree is the one in use, bands above it are unread."""
+    float64; sh_degree is the one in use, bands above it are unread; antialiased: with (83)."""
+    low_pass = LOW_PASS_ANTIALIASED if antialiased else LOW_PASS
     with np.errstate(all="ignore"):  # what overflows or divides by zero is culled below
         geometry = _geometry(means, quaternions, log_scales, camera)
         z = geometry.p[:, 2]
@@ -188,14 +193,17 @@ def project(
 
         m1, m2 = geometry.half[:, 0], geometry.half[:, 1]
         length1, length2 = (m1 * m1).sum(axis=1), (m2 * m2).sum(axis=1)
-        sxx, sxy, syy = length1 + LOW_PASS, (m1 * m2).sum(axis=1), length2 + LOW_PASS
+        sxx, sxy, syy = length1 + low_pass, (m1 * m2).sum(axis=1), length2 + low_pass
         cross = np.cross(m1, m2)
-        det = (cross * cross).sum(axis=1) + LOW_PASS * (length1 + length2) + LOW_PASS**2
+        det0 = (cross * cross).sum(axis=1)
+        det = det0 + low_pass * (length1 + length2) + low_pass**2
         l11 = np.sqrt(syy / det)
         whitening = np.stack([l11, -(sxy / syy) * l11, 1 / np.sqrt(syy)], axis=1)
         conics = np.stack([syy / det, -sxy / det, sxx / det], axis=1)
 
         opacities = 1 / (1 + np.exp(-opacity_logits))
+        if antialiased:
+            opacities = opacities * compensation(det0, det)
         reach = 2 * np.log(opacities / ALPHA_MIN)
         half_extents = np.sqrt(reach[:, None] * np.stack([sxx, syy], axis=1))
 
@@ -224,6 +232,22 @@ def project(
         colors=shown(colors),
         visible=visible,
     )
+
+
+def compensation(det0: Float64, det: Float64) -> Float64:
+    """Eq. (83), of the determinants (N,) of covariances without the low-pass and with it."""
+    return np.maximum(np.sqrt(det0 / det), LEAST_COMPENSATION)
+
+
+def _compensation_grad(geometry: _Geometry, d_logs: Float64) -> Float64:
+    """Eq. (84): dL/dSigma (N, 2, 2) of what the compensation has of it. d_logs (N,): dL/d(ln of the opacity)."""
+    plain = geometry.half @ geometry.half.transpose(0, 2, 1)
+    filtered = plain + LOW_PASS_ANTIALIASED * np.eye(2)
+    free = np.linalg.det(plain) > LEAST_COMPENSATION**2 * np.linalg.det(filtered)
+    gradient = np.zeros_like(plain)
+    half = 0.5 * d_logs[free, None, None]
+    gradient[free] = half * (np.linalg.inv(plain[free]) - np.linalg.inv(filtered[free]))
+    return gradient
 
 
 def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
@@ -272,8 +296,11 @@ def project_grad(
     d_covariances: Float64,
     d_opacities: Float64,
     d_colors: Float64,
+    *,
+    antialiased: bool = False,
 ) -> dict[str, Float64]:
-    """Eqs. (31) to (41): gradients by the five parameter arrays, keyed by their names; zero where culled.
+    """Eqs. (31) to (41), antialiased with (84): gradients by the five parameter arrays, keyed by their names; zero
+    where culled.
 
     projected: what `project` made; d_means2d (N, 2), d_covariances (N, 3): xx, xy, yy as in (28), d_opacities (N,),
     d_colors (N, 3). For perspective cameras alone.
@@ -285,6 +312,8 @@ def project_grad(
 
     gxx, gxy, gyy = d_covariances[rows].T
     d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
+    if antialiased:
+        d_covariance += _compensation_grad(geometry, d_opacities[rows] * projected.opacities[rows])
     d_half = 2 * d_covariance @ geometry.half  # (31)
 
     factor = geometry.rotations * geometry.scales[:, None, :]
@@ -325,6 +354,7 @@ def project_grad(
     gradients["means"][rows] = d_means
     gradients["quaternions"][rows] = d_quaternions
     gradients["log_scales"][rows] = d_log_scales
-    gradients["opacity_logits"][rows] = d_opacities[rows] * opacities * (1 - opacities)  # (41)
+    logits = opacity_logits[rows]
+    gradients["opacity_logits"][rows] = d_opacities[rows] * opacities / (1 + np.exp(logits))  # (41)
     gradients["sh"][rows, :count] = basis[:, :, None] * d_value[:, None, :]
     return gradients

@@ -12,7 +12,16 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.cameras import cam_from_pixel, pixel_grid
-from clsplat.reference.project import ALPHA_MIN, LOW_PASS, Footprint, Seen, rotation_matrices, view_directions
+from clsplat.reference.project import (
+    ALPHA_MIN,
+    LOW_PASS,
+    LOW_PASS_ANTIALIASED,
+    Footprint,
+    Seen,
+    compensation,
+    rotation_matrices,
+    view_directions,
+)
 from clsplat.reference.render import parameters
 from clsplat.spherical_harmonics import sh_basis
 
@@ -74,8 +83,11 @@ def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
     right, down, pixels = footprints(directions, camera)
     axes = camera.rotation @ rotation_matrices(arrays["quaternions"]) * np.exp(arrays["log_scales"])[:, None, :]
     half = np.stack([right, down], axis=1) @ axes / depths[:, None, None]
-    covariances = half @ half.transpose(0, 2, 1) + LOW_PASS * pixels @ pixels.transpose(0, 2, 1)
+    plain, low_pass = half @ half.transpose(0, 2, 1), LOW_PASS_ANTIALIASED if gaussians.antialiased else LOW_PASS
+    covariances = plain + low_pass * pixels @ pixels.transpose(0, 2, 1)
     opacities = 1 / (1 + np.exp(-arrays["opacity_logits"]))
+    if gaussians.antialiased:
+        opacities = opacities * compensation(np.linalg.det(plain), np.linalg.det(covariances))
     basis = sh_basis(view_directions(means, camera)[0], gaussians.sh_degree)
     colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, arrays["sh"][:, : basis.shape[1]]))
     visible = (depths > camera.near) & (opacities > ALPHA_MIN)

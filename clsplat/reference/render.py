@@ -49,7 +49,7 @@ def forward(
 ) -> Forward:
     """Project, sort, blend; sh_degree None uses all bands there are."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
-    projected = project(**parameters(gaussians), camera=camera, sh_degree=degree)
+    projected = project(**parameters(gaussians), camera=camera, sh_degree=degree, antialiased=gaussians.antialiased)
     return Forward(projected, blend(projected, camera.width, camera.height, background))
 
 
@@ -74,7 +74,7 @@ def render_grad(
     """Gradients of a loss with dL/dimage = d_image (H, W, 3)."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     arrays = parameters(gaussians)
-    projected = project(**arrays, camera=camera, sh_degree=degree)
+    projected = project(**arrays, camera=camera, sh_degree=degree, antialiased=gaussians.antialiased)
     screen = blend_grad(projected, camera.width, camera.height, background, d_image)
     by_parameter = project_grad(
         **arrays,
@@ -85,5 +85,6 @@ def render_grad(
         d_covariances=covariance_grad(projected.conics, screen.conics),
         d_opacities=screen.opacities,
         d_colors=screen.colors,
+        antialiased=gaussians.antialiased,
     )
     return Gradients(**vars(screen), parameters=by_parameter, visible=projected.visible)

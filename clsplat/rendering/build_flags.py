@@ -12,8 +12,9 @@ from clsplat.config.rasterizer import RasterizerConfig
 _HALF_LOG2E = 0.5 * math.log2(math.e)
 
 
-def kernel_defines(config: RasterizerConfig) -> dict[str, object]:
-    """The defines that make the kernels do as `config` says; only for what differs from the default."""
+def kernel_defines(config: RasterizerConfig, *, antialiased: bool = False) -> dict[str, object]:
+    """The defines that make the kernels do as `config` says; only for what differs from the default. antialiased: of
+    the model."""
     config, default = config.switches(), RasterizerConfig()
     defines: dict[str, object] = {}
     if config.extent == "3sigma":
@@ -32,6 +33,7 @@ def kernel_defines(config: RasterizerConfig) -> dict[str, object]:
         "NO_GRADIENT_SKIP": not config.gradient_skip,
         "NO_FRUSTUM_CULL": not config.frustum_cull,
         "NO_OPACITY_CULL": not config.opacity_cull,
+        "ANTIALIASED": antialiased,
     }
     defines.update({name: True for name, wanted in flags.items() if wanted})
     if config.sh_degree_limit != default.sh_degree_limit:

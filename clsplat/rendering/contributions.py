@@ -42,6 +42,7 @@ def largest_contributions(
     alpha_alone = drop_sh(gaussians, 0)  # colour does not matter
     plan = plan_step(device, len(gaussians), 1, cameras, config, fields=FIELDS, agreement=False)
     rasterizer = Rasterizer(device, config)
+    rasterizer.antialias(on=gaussians.antialiased)
     rasterizer.follow(plan)
     model = host_gaussians(alpha_alone, plan.rows) if plan.streamed else upload_gaussians(device, alpha_alone)
     background = allocate(device, (3,), np.float32)

@@ -12,7 +12,7 @@ from clsplat.device.context import Device
 from clsplat.device.layout import TILE, SlotFields
 from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_plan import Need, Plan, plan
-from clsplat.stages import blend, density, duplicate, loss, project, ranges, target
+from clsplat.stages import blend, density, duplicate, loss, project, ranges, sampling, target
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.duplicate import MAX_PAIRS
 from clsplat.stages.sort import scratch_bytes
@@ -54,11 +54,12 @@ def plan_step(
     agreement: bool,
     photographs: int = 0,
     turns: int = 1,
+    antialiased: bool = False,
     models: int = _MODELS,
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
-    photographs: pixels of all that may stay on the device; turns: of `loss`; models: arrays for each parameter, where
-    they are not those of a step of one view. Raises CapacityError."""
+    photographs: pixels of all that may stay on the device; turns: of `loss`; antialiased: of the
+    model; models: arrays for each parameter, where they are not those of a step of one view. Raises CapacityError."""
     planes = 0
     for camera in cameras:
         pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES)
@@ -68,7 +69,11 @@ def plan_step(
     statistics = density.gaussian_bytes(agreement=agreement, contributions=fields.contributions)
     step = replace(
         frame,
-        row=frame.row + screen + statistics + (_SHOWN if models > _MODELS else 0),
+        row=frame.row
+        + screen
+        + statistics
+        + (_SHOWN if models > _MODELS else 0)
+        + sampling.GAUSSIAN_BYTES * antialiased,
         banded=frame.banded + 4 * fields.floats,
         model=models * frame.model,
         pair=frame.pair + blend.gradient_pair_bytes(fields),

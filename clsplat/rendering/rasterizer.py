@@ -90,12 +90,8 @@ class Rasterizer:
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
-        self._switches = self.config.switches()
-        self.device = device.with_switches(kernel_defines(self.config))
-        self._by_projection = {
-            name: self.device.with_switches(kind.defines) if kind.defines else self.device
-            for name, kind in PROJECTIONS.items()
-        }
+        self._switches, self._bare = self.config.switches(), device
+        self.antialias(on=False)
         self.work = work or Workspace(device)
         self._packs: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
         aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
@@ -106,6 +102,14 @@ class Rasterizer:
         self._arriving: NDArray[np.uint32] | None = None
         self._all_bits = self._switches.key_bits == "all"
         self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS)
+
+    def antialias(self, *, on: bool) -> None:
+        """Draw models that are antialiased from here on, or those that are not (`Gaussians.antialiased`)."""
+        self.device = self._bare.with_switches(kernel_defines(self.config, antialiased=on))
+        self._by_projection = {
+            name: self.device.with_switches(kind.defines) if kind.defines else self.device
+            for name, kind in PROJECTIONS.items()
+        }
 
     def follow(self, plan: Plan) -> None:
         """Work in as much memory as the plan has for it. Where that is tight, what an earlier plan left goes."""

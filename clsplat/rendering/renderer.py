@@ -159,6 +159,7 @@ class Renderer:
             gaussians.check()
             self._sh = self._held = None
             self._sh = (gaussians, held_sh(gaussians, self._rasterizer.config))
+        self._rasterizer.antialias(on=gaussians.antialiased)
         sh = self._sh[1]
         asked = (len(gaussians), sh.floats, camera.width, camera.height, features, planes)
         if self._planned != asked:

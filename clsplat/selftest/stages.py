@@ -84,7 +84,9 @@ def _project(bench: Bench) -> Outcome:
         lambda: project(device, bench.work, bench.model, camera, bench.camera_array), take
     )
     gaussians = bench.frozen.gaussians
-    wanted = reference_project.project(**parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree)
+    wanted = reference_project.project(
+        **parameters(gaussians), camera=camera, sh_degree=gaussians.sh_degree, antialiased=False
+    )
     got, shown = bench.splats(), bench.visible & wanted.visible
     log2o = bench.projected.splats.get()[shown, SPLAT.index("LOG2O")]
     parts = {
@@ -289,11 +291,13 @@ def _project_grad(bench: Bench) -> Outcome:
     entries = [l11 * l11 * uu, l11 * (l12 * uu + l22 * uv), l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv]
     d_covariances = half * np.stack(entries, axis=1)
     model = parameters(bench.frozen.gaussians)
-    true = reference_project.project(**model, camera=bench.camera, sh_degree=bench.frozen.gaussians.sh_degree)
+    degree = bench.frozen.gaussians.sh_degree
+    true = reference_project.project(**model, camera=bench.camera, sh_degree=degree, antialiased=False)
     wanted = reference_project.project_grad(
         **model,
         camera=bench.camera,
-        sh_degree=bench.frozen.gaussians.sh_degree,
+        sh_degree=degree,
+        antialiased=False,
         projected=true,
         d_means2d=d_means,
         d_covariances=d_covariances,

@@ -196,6 +196,7 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     """Make the step once more: after each stage how many numbers are not finite, and how many steps `adam` refuses."""
     config, record = bundle.config, bundle.record
     rasterizer, probe = Rasterizer(device, config.rasterizer), _Counts(bundle.camera)
+    rasterizer.antialias(on=config.antialiased)
     parameters, first, second = (to_device(device, bundle.models[kind]) for kind in _KINDS)
     gradients = allocate_gaussians(device, parameters.count, parameters.coefficients, zero=True)
     probe.counts["parameters"] = _wrong_in(parameters)

@@ -57,6 +57,7 @@ from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.pending import Pending
 from clsplat.training.photographs import Photographs
 from clsplat.training.resolution import sizes_of
+from clsplat.training.sampling import SamplingFilter
 from clsplat.training.step import GradientStep, Sample, StepProbe, slot_fields
 from clsplat.training.watched import Watched
 
@@ -95,6 +96,7 @@ class Trainer:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
         self.rasterizer = Rasterizer(device, config.rasterizer)
+        self.rasterizer.antialias(on=config.antialiased)
         self.photographs = Photographs(self.views, device)
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.sizes = sizes_of(
@@ -121,6 +123,10 @@ class Trainer:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.origin, self.near = initial.origin, self.scene.near
         self._cameras: dict[int, Camera] = {}
+        self.sampling: SamplingFilter | None = None
+        if self.config.antialiased:
+            cameras = [self.local(view.camera) for view in self.views]
+            self.sampling = SamplingFilter(self.device, self.rasterizer.work, cameras)
         self._make_plan(len(initial))
         if self.plan.streamed:
             self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
@@ -142,6 +148,7 @@ class Trainer:
                 agreement=needs.agreement,
                 photographs=sum(view.camera.width * view.camera.height for view in self.views),
                 turns=self.pending.turns,
+                antialiased=self.config.antialiased,
                 **models,
             )
 
@@ -202,6 +209,9 @@ class Trainer:
         views = self.views_ahead
         self.step += views
         self._raise_sh_degree()
+        if self.sampling is not None and self.sampling.is_due(self.step):
+            self.settle()
+            self.sampling.renew(self.parameters)  # to no other effect if done again
         samples = [self._sample() for _ in range(views)]
         needs = self.strategy.needs(self.step)
         exact = GradientStep(self.device, self.rasterizer, self.config, self.step, self.rates(), slot_fields(needs))
@@ -211,7 +221,9 @@ class Trainer:
             sample, step = samples[0], replace(exact, turn=turn, room=room)
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
-            return step.run(model, *pixels, probe, reads_loss=reads_loss)
+            result = step.run(model, *pixels, probe, reads_loss=reads_loss)
+            self._limit_scales()
+            return result
 
         result: Loss | Losses
         if self.batch is None:
@@ -219,10 +231,15 @@ class Trainer:
         else:
             model, statistics = (self.parameters, self.first, self.second), needs.gradients
             result = self.batch.run(exact, model, samples, factor, self._watched_in_batch, statistics=statistics)
+            self._limit_scales()
         self.controlled, self.last_views = False, views
         self._note()
         self._rearrange(self.strategy.after_gradient(self._state()))
         return result
+
+    def _limit_scales(self) -> None:
+        if self.sampling is not None:
+            self.sampling.apply(self.parameters)
 
     def _room(self, factor: float) -> int:
         """Pairs to launch the next step for, or 0 for the exact number, as where the strategy looks at each step's
@@ -397,6 +414,8 @@ class Trainer:
         moved = [gather(device, rows, model, renews=index > 0) for index, model in enumerate(models)]
         del models
         self._set_parameters(*(self._placed(model) for model in moved))
+        if self.sampling is not None:
+            self.sampling.least = None
         carry(device, listed, statistics, self.statistics, densified=new_statistics)
         if type(self.strategy).rearranged is not Strategy.rearranged:
             entries = listed.get()
@@ -424,7 +443,7 @@ class Trainer:
         model = download_gaussians(self.parameters)
         full = np.zeros((len(model), (self.config.sh_degree + 1) ** 2, 3), np.float32)
         full[:, : model.sh.shape[1]] = model.sh
-        model.sh, model.origin, model.near = full, self.origin, self.near
+        model.sh, model.origin, model.near, model.antialiased = full, self.origin, self.near, self.config.antialiased
         return model
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
@@ -443,6 +462,8 @@ class Trainer:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
         arrays |= {f"{kind}/{group}": model[group].get() for kind, model in self.models().items() for group in GROUPS}
+        if self.sampling is not None and self.sampling.least is not None:
+            arrays["sampling/least"] = self.sampling.least.get()
         return arrays
 
     def restart(self) -> None:
@@ -483,6 +504,11 @@ class Trainer:
                 raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
         self.statistics.load(statistics)  # what the settings did not ask for before the checkpoint is not known
         self.strategy.load(_named(checkpoint, "strategy/"))
+        if self.sampling is not None:
+            least = checkpoint.arrays.get("sampling/least")
+            if least is not None and least.shape != (self.parameters.count,):
+                raise unusable(checkpoint, f"sampling/least has shape {least.shape}")
+            self.sampling.restore(least)
 
     def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
         most, degree = (self.config.sh_degree + 1) ** 2, self.config.sh_degree

@@ -2,6 +2,14 @@
 // Equation numbers are those of docs/gradients.md. With ORTHOGRAPHIC the image is linear in x and y, not in x/z and y/z
 // (docs/cameras.md, equations 15 to 17).
 
+// px^2 added to the projected covariance, and with ANTIALIASED the least that (83) makes of an opacity.
+#ifdef ANTIALIASED
+#define LOW_PASS 0.1f
+#define LEAST_COMPENSATION 0.005f
+#else
+#define LOW_PASS 0.3f
+#endif
+
 // So that no sum of what they are factors of overflows: of distances in world units and of axes in pixels.
 #define FARTHEST 1e18f
 // Where `refine` is called for: longest axis over the ellipse's short one, and an axis over what is seen of it. Up to
@@ -23,6 +31,9 @@ typedef struct {
   floatL s[3];          // scales
   floatL sxx, sxy, syy; // projected covariance with the low-pass
   floatL det;
+#ifdef ANTIALIASED
+  floatL det0; // without the low-pass
+#endif
 } Projection;
 
 static inline void rotation_of(const floatL *q, floatL *r) {
@@ -89,6 +100,9 @@ static inline floatL clampL(floatL x, float low, float high) {
 // (5) to (7) from J A and S, with the determinant as a sum of squares (56).
 static inline void covariance(Projection *p) {
   floatL xx = (floatL)(0.0f), yy = xx, xy = xx, minors = (floatL)(LOW_PASS * LOW_PASS);
+#ifdef ANTIALIASED
+  p->det0 = (floatL)(0.0f);
+#endif
   FOR_AXES(k) {
     const floatL m1 = p->s[k] * p->b1[k], m2 = p->s[k] * p->b2[k];
     xx = fmaL(m1, m1, xx);
@@ -96,12 +110,23 @@ static inline void covariance(Projection *p) {
     xy = fmaL(m1, m2, xy);
     const floatL minor = p->s[(k + 1) % 3] * p->s[(k + 2) % 3] * p->c[k];
     minors = fmaL(minor, minor, minors);
+#ifdef ANTIALIASED
+    p->det0 = fmaL(minor, minor, p->det0);
+#endif
   }
   p->sxx = xx + LOW_PASS;
   p->syy = yy + LOW_PASS;
   p->sxy = xy;
   p->det = fmaL((floatL)(LOW_PASS), xx + yy, minors);
 }
+
+#ifdef ANTIALIASED
+// (83): what the low-pass thickens, opacity makes up for. det0, det: the covariance's determinant without it and with.
+static inline floatL compensation(floatL det0, floatL det) {
+  const floatL part = det0 / det;
+  return part > LEAST_COMPENSATION * LEAST_COMPENSATION ? sqrt(part) : (floatL)(LEAST_COMPENSATION);
+}
+#endif
 
 // The rest of x/z as the Jacobian takes it: of a limit where it is clamped.
 static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,

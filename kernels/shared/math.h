@@ -3,7 +3,6 @@
 #pragma OPENCL FP_CONTRACT OFF
 
 #define LOG2E 1.44269504088896341f
-#define LOW_PASS 0.3f // px^2 added to the projected covariance
 #define ALPHA_MAX 0.99f
 #ifndef ALPHA_MIN // these two can be set by RasterizerConfig
 #define ALPHA_MIN (1.0f / 255.0f)

@@ -7,6 +7,7 @@ import gzip
 import struct
 import time
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -125,10 +126,13 @@ def test_values_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_an_antialiased_model_says_so(tmp_path: Path) -> None:
-    spz.write(tmp_path / "model.spz", lopsided(5), antialiased=True)
-    with pytest.warns(UserWarning, match="anti-aliasing"):
-        spz.read(tmp_path / "model.spz")
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_an_antialiased_model_says_so(version: int, tmp_path: Path) -> None:
+    for antialiased in (False, True):
+        model, path = replace(lopsided(5), antialiased=antialiased), tmp_path / f"{antialiased}.spz"
+        spz.write(path, model, version=version)
+        assert spz.read(path).antialiased == antialiased
+        assert spz.describe(path)["antialiased"] == antialiased
 
 
 def with_extensions(data: bytes, *records: tuple[int, bytes]) -> bytes:

@@ -7,6 +7,8 @@ the step.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scenes
@@ -35,12 +37,12 @@ class Objective:
 
     def __init__(self, gaussians: Gaussians, camera: Camera) -> None:
         self.arrays = parameters(gaussians)
-        self.camera = camera
+        self.camera, self.antialiased = camera, gaussians.antialiased
         self.target = np.random.default_rng(0).uniform(0, 1, (camera.height, camera.width, 3))
         self.count, self.last = self._evaluate(self.arrays)[1:]
 
     def _evaluate(self, arrays: Arrays) -> tuple[float, NDArray[np.int64], NDArray[np.int64]]:
-        projected = project(**arrays, camera=self.camera, sh_degree=3)
+        projected = project(**arrays, camera=self.camera, sh_degree=3, antialiased=self.antialiased)
         blended = blend(projected, self.camera.width, self.camera.height, BACKGROUND)
         return l1_dssim(blended.image, self.target)[0], blended.count, blended.last
 
@@ -55,7 +57,7 @@ class Objective:
         return (self(shifted[0]) - self(shifted[1])) / (2 * STEP)
 
     def gradient(self) -> Arrays:
-        projected = project(**self.arrays, camera=self.camera, sh_degree=3)
+        projected = project(**self.arrays, camera=self.camera, sh_degree=3, antialiased=self.antialiased)
         width, height = self.camera.width, self.camera.height
         image = blend(projected, width, height, BACKGROUND).image
         screen = blend_grad(projected, width, height, BACKGROUND, l1_dssim(image, self.target)[1])
@@ -68,12 +70,14 @@ class Objective:
             d_covariances=covariance_grad(projected.conics, screen.conics),
             d_opacities=screen.opacities,
             d_colors=screen.colors,
+            antialiased=self.antialiased,
         )
 
 
-@pytest.fixture(scope="module")
-def overlap() -> tuple[Objective, Arrays]:
-    objective = Objective(*scenes.overlap())
+@pytest.fixture(scope="module", params=[False, True], ids=["", "antialiased"])
+def overlap(request: pytest.FixtureRequest) -> tuple[Objective, Arrays]:
+    gaussians, camera = scenes.overlap()
+    objective = Objective(replace(gaussians, antialiased=request.param), camera)
     return objective, objective.gradient()
 
 

@@ -70,6 +70,7 @@ class Pipeline:
     ) -> Pipeline:
         gaussians, camera = scene
         rasterizer = Rasterizer(device, config)
+        rasterizer.antialias(on=gaussians.antialiased)
         on_device = upload_gaussians(device, gaussians)
         frame = rasterizer.forward(on_device, camera, upload(device, np.array(background, np.float32)))
         return cls(rasterizer, on_device, camera, frame)

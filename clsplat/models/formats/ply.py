@@ -52,6 +52,8 @@ SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 ORIGIN = ["comment", "clsplat", "origin"]
 NEAR_PLANE = ["comment", "clsplat", "near"]
+MIP = ["comment", "SplatRenderMode:", "mip"]
+"""The comment of a model that is antialiased, in Brush's words. Some writers add the low-pass: mip-0.1."""
 FILTER = "filter_3D"
 """Mip-splatting's property: what its renderer adds to the scales."""
 LOCAL = "clsplat_local"
@@ -80,7 +82,8 @@ class Element:
 @dataclass
 class Header:
     """path: of the file, for messages; format: "ascii" or a key of BYTE_ORDERS; size: the header's length in bytes,
-    `end_header` included; origin: of the element LOCAL; near: the near plane, where it is not the usual one."""
+    `end_header` included; origin: of the element LOCAL; near: the near plane, where it is not the usual one;
+    antialiased: as of `Gaussians`."""
 
     path: Path
     format: str
@@ -89,6 +92,7 @@ class Header:
     origin: Float64 | None = None
     near: float = NEAR
     comments: list[str] = field(default_factory=list)
+    antialiased: bool = False
 
     @property
     def vertex(self) -> Element:
@@ -137,7 +141,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         gaussians = _assemble(read_vertices(file, header, "Gaussian"), vertex.count, rest, path)
         if header.origin is not None:
             _count_from(header.origin, gaussians, _local_means(file, header), path)
-        gaussians.near = header.near
+        gaussians.near, gaussians.antialiased = header.near, header.antialiased
         return gaussians
 
 
@@ -157,13 +161,14 @@ def blocks(path: Path) -> Iterator[Gaussians]:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: encoding, comments, properties that are ignored, and `near`."""
+    """The format's part of `clsplat info`: encoding, comments, properties that are ignored, `near`, `antialiased`."""
     known = {*REQUIRED, "nx", "ny", "nz"}
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
     properties = header.vertex.properties
     ignored = [name for name, _ in properties if name not in known and not name.startswith("f_rest_")]
-    return {"encoding": header.format, "comments": header.comments, "ignored": ignored, "near": header.near}
+    described = {"encoding": header.format, "comments": header.comments, "ignored": ignored, "near": header.near}
+    return described | {"antialiased": header.antialiased}
 
 
 def write(
@@ -191,6 +196,7 @@ def write(
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     lines += [" ".join([*ORIGIN, *(repr(float(value)) for value in gaussians.origin)])] if far else []
     lines += [" ".join([*NEAR_PLANE, repr(float(gaussians.near))])] if gaussians.near != NEAR else []
+    lines += [" ".join(MIP)] if gaussians.antialiased else []
     lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
     lines += [f"element {LOCAL} {count}", *(f"property float {name}" for name in POSITION)] if far else []
     lines += ["end_header", ""]
@@ -226,7 +232,7 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     form = ""
     elements: list[Element] = []
     comments: list[str] = []
-    origin, near = None, NEAR
+    origin, near, antialiased = None, NEAR, False
     for _ in range(MAX_HEADER_LINES):
         line = file.readline(4096)
         if not line.endswith(b"\n"):
@@ -238,13 +244,14 @@ def read_header(file: BinaryIO, path: Path) -> Header:
                 origin = given if len(given) == 3 and np.isfinite(given).all() else None
             if words[:3] == NEAR_PLANE:
                 near = float(given[0]) if len(given) == 1 and 0 < given[0] < np.inf else NEAR
+            antialiased |= words[:2] == MIP[:2] and "".join(words[2:3]).startswith(MIP[2])
             comments += [" ".join(words[1:])] if words else []
             continue
         if words == ["end_header"]:
             if form not in ("ascii", *BYTE_ORDERS):
                 expected = "ascii, binary_little_endian or binary_big_endian"
                 raise InputError(f"{path}: PLY header has the format {form or 'missing'!r}, expected {expected}")
-            return Header(path, form, elements, file.tell(), origin, near, comments)
+            return Header(path, form, elements, file.tell(), origin, near, comments, antialiased)
         try:
             match words:
                 case ["format", name, _]:

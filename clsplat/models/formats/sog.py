@@ -31,7 +31,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64, numbers
-from clsplat.errors import InputError, plain, warn
+from clsplat.errors import InputError, plain
 from clsplat.files import (
     MAX_DOCUMENT,
     atomic_write,
@@ -85,7 +85,9 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read a .sog, or a meta.json with its pictures, or the folder that has them. Raises InputError."""
     with _opened(path) as opened:
-        model = _Meta(*opened).gaussians()
+        meta = _Meta(*opened)
+        model = meta.gaussians()
+        model.antialiased = bool(meta.meta.get("antialias", False))
     packing.require_finite(path, model)
     return model
 
@@ -165,8 +167,6 @@ class _Meta:
         if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count < 1 << 32:
             raise InputError(f"{self.path}: has {str(count)[:20]} Gaussians, expected at least one")
         self.count = count
-        if meta.get("antialias"):
-            warn(f"{self.path}: trained with anti-aliasing, which this renderer does not do")
 
     def section(self, name: str) -> dict[str, Any]:
         value = self.meta.get(name)
@@ -331,6 +331,7 @@ def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, p
         "scales": {"codebook": scale_codes.tolist(), "files": [scales]},
         "quats": {"files": [picture("quats.webp", [quats])]},
         "sh0": {"codebook": colour_codes.tolist(), "files": [colours]},
+        **({"antialias": True} if gaussians.antialiased else {}),
     }
     if gaussians.sh_degree:
         rest = gaussians.sh[order, 1:]

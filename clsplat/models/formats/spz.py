@@ -110,9 +110,8 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     values.require_count(path, header.count, size)
     if header.degree > MAX_SH_DEGREE:
         warn(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out")
-    if header.flags & ANTIALIASED:
-        warn(f"{path}: trained with anti-aliasing, which this renderer does not do")
     result = values.empty(header.count, min(header.degree, MAX_SH_DEGREE))
+    result.antialiased = bool(header.flags & ANTIALIASED)
     if header.version == 4:
         signs = _frame(file.read(header.table - 32), path) if header.flags & HAS_EXTENSIONS else UP_BACK
         _unpack(_zstd_streams(file, header, size, path), header, signs, result, path)
@@ -304,7 +303,6 @@ def write(
     version: int = DEFAULT_VERSION,
     fractional_bits: int | None = None,
     sh_bits: tuple[int, int] = SH_BITS,
-    antialiased: bool = False,
 ) -> None:
     """Write an SPZ file, atomically; the same Gaussians give the same bytes.
 
@@ -316,14 +314,12 @@ def write(
     if version not in VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
     values.check_writable(path, gaussians, least=1)
-    header = header_for(path, gaussians, version, fractional_bits, ANTIALIASED if antialiased else 0)
+    header = header_for(path, gaussians, version, fractional_bits)
     with atomic_writer(path) as file:
         write_to(file, gaussians, header, sh_bits)
 
 
-def header_for(
-    path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None, flags: int = 0
-) -> Header:
+def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None) -> Header:
     """The header for `write_to`, of at least one Gaussian. The bits after the point are as many as asked for, if the
     positions fit; or by the model's size, without its farthest hundredth. Raises InputError for positions that do not
     fit."""
@@ -346,6 +342,7 @@ def header_for(
         bits = min(fits, max(12, 16 - int(np.ceil(np.log2(max(float(spread), 1e-6))))))
     elif bits < 0:
         raise ValueError(f"fractional_bits {bits}: expected 0 to 23")
+    flags = ANTIALIASED if gaussians.antialiased else 0
     return Header(version, len(gaussians), gaussians.sh_degree, bits, flags)
 
 

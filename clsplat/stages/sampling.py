@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches sampling.cl: scales that are no less than what the pictures can show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from clsplat.camera import Camera
+from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_items
+from clsplat.device.profile import stage
+from clsplat.stages.device_camera import pack_camera
+from clsplat.stages.device_gaussians import AnyGaussians, parts
+
+SAMPLING = np.float32(np.sqrt(0.2))
+"""Least standard deviation of a Gaussian, in widths of the finest pixel that shows it (Yu et al. 2024, Mip-Splatting,
+section 5.1)."""
+
+
+GAUSSIAN_BYTES = 4
+"""Bytes of each Gaussian: its least scale."""
+
+
+def upload_cameras(device: Device, cameras: Sequence[Camera]) -> DeviceArray:
+    """(views, CAMERA) of cameras that count from where the means do."""
+    return upload(device, np.stack([pack_camera(camera) for camera in cameras]))
+
+
+@stage("sampling")
+def sampling_limits(
+    device: Device, work: Workspace, gaussians: AnyGaussians, cameras: DeviceArray, least: DeviceArray
+) -> None:
+    """Fill least (n,): the natural log of the least standard deviation, in world units, that the pictures of the
+    cameras can show of each Gaussian; -1e30 for one that is in none."""
+    kernel = device.kernels("sampling", LANES=1, SAMPLING=f"{float(SAMPLING):.9e}f").sampling_limits
+    for start, stop, (part,) in parts(work, gaussians):
+        arrays = (cameras, part["means"], least.rows(start, stop))
+        launch_items(device, kernel, part.count, part.count, cameras.shape[0], *arrays)
+
+
+@stage("sampling")
+def limit_scales(device: Device, work: Workspace, gaussians: AnyGaussians, least: DeviceArray) -> None:
+    """Make the log scales that are less than `least` (n,) that."""
+    kernel = device.kernels("sampling", LANES=1, SAMPLING=f"{float(SAMPLING):.9e}f").limit_scales
+    for start, stop, (part,) in parts(work, gaussians, keep=True):
+        launch_items(device, kernel, part.count, part.count, least.rows(start, stop), part["log_scales"])
