@@ -20,7 +20,7 @@ static inline uint mixed(uint x) {
 
 #define HALVES 8              // uniform numbers of 16 bits in a sum
 #define WORDS (HALVES / 2)    // with two in each
-#define SPREAD 1.86877495e-5f // one over the standard deviation of the sum, sqrt(HALVES (2^32 - 1)/12)
+#define SPREAD 1.86881232e-5f // one over the standard deviation of the sum, sqrt(HALVES (2^32 - 1)/12)
 
 // Number `index` of those of a row: (93). Its sum is a whole number under 2^23, so that it is rounded once.
 static inline float normal(uint row_word, uint index) {
