@@ -115,6 +115,9 @@ class DensityConfig:
     under min-opacity move to where others are opaque, max-gaussians is reached by a twentieth more each time, and noise
     moves what is nearly transparent (3DGS-MCMC). With mcmc there are no clones, splits and resets; max-screen-radius
     moves Gaussians, from the start."""
+    spread: float = 1.0
+    """With growth mcmc: distance of what moves or is added from the mean of the Gaussian that it comes from, in standard
+    deviations, drawn at random; 0 puts it there, as published."""
     noise_rate: float = 5e5
     """With growth mcmc: noise added to the means each step, in learning rates of the means, for Gaussians of size 1 in
     a scene of extent 1; 0 adds none. None is added in the cooldown."""
@@ -148,7 +151,7 @@ class DensityConfig:
             (("split_factor",), lambda value: 1 < value < inf, "a finite number, more than 1"),
             (("min_opacity", "opacity_reset_to"), lambda value: 0 < value < 1, "more than 0, less than 1"),
             (
-                ("max_screen_radius", "min_contribution", "noise_rate", "opacity_weight", "scale_weight"),
+                ("max_screen_radius", "min_contribution", "spread", "noise_rate", "opacity_weight", "scale_weight"),
                 lambda value: 0 <= value < inf,
                 "a finite number, at least 0",
             ),

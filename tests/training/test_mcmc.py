@@ -78,8 +78,10 @@ def test_growth_reaches_the_cap_halfway() -> None:
     assert wanted(replace(config, max_gaussians=1060), 600, 1000) == 1050, "a twentieth, where that is enough"
 
 
-def test_the_dead_move_and_some_are_added(scene: Scene, default_device: Device) -> None:
-    trainer = Trainer(scene, CONFIG, default_device)
+@pytest.mark.parametrize("spread", [0.0, 0.5])
+def test_the_dead_move_and_some_are_added(scene: Scene, default_device: Device, spread: float) -> None:
+    config = replace(CONFIG, density=replace(CONFIG.density, spread=spread))
+    trainer = Trainer(scene, config, default_device)
     for _ in range(15):
         trainer.train_step()
     count = trainer.parameters.count
@@ -103,8 +105,14 @@ def test_the_dead_move_and_some_are_added(scene: Scene, default_device: Device) 
     assert plan.fresh[count:].all()
     assert not np.isin(plan.rows, gone).any()
     assert_same_bits(plan.rows[stay], stay.astype(np.uint32), "rows")
-    for group in ("means", "quaternions", "sh_dc", "sh_rest"):
+    for group in ("quaternions", "sh_dc", "sh_rest"):
         assert_same_bits(after["parameters"][group], before["parameters"][group][plan.rows], group)
+    new = np.concatenate([gone, np.arange(count, len(plan.rows))])
+    offsets = after["parameters"]["means"] - before["parameters"]["means"][plan.rows]
+    assert not np.delete(offsets, new, axis=0).any()
+    away = np.linalg.norm(offsets[new], axis=1) / np.exp(after["parameters"]["log_scales"][new].max(axis=1))
+    assert away.any() == (spread > 0)
+    assert away.max() < 4.5 * spread + 1e-9
     for kind in ("first", "second"):
         assert not any(after[kind][group][plan.fresh].any() for group in GROUPS)
         for group in GROUPS:

@@ -15,7 +15,7 @@ from clsplat.config.exploring import Exploration, step_key
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
-from clsplat.training.density.adaptive import is_due
+from clsplat.training.density.adaptive import draw_offsets, is_due
 
 MOST = 51
 """Gaussians that share the place of one, at most."""
@@ -84,6 +84,11 @@ class Mcmc(Strategy):
             "opacity_logits": (changed, logits),
             "log_scales": (changed, log_scales[changed].astype(np.float32)),
         }
+        if config.spread > 0:
+            new = np.concatenate([np.flatnonzero(dead), np.arange(count, count + more)])
+            means, turned = (model.parameters[group].get()[rows[new]] for group in ("means", "quaternions"))
+            offsets = config.spread * draw_offsets(turned, log_scales[new], rng)
+            values["means"] = (new, (means + offsets).astype(np.float32))
         return RowPlan(rows=rows.astype(np.uint32), fresh=fresh, values=values, new_statistics=True)
 
     def exploration(self, step: int, means_rate: float, count: int, extent: float) -> Exploration:
