@@ -116,8 +116,8 @@ class DensityConfig:
     moves what is nearly transparent (3DGS-MCMC). With mcmc there are no clones, splits and resets; max-screen-radius
     moves Gaussians, from the start."""
     spread: float = 1.0
-    """With growth mcmc: distance of what moves or is added from the mean of the Gaussian that it comes from, in standard
-    deviations, drawn at random; 0 puts it there, as published."""
+    """With growth mcmc: distance of what moves or is added from the mean of the Gaussian that it comes from, in
+    standard deviations, drawn at random; 0 puts it there, as published."""
     noise_rate: float = 5e5
     """With growth mcmc: noise added to the means each step, in learning rates of the means, for Gaussians of size 1 in
     a scene of extent 1; 0 adds none. None is added in the cooldown."""
