@@ -13,8 +13,9 @@
 //   loss per unit of each. Rows of Gaussians that are not visible are left as they are. project_step, built with ADAM:
 //   the parameters and their moments `first` and `second`, of the same shapes; `readback` (READBACK_SIZE) counts, and
 //   the scalars are those of Step, one a group where they differ. The gradient of a Gaussian that is not visible is
-//   zero, or with SPARSE its row stays as it is. After a pass that has stopped (duplicate.cl) nothing changes.
-// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42).
+//   zero, or with SPARSE its row stays as it is. After a pass that has stopped (duplicate.cl) nothing changes. With
+//   PENALTIES the gradient has that of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
+// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -87,6 +88,9 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #ifdef CONTRIBUTIONS
                                __global float *contributions,
 #endif
+#ifdef PENALTIES
+                               const float opacity_weight, const float scale_weight,
+#endif
 #ifdef SH_GRADIENT
                                SH_GRADIENT *d_sh_rest,
 #endif
@@ -129,6 +133,10 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   // Opacity, (29) and (41): sum of g is o dL/do, and do/dlogit = o (1 - o).
   Lanes d_screen[2];
   d->opacity.all = m_g * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also where o is next to 1
+#ifdef PENALTIES                                                  // (91)
+  const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
+  d->opacity.all = fmaL(opacity_weight * opacity, sigmoidL(-GATHER(opacity_logits, 1, 0)), d->opacity.all);
+#endif
 
   // (50). Mean on the image: -W^T (sum of g w).
   const floatL d_mx = -INVERSE_WHITEN2 * (l11 * m_gu);
@@ -189,6 +197,9 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     turned[k] = fmaL(-(by_det0 * p.s[k] * p.c[l]), apart * sum * (p.s[k] * p.c[n]), turned[k]);
 #endif
   }
+#ifdef PENALTIES
+  FOR_AXES(k) d->scale[k].all = fmaL((floatL)(scale_weight), p.s[k], d->scale[k].all);
+#endif
   const floatL w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
   const floatL turn = 2.0f / p.length;
   d->quaternion[0].all = turn * -fmaL(x, turned[0], fmaL(y, turned[1], z * turned[2]));
@@ -269,10 +280,15 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   return 1;
 }
 
-#ifdef CONTRIBUTIONS
-#define VIEW_ARRAYS screen, contributions
+#ifdef PENALTIES
+#define WEIGHTS , opacity_weight, scale_weight
 #else
-#define VIEW_ARRAYS screen
+#define WEIGHTS
+#endif
+#ifdef CONTRIBUTIONS
+#define VIEW_ARRAYS screen, contributions WEIGHTS
+#else
+#define VIEW_ARRAYS screen WEIGHTS
 #endif
 
 #ifndef ADAM
@@ -287,6 +303,10 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 #ifdef CONTRIBUTIONS
                            ,
                            __global float *contributions
+#endif
+#ifdef PENALTIES
+                           ,
+                           const float opacity_weight, const float scale_weight
 #endif
 ) {
   const uint first_row = get_global_id(0) * LANES;
@@ -352,6 +372,9 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
              __global float *screen,
 #ifdef CONTRIBUTIONS
              __global float *contributions,
+#endif
+#ifdef PENALTIES
+             const float opacity_weight, const float scale_weight,
 #endif
              const float beta1, const float beta2, const float epsilon, const float root, const float root_sh_rest,
              const float rate_means, const float rate_quaternions, const float rate_log_scales,

@@ -48,7 +48,7 @@ def loaded(scene: Path) -> Scene:
         (TrainConfig(density={"every": 3}), "--density {'every': 3}: expected DensityConfig(...)"),
         (
             TrainConfig(density=DensityConfig(growth="budgets")),
-            "--density.growth budgets: expected one of paper, budget",
+            "--density.growth budgets: expected one of paper, budget, mcmc",
         ),
         (TrainConfig(rasterizer=RasterizerConfig(extent="opacit")), "--rasterizer.extent opacit: expected one of"),
         (TrainConfig(rasterizer=BenchSwitches(row_skip="no")), "--rasterizer.row-skip no: expected True or False"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stages that are neither projection nor blending: elementary functions, loss, Adam, each by itself."""
+"""The stages that are neither projection nor blending: elementary functions, loss, Adam, noise, each by itself."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ import numpy as np
 from measuring import Result
 from numpy.typing import NDArray
 
+from clsplat.config.exploring import Exploration, step_key
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
-from clsplat.device.layout import TILE
+from clsplat.device.layout import READBACK, TILE
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference.adam import adam as exact_adam
 from clsplat.reference.loss import l1_dssim
+from clsplat.reference.noise import displacements
 from clsplat.stages.adam import adam
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.stages.loss import loss
+from clsplat.stages.noise import noise
 
 Array = NDArray[Any]
 
@@ -32,11 +35,13 @@ BOUNDS = {
     "loss": 1e-6,
     "loss gradient": 1e-5,
     "adam": 1e-4,
+    "noise": 5e-6,
 }
 """exp, sigmoid: 2 and 3 ulp; exp2: 0.8e-7 of its polynomial and rounding. log2: absolute under 1. loss: relative to at
 least 1, a sum of partial sums. loss gradient: in norm; differences of pixels are exact to 1e-7 of the brightness, up to
 1.5, and of the ripple of flat pictures that is more. adam: of a step, as beta2 in float32 is 1e-8 off in
-1 - beta2 = 1e-3, 1e-5 of a step, and a few roundings."""
+1 - beta2 = 1e-3, 1e-5 of a step, and a few roundings. noise: in norm; of 100 (o - dead), up to 16, a digit of o is
+1e-6 of the weight."""
 
 
 def elementary(device: Device, rng: np.random.Generator, count: int) -> Result:
@@ -123,9 +128,35 @@ def steps(device: Device, rng: np.random.Generator, many: int) -> Result:
     return {"adam": worst}
 
 
+def exploration(device: Device, rng: np.random.Generator, many: int) -> Result:
+    """Largest error in norm of the noise on Gaussians of any opacity, needles and discs among them."""
+    worst, count = 0.0, 200
+    readback = upload(device, np.zeros(len(READBACK), np.uint32))
+    for _ in range(many):
+        explore = Exploration(amount=10 ** rng.uniform(-3, 3), key=step_key(0, int(rng.integers(1 << 30))))
+        model = allocate_gaussians(device, count, 1, zero=True)
+        values = {
+            "quaternions": rng.standard_normal((count, 4)) * 10 ** rng.uniform(-3, 3, (count, 1)),
+            "log_scales": rng.uniform(-9, 2, (count, 3)),
+            "opacity_logits": rng.uniform(-9, 0, count),
+        }
+        exact = {group: array.astype(np.float32).astype(float) for group, array in values.items()}
+        for group, array in exact.items():
+            model[group].set(array.astype(np.float32))
+        noise(device, explore, model, 0, readback)
+        wanted = displacements(explore, **exact)
+        worst = max(worst, float(np.linalg.norm(model["means"].get() - wanted) / np.linalg.norm(wanted)))
+    return {"noise": worst}
+
+
 def stages(device: Device, seed: int, many: int) -> Result:
     """Errors by name, with their bounds and what is over one."""
     rng = np.random.default_rng([seed, 77])
-    found = {**elementary(device, rng, 1000 * many), **losses(device, rng, many), **steps(device, rng, many)}
+    found = {
+        **elementary(device, rng, 1000 * many),
+        **losses(device, rng, many),
+        **steps(device, rng, many),
+        **exploration(device, rng, many),
+    }
     faults = [f"{name} {error:.2g} over {BOUNDS[name]:g}" for name, error in found.items() if not error <= BOUNDS[name]]
     return {"errors": found, "faults": faults}

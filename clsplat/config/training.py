@@ -16,7 +16,7 @@ from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
 
 Background = Literal["black", "white", "random"]
-Growth = Literal["paper", "budget"]
+Growth = Literal["paper", "budget", "mcmc"]
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,21 @@ class DensityConfig:
     mean too; 1 asks for the mean alone, as the paper. A view that came again counts again."""
     growth: Growth = "paper"
     """paper: densify what is over the threshold; budget: the number of Gaussians rises along a parabola to
-    max-gaussians at density.stop, the largest gradients first, whatever the threshold (Taming 3DGS)."""
+    max-gaussians at density.stop, the largest gradients first, whatever the threshold (Taming 3DGS); mcmc: Gaussians
+    under min-opacity move to where others are opaque, max-gaussians is reached by a twentieth more each time, and noise
+    moves what is nearly transparent (3DGS-MCMC). With mcmc there are no clones, splits and resets; max-screen-radius
+    moves Gaussians, from the start."""
+    spread: float = 1.0
+    """With growth mcmc: distance of what moves or is added from the mean of the Gaussian that it comes from, in
+    standard deviations, drawn at random; 0 puts it there, as published."""
+    noise_rate: float = 5e5
+    """With growth mcmc: noise added to the means each step, in learning rates of the means, for Gaussians of size 1 in
+    a scene of extent 1; 0 adds none. None is added in the cooldown."""
+    opacity_weight: float = 0.01
+    """With growth mcmc: weight of the mean opacity in the loss, by the Gaussians that the step's view shows."""
+    scale_weight: float = 0.01
+    """With growth mcmc: weight of the mean size in the loss, in parts of the scene's extent, by the Gaussians that the
+    step's view shows."""
     min_contribution: float = 0.0
     """Prune Gaussians that add less than this to every training view of an epoch (a pass through all of them): alpha
     times transmittance, summed over the picture, in pixels. 0 prunes none."""
@@ -136,7 +150,11 @@ class DensityConfig:
             (("dense_fraction",), lambda value: 0 < value <= 1, "more than 0, at most 1"),
             (("split_factor",), lambda value: 1 < value < inf, "a finite number, more than 1"),
             (("min_opacity", "opacity_reset_to"), lambda value: 0 < value < 1, "more than 0, less than 1"),
-            (("max_screen_radius", "min_contribution"), lambda value: 0 <= value < inf, "a finite number, at least 0"),
+            (
+                ("max_screen_radius", "min_contribution", "spread", "noise_rate", "opacity_weight", "scale_weight"),
+                lambda value: 0 <= value < inf,
+                "a finite number, at least 0",
+            ),
             (("max_gaussians", "views_agree"), lambda value: value >= 1, "at least 1"),
             (("prune_fraction",), lambda value: 0 <= value < 1, "at least 0, less than 1"),
         )
@@ -150,9 +168,15 @@ class DensityConfig:
         if self.prune_at and self.prune_fraction == 0:
             steps = ",".join(map(str, self.prune_at))
             raise InputError(f"--density.prune-at {steps}: prunes nothing, expected --density.prune-fraction too")
-        if self.growth == "budget" and self.max_gaussians == DensityConfig.max_gaussians:
+        if self.growth != "paper" and self.max_gaussians == DensityConfig.max_gaussians:
             raise InputError(
-                "--density.growth budget: expected --density.max-gaussians too, the number of Gaussians to grow to"
+                f"--density.growth {self.growth}: expected --density.max-gaussians too, the number of Gaussians to "
+                "grow to"
+            )
+        if self.growth == "mcmc" and (self.prune_at or self.prune_every):
+            found = "prune-at" if self.prune_at else "prune-every"
+            raise InputError(
+                f"--density.growth mcmc: moves Gaussians and prunes none before the end, expected no --density.{found}"
             )
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clsplat.camera import Camera
+from clsplat.config.exploring import Exploration
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
@@ -141,10 +142,12 @@ def project_grad(
     *,
     fields: SlotFields = PLAIN_SLOTS,
     sh_rest: bool = True,
+    explore: Exploration | None = None,
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` from the pairs' slots,
-    which have `fields`."""
-    defines = _defines(gaussians, slots, fields, sh_rest=sh_rest)
+    which have `fields`; explore: its penalties are added."""
+    weights = _weights(explore)
+    defines = {**_defines(gaussians, slots, fields, sh_rest=sh_rest), **({"PENALTIES": True} if weights else {})}
     n = gaussians.count
     launch_items(
         device,
@@ -154,6 +157,7 @@ def project_grad(
         *(model[group] for model in (gaussians, gradients) for group in GROUPS),
         screen.gradients,
         *([screen.contributions] if fields.contributions else []),
+        *weights,
     )
 
 
@@ -171,6 +175,7 @@ def project_step(
     readback: DeviceArray,
     *,
     fields: SlotFields = PLAIN_SLOTS,
+    explore: Exploration | None = None,
 ) -> None:
     """`project_grad` and with it `stages.adam.adam`, of the model (parameters, first and second moments), and no
     gradients in memory. Arguments are those of the two."""
@@ -179,6 +184,8 @@ def project_step(
     defines = {**_defines(parameters, slots, fields, sh_rest=sh_rest), "ADAM": True}
     if config.sparse:
         defines["SPARSE"] = True
+    if weights := _weights(explore):
+        defines["PENALTIES"] = True
     by_group = {
         group: (0.0, 0.0) if group == "sh_rest" and not sh_rest else corrected(config, step, group, rates[group])
         for group in GROUPS
@@ -187,6 +194,7 @@ def project_step(
         *_inputs(parameters, camera_array, projected, slots),
         screen.gradients,
         *([screen.contributions] if fields.contributions else []),
+        *weights,
         *(config.beta1, config.beta2, config.epsilon),
         *(by_group["means"][1], by_group["sh_rest"][1]),
         *(rate for rate, _ in by_group.values()),
@@ -200,6 +208,11 @@ def project_step(
     else:
         kernel = device.kernels("project_grad", ROWS=LOCAL, **defines).project_step
         launch_items(device, kernel, parameters.count, *arguments)
+
+
+def _weights(explore: Exploration | None) -> tuple[float, ...]:
+    """Weights of the penalties on opacity and scale, none where there are none."""
+    return (explore.opacity, explore.scale) if explore is not None and explore.penalised else ()
 
 
 def _defines(gaussians: DeviceGaussians, slots: Slots, fields: SlotFields, *, sh_rest: bool) -> dict[str, object]:

@@ -34,6 +34,7 @@ from clsplat.stages.device_gaussians import (
     parts,
 )
 from clsplat.stages.loss import Loss
+from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen
 from clsplat.training.photographs import Photographs
 from clsplat.training.step import GradientStep, Sample, StepProbe, StepRows, ViewRows
@@ -91,6 +92,8 @@ class _AddedView(GradientStep):
         if self.device.only_tries:
             models, counts = (parameters, sums, rows.gradients, rows.gradients), rows.projected.tile_counts
             adam(self.device, self.step, self.rates, self.config.optimiser, *models, counts, self.rasterizer.readback)
+            if self.explore is not None:
+                noise(self.device, self.explore, parameters, 0, self.rasterizer.readback)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +180,7 @@ class Replica:
         settings = (self.device, self.rasterizer, step.config, step.step, step.rates, step.fields)
         room = _gradients(self.rasterizer.work, parameters)
         pixels = (photograph, sample.camera, sample.background)
-        result = _RemoteView(*settings, arrays, gradients).run(
+        result = _RemoteView(*settings, arrays, gradients, explore=step.explore).run(
             (parameters,), *pixels, StepProbe(), room, reads_loss=True
         )
         return Outcome(arrays, gradients, result)
@@ -240,7 +243,10 @@ class Batch:
         optimiser, number = scaled(self.config.optimiser, batch), -(-step.step // batch)
         config, rates = replace(self.config, optimiser=optimiser), scaled_rates(step.rates, batch)
         sums, shown = self._room_for(device, model[0])
-        step_of_view = _AddedView(device, self.rasterizer, config, number, rates, step.fields, shown)
+        explore = step.explore
+        step_of_view = _AddedView(
+            device, self.rasterizer, config, number, rates, step.fields, shown, explore=explore and explore.of_view()
+        )
         first, *others = shares(len(samples), 1 + len(self.replicas))
         transfers = self._send(model[0])
         pending: list[tuple[int, Future[Outcome]]] = []
@@ -262,6 +268,8 @@ class Batch:
             counts = self.rasterizer.readback if shown is None else shown.rows(start, stop)
             models = (parameters, gradients, moments, squares)
             adam(device, number, rates, optimiser, *models, counts, self.rasterizer.readback)
+            if explore is not None:
+                noise(device, explore.scaled(sqrt(batch)), parameters, start, self.rasterizer.readback)
         self._sent = None if updates_sh_rest(optimiser, number) else model[0]
         return Losses(tuple(losses))
 

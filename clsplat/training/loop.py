@@ -309,6 +309,7 @@ class Session:
             if written and isinstance(error, DriverError):
                 raise DriverError(f"{error}{written}") from error
             raise
+        trainer.finish()
         model = trainer.gaussians()
         if run is not None:
             run.save_model(model, photos_space(view.path for view in trainer.scene.views))

@@ -45,7 +45,7 @@ from clsplat.stages.device_gaussians import (
 )
 from clsplat.stages.loss import Loss
 from clsplat.stages.project import Slots
-from clsplat.training.density.adaptive import Adaptive
+from clsplat.training.density.choice import strategy_of
 from clsplat.training.health import Incident, finite_or_zero
 from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
 
@@ -200,7 +200,7 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     parameters, first, second = (to_device(device, bundle.models[kind]) for kind in _KINDS)
     gradients = allocate_gaussians(device, parameters.count, parameters.coefficients, zero=True)
     probe.counts["parameters"] = _wrong_in(parameters)
-    fields = slot_fields(Adaptive(config).needs(record["step"]))
+    fields = slot_fields(strategy_of(config).needs(record["step"]))
     step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
     pixels = (bundle.photograph, bundle.camera, bundle.background)
     step.run((parameters, first, second), *pixels, probe, gradients)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.config.exploring import Exploration
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
@@ -19,6 +20,7 @@ from clsplat.rendering.rasterizer import Frame, Rasterizer, Room
 from clsplat.stages.adam import adam, updates_sh_rest
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 from clsplat.stages.loss import Loss, loss
+from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen, Slots, project_grad, project_step
 from clsplat.stages.target import target
 from clsplat.training.density import StatisticsNeeds
@@ -95,7 +97,8 @@ class StepProbe:
 class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in the memory of a rasterizer.
 
-    fields: the fields of a slot that the step fills; turn: of `loss`; room: of `Rasterizer.forward`.
+    fields: the fields of a slot that the step fills; turn: of `loss`; room: of `Rasterizer.forward`; explore: what the
+    step does beside following the gradient of the loss.
     """
 
     device: Device
@@ -107,6 +110,7 @@ class GradientStep:
     _: KW_ONLY
     turn: int = 0
     room: Room | None = None
+    explore: Exploration | None = None
 
     def run(
         self,
@@ -142,7 +146,7 @@ class GradientStep:
             if gradients is not None:
                 sh_rest = updates_sh_rest(self.config.optimiser, self.step)
                 arrays = (part[0], frame.camera_array, projected, row_slots, gradients, screen)
-                project_grad(rasterizer.device, *arrays, fields=self.fields, sh_rest=sh_rest)
+                project_grad(rasterizer.device, *arrays, fields=self.fields, sh_rest=sh_rest, explore=self.explore)
             probe.before_rows(rows)
             self.update(rows)
             probe.after_rows(rows)
@@ -155,10 +159,12 @@ class GradientStep:
             parameters, first, second = rows.model
             models = (parameters, rows.gradients, first, second)
             adam(self.device, self.step, self.rates, optimiser, *models, rows.projected.tile_counts, readback)
-            return
-        view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-        device = self.rasterizer.device
-        project_step(device, self.step, self.rates, optimiser, rows.model, *view, fields=self.fields)
+        else:
+            view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
+            device, fields, explore = self.rasterizer.device, self.fields, self.explore
+            project_step(device, self.step, self.rates, optimiser, rows.model, *view, fields=fields, explore=explore)
+        if self.explore is not None:
+            noise(self.device, self.explore, rows.parameters, rows.start, readback)
 
 
 def slot_fields(needs: StatisticsNeeds) -> SlotFields:

@@ -51,7 +51,7 @@ from clsplat.stages.device_gaussians import (
 from clsplat.stages.loss import Loss
 from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
 from clsplat.training.density import HALVED, ModelState, RowPlan, Strategy
-from clsplat.training.density.adaptive import Adaptive
+from clsplat.training.density.choice import strategy_of
 from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.pending import Pending
@@ -90,7 +90,7 @@ class Trainer:
         config: TrainConfig,
         device: Device,
         initial: Gaussians | None = None,
-        strategy: Callable[[TrainConfig], Strategy] = Adaptive,
+        strategy: Callable[[TrainConfig], Strategy] = strategy_of,
         further: Sequence[Device] = (),
     ) -> None:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
@@ -214,7 +214,10 @@ class Trainer:
             self.sampling.renew(self.parameters)  # to no other effect if done again
         samples = [self._sample() for _ in range(views)]
         needs = self.strategy.needs(self.step)
-        exact = GradientStep(self.device, self.rasterizer, self.config, self.step, self.rates(), slot_fields(needs))
+        rates, count = self.rates(), self.parameters.count
+        explore = self.strategy.exploration(self.step, rates["means"], count, self.scene.extent)
+        settings = (self.device, self.rasterizer, self.config)
+        exact = GradientStep(*settings, self.step, rates, slot_fields(needs), explore=explore)
         factor, number = self.sizes.factor(self.step), self.step
 
         def run(turn: int, room: Room | None) -> Loss:
@@ -390,6 +393,11 @@ class Trainer:
             self.second[group].fill(0.0)
         if plan.forget_contributions:
             self.statistics.forget_contributions()
+
+    def finish(self) -> None:
+        """Take away what a finished model has no use for."""
+        self.settle()
+        self._rearrange(self.strategy.at_end(self._state()))
 
     def _halve(self, listed: RowList, halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]]) -> None:
         """Make the last rows, copies yet of what is split, the halves of that."""

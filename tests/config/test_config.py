@@ -48,7 +48,11 @@ OUT_OF_RANGE = {
     "--density.prune-every": ("-1",),
     "--density.prune-at": ("0", "-5", "9,5", "5,5", "3000"),
     "--density.prune-fraction": ("-0.1", "1", "nan", "0.5"),
-    "--density.growth": ("budget",),
+    "--density.growth": ("budget", "mcmc"),
+    "--density.spread": ("-1", "nan", "inf"),
+    "--density.noise-rate": ("-1", "nan", "inf"),
+    "--density.opacity-weight": ("-1", "nan", "inf"),
+    "--density.scale-weight": ("-1", "nan", "inf"),
 }
 
 

@@ -14,6 +14,7 @@ from pipeline import BACKGROUND
 from quick import quick
 
 from clsplat.camera import Camera
+from clsplat.config.exploring import Exploration
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
@@ -37,6 +38,7 @@ class Case:
     fields: SlotFields = PLAIN_SLOTS
     added_up: bool = False
     step: int = 5
+    explore: Exploration | None = None
 
 
 CASES = {
@@ -49,6 +51,13 @@ CASES = {
     "the higher SH bands' second step, sparse": Case(optimiser=OptimiserConfig(sparse=True, sh_rest_every=3), step=6),
     "all fields of slots": Case(degree=1, fields=WIDEST_SLOTS),
     "several bands": Case(degree=1, added_up=True),
+    "penalties": Case(explore=Exploration(opacity=0.2, scale=0.3)),
+    "penalties, all fields of slots, sparse": Case(
+        degree=1,
+        optimiser=OptimiserConfig(sparse=True),
+        fields=WIDEST_SLOTS,
+        explore=Exploration(opacity=0.2),
+    ),
 }
 
 
@@ -120,12 +129,13 @@ def after_step(
     if fused:
         step = (case.step, RATES, case.optimiser)
         view = (camera_array, projected, slots, screen)
-        project_step(device, *step, model, *view, readback, fields=case.fields)
+        project_step(device, *step, model, *view, readback, fields=case.fields, explore=case.explore)
     else:
         gradients = allocate_gaussians(device, count, coefficients, zero=True)
         sh_rest = updates_sh_rest(case.optimiser, case.step)
         view = (camera_array, projected, slots)
-        project_grad(device, parameters, *view, gradients, screen, fields=case.fields, sh_rest=sh_rest)
+        also = {"fields": case.fields, "sh_rest": sh_rest, "explore": case.explore}
+        project_grad(device, parameters, *view, gradients, screen, **also)
         models = (parameters, gradients, first, second)
         adam(device, case.step, RATES, case.optimiser, *models, projected.tile_counts, readback)
     view_arrays = {"screen": screen.gradients.get(), "counts": readback.get()}

@@ -83,6 +83,14 @@ EVERYTHING = short(
 """Growth of every array, contributions and agreement, two SH degrees, an opacity reset."""
 
 
+EXPLORING = short(
+    iterations=24,
+    warmup=(2, 4),
+    sh_degree_every=8,
+    density={"start": 5, "every": 4, "growth": "mcmc", "max_gaussians": 150, "max_screen_radius": 20.0},
+)
+"""Moves, growth, penalties and noise."""
+
 MANY = short(
     iterations=32,
     random_points=400,
@@ -92,13 +100,13 @@ MANY = short(
 
 
 @pytest.mark.parametrize("word", quick(["NaN", "garbage"], "NaN"))
-@pytest.mark.parametrize("how", quick(["at once", "in pieces", "in vectors of 1"], "at once"))
+@pytest.mark.parametrize("how", quick(["at once", "mcmc", "in pieces", "in vectors of 1"], "at once", "mcmc"))
 def test_training_in_poisoned_memory(
     scene: Scene, many_points: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, word: str, how: str
 ) -> None:
     device = shaped(default_device, 1, 64) if how == "in vectors of 1" else default_device
     pieces = how == "in pieces"
-    config = MANY if pieces else EVERYTHING
+    config = MANY if pieces else EXPLORING if how == "mcmc" else EVERYTHING
     found = []
     for value in ("", WORDS[word]):
         monkeypatch.setenv("CLSPLAT_POISON", value)

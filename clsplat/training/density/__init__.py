@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.config.exploring import Exploration
 from clsplat.config.marking import MarkRules
 
 
@@ -119,6 +120,14 @@ class Strategy:
 
     def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002  # most have none
         """The plan at the end of step number `model.step`, behind Adam's."""
+        return None
+
+    def exploration(self, step: int, means_rate: float, count: int, extent: float) -> Exploration | None:  # noqa: ARG002
+        """Penalties and noise of step number `step`, of `count` Gaussians; means_rate, extent: world units."""
+        return None
+
+    def at_end(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002
+        """The plan for a model whose training is over."""
         return None
 
     def rearranged(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]) -> None:

@@ -10,7 +10,7 @@ from math import inf
 
 import numpy as np
 
-from clsplat.arrays import Float32
+from clsplat.arrays import Float32, Float64
 from clsplat.config.marking import MarkRules, edge
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
@@ -170,14 +170,20 @@ def split_halves(
     config: DensityConfig, *, means: Float32, quaternions: Float32, log_scales: Float32, rng: np.random.Generator
 ) -> tuple[Float32, Float32]:
     """Means and log scales of halves: drawn from the Gaussian they come from, and smaller. (m, 3), (m, 4), (m, 3)."""
-    offsets = rng.standard_normal(means.shape) * np.exp(log_scales.astype(np.float64))
+    offsets = draw_offsets(quaternions, log_scales, rng)
+    smaller = log_scales - np.float32(np.log(config.split_factor))
+    return (means + offsets).astype(np.float32), smaller.astype(np.float32)
+
+
+def draw_offsets(quaternions: Float32 | Float64, log_scales: Float32 | Float64, rng: np.random.Generator) -> Float64:
+    """Places drawn from Gaussians (m,), from their means: (m, 3); quaternions (m, 4), log scales (m, 3)."""
+    offsets = rng.standard_normal(log_scales.shape) * np.exp(log_scales.astype(np.float64))
     q = quaternions.astype(np.float64)
     q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # of length 0, which is not drawn: no rotation
     w, axis = q[:, :1], q[:, 1:]
     twice = 2 * np.cross(axis, offsets)
-    rotated = offsets + w * twice + np.cross(axis, twice)
-    smaller = log_scales - np.float32(np.log(config.split_factor))
-    return (means + rotated).astype(np.float32), smaller.astype(np.float32)
+    rotated: Float64 = offsets + w * twice + np.cross(axis, twice)
+    return rotated
 
 
 def reset_opacities(config: DensityConfig, opacity_logits: Float32) -> Float32:

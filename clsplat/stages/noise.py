@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches noise.cl, which moves the means of Gaussians that are nearly transparent."""
+
+from __future__ import annotations
+
+from math import inf, log
+
+import numpy as np
+
+from clsplat.config.exploring import Exploration
+from clsplat.device.buffers import DeviceArray
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_items
+from clsplat.device.profile import stage
+from clsplat.gaussians import GROUPS
+from clsplat.stages.device_gaussians import DeviceGaussians
+
+REACH = 0.16
+"""Opacity over that of the dead from which on no noise is added: there it is less than 1.2e-7 of what the dead get."""
+
+
+def highest_logit(dead: float) -> float:
+    """Logit of the opacity from which on no noise is added."""
+    highest = dead + REACH
+    return log(highest / (1 - highest)) if highest < 1 else inf
+
+
+@stage("noise")
+def noise(
+    device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
+) -> None:
+    """Add a step's noise to the means of these Gaussians, of which the first is `first_row` of the model; none after a
+    pass that has stopped, by `readback`."""
+    if explore.amount == 0:
+        return
+    highest, limit2 = min(highest_logit(explore.dead), 1e30), GROUPS["means"].limit ** 2
+    launch_items(
+        device,
+        device.kernels("noise", LANES=1).add_noise,
+        gaussians.count,
+        gaussians.count,
+        np.uint32(first_row),
+        *(np.uint32(word) for word in explore.key),
+        *(explore.amount, explore.dead, highest, limit2),
+        readback.buffer,
+        *(gaussians[group] for group in ("quaternions", "log_scales", "opacity_logits", "means")),
+    )

@@ -1,0 +1,67 @@
+// Noise on the means of Gaussians that are nearly transparent, along their own ellipsoids: what is not seen has no
+// gradient to find its place by.
+//
+// Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
+// Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
+// Buffers: quaternions (n, 4), log_scales (n, 3), opacity_logits (n) -> means (n, 3), world units. first_row: the first
+//   one's in the model; key0, key1: the step's; amount: 1 over world units; dead: opacity; highest: the logit from
+//   which on a mean stays; readback (READBACK_SIZE). After a pass that has stopped (duplicate.cl) nothing changes.
+// Equations: docs/gradients.md, (92) and (93).
+#include "shared/math.h"
+#include "shared/lanes.h"
+#include "shared/elementary.h"
+
+// Mixes a word so that each bit of it sways half of the result's; no two words have one result.
+static inline uint mixed(uint x) {
+  x = (x ^ (x >> 16)) * 0x7feb352du;
+  x = (x ^ (x >> 15)) * 0x846ca68bu;
+  return x ^ (x >> 16);
+}
+
+#define HALVES 8              // uniform numbers of 16 bits in a sum
+#define WORDS (HALVES / 2)    // with two in each
+#define SPREAD 1.86881232e-5f // one over the standard deviation of the sum, sqrt(HALVES (2^32 - 1)/12)
+
+// Number `index` of those of a row: (93). Its sum is a whole number under 2^23, so that it is rounded once.
+static inline float normal(uint row_word, uint index) {
+  int sum = -(HALVES * 65535) / 2;
+  for (uint k = 0; k < WORDS; ++k) {
+    const uint word = mixed(row_word + 0x9e3779b9u * (WORDS * index + k));
+    sum += (int)(word & 0xffffu) + (int)(word >> 16);
+  }
+  return SPREAD * (float)sum;
+}
+
+__kernel void add_noise(const uint n, const uint first_row, const uint key0, const uint key1, const float amount,
+                        const float dead, const float highest, const float limit2, __global const uint *readback,
+                        __global const float *quaternions, __global const float *log_scales,
+                        __global const float *opacity_logits, __global float *means) {
+  const uint i = get_global_id(0);
+  if (i >= n || readback[READBACK_STOPPED]) return;
+  const float logit = opacity_logits[i];
+  if (!(logit < highest)) return;
+  const uint row_word = mixed((first_row + i) ^ key0) + key1;
+  const float e0 = normal(row_word, 0), e1 = normal(row_word, 1), e2 = normal(row_word, 2);
+  const float by = amount * sigmoidL(100.0f * (dead - sigmoidL(logit)));
+
+  // A column of the rotation after the other: the axis, times the variance along it, times what eta has of it.
+  __global const float *q = quaternions + 4 * (size_t)i;
+  __global const float *l = log_scales + 3 * (size_t)i;
+  __global float *mean = means + 3 * (size_t)i;
+  const float length2 = fma1(q[0], q[0], fma1(q[1], q[1], fma1(q[2], q[2], q[3] * q[3])));
+  if (!(length2 > 1e-30f && length2 < 1e30f)) return;
+  const float length = sqrt(length2);
+  const float w = q[0] / length, x = q[1] / length, y = q[2] / length, z = q[3] / length;
+  const float axes[3][3] = {{1.0f - 2.0f * fma1(y, y, z * z), 2.0f * fma1(x, y, w * z), 2.0f * fma1(x, z, -(w * y))},
+                            {2.0f * fma1(x, y, -(w * z)), 1.0f - 2.0f * fma1(x, x, z * z), 2.0f * fma1(y, z, w * x)},
+                            {2.0f * fma1(x, z, w * y), 2.0f * fma1(y, z, -(w * x)), 1.0f - 2.0f * fma1(x, x, y * y)}};
+  float moved[3] = {mean[0], mean[1], mean[2]};
+  for (int k = 0; k < 3; ++k) {
+    const float s = expL(l[k]);
+    const float along = fma1(axes[k][0], e0, fma1(axes[k][1], e1, axes[k][2] * e2)) * s * s * by;
+    for (int j = 0; j < 3; ++j) moved[j] = fma1(axes[k][j], along, moved[j]);
+  }
+  // As Adam, it leaves no mean that is not finite.
+  if (!(moved[0] * moved[0] < limit2 && moved[1] * moved[1] < limit2 && moved[2] * moved[2] < limit2)) return;
+  for (int j = 0; j < 3; ++j) mean[j] = moved[j];
+}

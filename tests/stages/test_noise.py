@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""noise.cl against its float64 twin, its bits in every shape, the statistics of its numbers; penalties, (91)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+from compare import assert_close, assert_same_bits
+from numpy.typing import NDArray
+
+from clsplat.config.exploring import Exploration, step_key
+from clsplat.device.buffers import DeviceArray, upload
+from clsplat.device.context import Device
+from clsplat.device.layout import READBACK
+from clsplat.gaussians import GROUPS, Gaussians
+from clsplat.reference.noise import displacements, normal_numbers, penalty, penalty_grad
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
+from clsplat.stages.noise import REACH, highest_logit, noise
+from clsplat.stages.project import Screen, Slots, project_grad
+
+LOUD = Exploration(amount=40.0, key=step_key(7, 123))
+
+
+def counts(device: Device) -> DeviceArray:
+    return upload(device, np.zeros(len(READBACK), np.uint32))
+
+
+def faint(count: int) -> Gaussians:
+    """Gaussians about the opacity of the dead, with means at the origin, so that no digits of the noise are lost."""
+    gaussians, _ = scenes.random_cloud(count, 5, 70, 50, degree=0)
+    rng = np.random.default_rng(count)
+    opacities = rng.uniform(1e-4, 0.2, count)
+    gaussians.opacity_logits[:] = np.log(opacities / (1 - opacities))
+    gaussians.means[:] = 0.0
+    return gaussians
+
+
+def moved(device: Device, gaussians: Gaussians, explore: Exploration, first_row: int = 0) -> NDArray[np.float32]:
+    held = upload_gaussians(device, gaussians)
+    noise(device, explore, held, first_row, counts(device))
+    for group in GROUPS:
+        if group not in ("means", "sh_dc", "sh_rest"):
+            assert_same_bits(held[group].get(), getattr(gaussians, GROUPS[group].field), group)
+    return held["means"].get()
+
+
+@pytest.mark.smoke
+def test_numbers_are_nearly_normal() -> None:
+    """Mean 0, variance 1, fourth moment 3 - 6/(5 * 8); no correlation between coordinates, rows and steps."""
+    rows = np.arange(200_000)
+    numbers = [normal_numbers(step_key(3, step), rows) for step in (1, 2)]
+    values, of_error = numbers[0], 5 / np.sqrt(len(rows))
+    assert np.abs(values.mean(axis=0)).max() < of_error
+    assert np.abs((values**2).mean(axis=0) - 1).max() < of_error * np.sqrt(2)
+    assert np.abs((values**4).mean(axis=0) - 2.85).max() < of_error * np.sqrt(90)
+    assert np.abs(values).max() < np.sqrt(24)
+    products = [values[:, 0] * values[:, 1], values[:, 1] * values[:, 2], values[:, 0] * values[:, 2]]
+    products += [(values[1:] * values[:-1]).ravel(), (numbers[0] * numbers[1]).ravel()]
+    for product in products:
+        assert abs(product.mean()) < of_error
+
+
+@pytest.mark.parametrize("count", [1, 7, 64, 65, 203])
+def test_noise_is_the_twins(shaped_device: Device, count: int) -> None:
+    gaussians = faint(count)
+    got = moved(shaped_device, gaussians, LOUD)
+    arrays = (gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits)
+    wanted = displacements(LOUD, *(array.astype(np.float64) for array in arrays))
+    stays = gaussians.opacity_logits >= highest_logit(LOUD.dead)
+    assert not got[stays].any()
+    # of 100 (o - dead), up to 16, a digit of o is 1e-6 of the weight
+    assert_close(got[~stays], wanted[~stays], relative=1e-4, absolute=1e-5 * float(np.abs(wanted).max(initial=0)))
+    error = np.linalg.norm(got - wanted) / np.linalg.norm(wanted)
+    assert error < 5e-6, error
+
+
+def test_every_driver_and_shape_has_the_same_bits(shaped_device: Device, default_device: Device) -> None:
+    gaussians, _ = scenes.random_cloud(500, 9, 70, 50, degree=0)
+    gaussians.opacity_logits -= 4
+    assert_same_bits(moved(shaped_device, gaussians, LOUD), moved(default_device, gaussians, LOUD), "means")
+
+
+def test_pieces_and_steps(device: Device) -> None:
+    """A piece of the rows has the bits that these have in the whole; another step has others."""
+    gaussians = faint(90)
+    whole = moved(device, gaussians, LOUD)
+    part = Gaussians(*(array[30:] for array in gaussians.arrays().values()))
+    assert_same_bits(moved(device, part, LOUD, 30), whole[30:], "means")
+    other = moved(device, gaussians, Exploration(amount=40.0, key=step_key(7, 124)))
+    assert (other != whole).any(axis=1).mean() > 0.7
+
+
+def test_what_stays(device: Device) -> None:
+    """The opaque, what has no rotation or a size beyond all bounds, and everything after a pass that has stopped."""
+    gaussians = faint(40)
+    gaussians.opacity_logits[:] = -6
+    gaussians.means[:] = 1.0
+    opaque = LOUD.dead + 1.01 * REACH
+    gaussians.opacity_logits[0] = np.log(opaque / (1 - opaque))
+    gaussians.quaternions[1] = 0
+    gaussians.log_scales[2] = 80
+    gaussians.log_scales[3, 0] = np.inf
+    gaussians.opacity_logits[4] = np.nan
+    gaussians.quaternions[5] = np.nan
+    got = moved(device, gaussians, LOUD)
+    assert_same_bits(got[:6], gaussians.means[:6], "means")
+    assert (got[6:] != 1).any(axis=1).all()
+    held, stopped = upload_gaussians(device, gaussians), counts(device)
+    values = stopped.get()
+    values[READBACK.index("STOPPED")] = 1
+    stopped.set(values)
+    noise(device, LOUD, held, 0, stopped)
+    assert_same_bits(held["means"].get(), gaussians.means, "means")
+
+
+def test_the_twins_penalty_by_finite_differences() -> None:
+    explore, rng = Exploration(opacity=0.3, scale=0.7), np.random.default_rng(1)
+    scales, logits, step = rng.normal(-2, 1, (9, 3)), rng.normal(0, 3, 9), 1e-6
+    by_scales, by_logits = penalty_grad(explore, scales, logits)
+    for index in np.ndindex(scales.shape):
+        change = np.zeros(scales.shape)
+        change[index] = step
+        difference = penalty(explore, scales + change, logits) - penalty(explore, scales - change, logits)
+        assert difference / (2 * step) == pytest.approx(by_scales[index], rel=1e-6, abs=1e-9)
+    for row in range(len(logits)):
+        change = np.zeros(len(logits))
+        change[row] = step
+        difference = penalty(explore, scales, logits + change) - penalty(explore, scales, logits - change)
+        assert difference / (2 * step) == pytest.approx(by_logits[row], rel=1e-6, abs=1e-9)
+
+
+def test_penalties_are_added_in_view(shaped_device: Device) -> None:
+    """The gradient with penalties of a loss that is 0: the twin's in view, nothing elsewhere."""
+    count, explore = 203, Exploration(opacity=0.3, scale=0.7)
+    gaussians, camera = scenes.random_cloud(count, 11, 70, 50, degree=1)
+    gaussians.means[50:90] -= 100 * camera.rotation[2].astype(np.float32)
+    held = upload_gaussians(shaped_device, gaussians)
+    frame = Rasterizer(shaped_device).forward(held, camera, upload(shaped_device, np.zeros(3, np.float32)))
+    visible = frame.projected.tile_counts.get() > 0
+    assert 20 < visible.sum() < count - 30
+    assert frame.part.counted.first_slots is not None
+    slots = upload(shaped_device, np.zeros((frame.part.counted.pairs, 9), np.float32))
+    gradients = allocate_gaussians(shaped_device, count, held.coefficients, zero=True)
+    screen = Screen(upload(shaped_device, np.zeros((count, 2), np.float32)))
+    view = (frame.camera_array, frame.projected, Slots(slots, frame.part.counted.first_slots))
+    project_grad(shaped_device, held, *view, gradients, screen, explore=explore)
+    by_scales, by_logits = penalty_grad(
+        explore, gaussians.log_scales.astype(np.float64), gaussians.opacity_logits.astype(np.float64)
+    )
+    for group, wanted in (("log_scales", by_scales), ("opacity_logits", by_logits)):
+        got = gradients[group].get()
+        assert np.linalg.norm(got[visible] - wanted[visible]) <= 1e-6 * np.linalg.norm(wanted[visible]), group
+        assert not got[~visible].any()
+    for group in ("means", "quaternions", "sh_dc", "sh_rest"):
+        assert not gradients[group].get().any(), group

@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Density control as sampling: who moves where, and that it repeats to the last byte however training is done."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import comb
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compare import assert_same_bits
+from test_trainer import model_bytes
+from tiny import short, write_scene
+
+from clsplat.api import train
+from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import ClsplatError
+from clsplat.gaussians import GROUPS
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.density.mcmc import MOST, Mcmc, draw, shared, wanted
+from clsplat.training.pending import VARIABLE
+from clsplat.training.trainer import Trainer
+
+GROWN = 150
+CONFIG = short(
+    iterations=48,
+    density={"growth": "mcmc", "max_gaussians": GROWN, "min_opacity": 0.03, "max_screen_radius": 30.0},
+)
+"""Gaussians move and are added after steps 15, 20, ... 35, and there is noise in all steps."""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return model_bytes(scene, CONFIG, default_device, tmp_path_factory.mktemp("undisturbed"))
+
+
+# The policy
+
+
+@pytest.mark.parametrize("opacity", [0.006, 0.1, 0.5, 0.99, 1 - 1e-7])
+@pytest.mark.parametrize("number", [1, 2, 3, 10, MOST])
+def test_shares_of_opacity_and_scale(opacity: float, number: int) -> None:
+    """The published double sum, and as much of the light that passes."""
+    parts, by = shared(np.array([opacity]), np.array([number]), 1e-9)
+    assert (1 - parts[0]) ** number == pytest.approx(1 - opacity, rel=1e-6)
+    double = sum(
+        comb(i - 1, k) * (-1) ** k * parts[0] ** (k + 1) / np.sqrt(k + 1)
+        for i in range(1, number + 1)
+        for k in range(i)
+    )
+    assert np.exp(by[0]) == pytest.approx(opacity / double, rel=1e-9)
+
+
+def test_draws_follow_the_weights() -> None:
+    weights = np.array([0.0, 1.0, 0.0, 3.0, 4.0, 0.0])
+    found = np.bincount(draw(weights, 80_000, np.random.default_rng(2)), minlength=6) / 10_000
+    assert not found[weights == 0].any()
+    np.testing.assert_allclose(found, weights, atol=0.1)
+
+
+def test_growth_reaches_the_cap_halfway() -> None:
+    config = DensityConfig(growth="mcmc", max_gaussians=9000, start=500, stop=2500, every=100)
+    count, counts = 1000, {}
+    for step in range(600, 2500, 100):
+        count = counts[step] = wanted(config, step, count)
+    assert counts[600] < 1250
+    assert counts[1500] == counts[2400] == 9000
+    assert wanted(config, 600, 9500) == 9500
+    assert wanted(replace(config, max_gaussians=1040), 600, 1000) == 1040
+    assert wanted(replace(config, max_gaussians=1060), 600, 1000) == 1050, "a twentieth, where that is enough"
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.5])
+def test_the_dead_move_and_some_are_added(scene: Scene, default_device: Device, spread: float) -> None:
+    config = replace(CONFIG, density=replace(CONFIG.density, spread=spread))
+    trainer = Trainer(scene, config, default_device)
+    for _ in range(15):
+        trainer.train_step()
+    count = trainer.parameters.count
+    logits = trainer.parameters["opacity_logits"].get()
+    logits[:4], logits[4:] = -6.0, np.maximum(logits[4:], -2.0)
+    trainer.parameters["opacity_logits"].set(logits)
+    trainer.statistics.radii.fill(0.0)
+    radii = trainer.statistics.radii.get()
+    radii[7] = 31.0
+    trainer.statistics.radii.set(radii)
+    before = {kind: {g: model[g].get() for g in GROUPS} for kind, model in trainer.models().items()}
+    plan = trainer.strategy.before_step(trainer._state())
+    trainer._rearrange(plan)
+    after = {kind: {g: model[g].get() for g in GROUPS} for kind, model in trainer.models().items()}
+    assert plan.rows is not None
+    assert plan.fresh is not None
+    assert count < len(plan.rows) == trainer.parameters.count <= GROWN
+    gone = np.array([0, 1, 2, 3, 7])
+    stay = np.setdiff1d(np.arange(count), gone)
+    assert plan.fresh[gone].all()
+    assert plan.fresh[count:].all()
+    assert not np.isin(plan.rows, gone).any()
+    assert_same_bits(plan.rows[stay], stay.astype(np.uint32), "rows")
+    for group in ("quaternions", "sh_dc", "sh_rest"):
+        assert_same_bits(after["parameters"][group], before["parameters"][group][plan.rows], group)
+    new = np.concatenate([gone, np.arange(count, len(plan.rows))])
+    offsets = after["parameters"]["means"] - before["parameters"]["means"][plan.rows]
+    assert not np.delete(offsets, new, axis=0).any()
+    away = np.linalg.norm(offsets[new], axis=1) / np.exp(after["parameters"]["log_scales"][new].max(axis=1))
+    assert away.any() == (spread > 0)
+    assert away.max() < 4.5 * spread + 1e-9
+    for kind in ("first", "second"):
+        assert not any(after[kind][group][plan.fresh].any() for group in GROUPS)
+        for group in GROUPS:
+            same = np.flatnonzero(~plan.fresh)
+            assert_same_bits(after[kind][group][same], before[kind][group][same], group)
+    opacity = 1 / (1 + np.exp(-after["parameters"]["opacity_logits"].astype(np.float64)))
+    old = 1 / (1 + np.exp(-before["parameters"]["opacity_logits"].astype(np.float64)))
+    assert not trainer.statistics.radii.get().any()
+    for parent in np.unique(plan.rows[plan.fresh]):
+        shares = opacity[plan.rows == parent]
+        # all that shares a place lets as much light pass as the one did
+        assert np.prod(1 - shares) == pytest.approx(1 - old[parent], rel=1e-5)
+
+
+def test_nothing_alive_stops_it(scene: Scene, default_device: Device) -> None:
+    trainer = Trainer(scene, CONFIG, default_device)
+    trainer.parameters["opacity_logits"].fill(-9.0)
+    with pytest.raises(ClsplatError, match=r"every Gaussian is under --density\.min-opacity 0\.03"):
+        trainer.strategy.before_step(trainer._state(15))
+
+
+def test_no_noise_in_the_cooldown_and_none_in_other_units() -> None:
+    config = replace(CONFIG, optimiser=OptimiserConfig(cooldown=8))
+    strategy = Mcmc(config)
+    amounts = {step: strategy.exploration(step, 2e-3, 100, 5.0).amount for step in (1, 40, 41, 48)}
+    assert amounts == {1: 5e5 * 2e-3 / 25, 40: 5e5 * 2e-3 / 25, 41: 0.0, 48: 0.0}
+    assert strategy.exploration(1, 2e-3, 100, 5.0).key != strategy.exploration(2, 2e-3, 100, 5.0).key
+    larger = strategy.exploration(1, 20e-3, 100, 50.0)
+    assert larger.amount * 10**2 == pytest.approx(10 * amounts[1]), "ten times as far where all is ten times as large"
+    assert larger.scale * 10 == pytest.approx(strategy.exploration(1, 2e-3, 100, 5.0).scale)
+
+
+# Training
+
+
+def test_it_grows_learns_and_leaves_nothing_undrawn(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    config = replace(CONFIG, iterations=120, density=replace(CONFIG.density, min_opacity=0.005, opacity_weight=3.0))
+    counts: list[int] = []
+    run = Run.create(tmp_path / "run", config)
+    model = train(scene, config, device=default_device, run=run, on_step=lambda report: counts.append(report.gaussians))
+    assert counts[-1] == GROWN
+    assert len(model) <= GROWN
+    assert (1 / (1 + np.exp(-model.opacity_logits.astype(np.float64))) > 1 / 255).all()
+    trainer = Trainer(scene, config, default_device)
+    trainer.parameters["opacity_logits"].set(np.linspace(-9, 3, trainer.parameters.count, dtype=np.float32))
+    trainer.finish()
+    kept = trainer.gaussians().opacity_logits
+    assert 0 < len(kept) < len(scene.points)
+    assert kept.min() > -5.54
+
+
+@pytest.mark.parametrize("step", [7, 15, 16, 20, 40])
+def test_stopping_and_going_on_gives_the_same_bytes(
+    step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
+) -> None:
+    model_bytes(scene, replace(CONFIG, iterations=step), default_device, tmp_path / "run")
+    run = Run.create(tmp_path / "run", CONFIG, resume=True)
+    train(scene, CONFIG, device=default_device, run=run, resume=True)
+    assert run.model_path.read_bytes() == undisturbed
+
+
+@pytest.mark.parametrize("share", [0.6, 0.3])
+def test_in_less_memory_the_same_bytes(share: float, default_device: Device, tmp_path: Path) -> None:
+    scene = load_scene(write_scene(tmp_path / "scene", points=False))
+    many = replace(CONFIG, random_points=400, density=replace(CONFIG.density, max_gaussians=2500))
+    free = default_device.with_memory_limit(None)
+    whole = model_bytes(scene, many, free, tmp_path / "free")
+    device = default_device.with_memory_limit(int(share * free.memory.peak))
+    run, pieces = Run.create(tmp_path / "limited", many), []
+    train(scene, many, device=device, run=run, on_plan=lambda plan: pieces.append(plan.pieces))
+    assert run.model_path.read_bytes() == whole
+    assert any(streamed for streamed, _ in pieces) or share > 0.5
+
+
+def test_by_capacity_the_same_bytes(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step that has stopped adds no noise, and the one that is made again has its own."""
+    ends = []
+    for capacity in (False, True):
+        monkeypatch.setenv(VARIABLE, "01"[capacity])
+        trainer = Trainer(scene, CONFIG, default_device)
+        real = trainer.pending.room
+        monkeypatch.setattr(
+            trainer.pending,
+            "room",
+            lambda *size, real=real, trainer=trainer: (
+                (room := real(*size)) and (8 if trainer.step in (12, 31) else room)
+            ),
+        )
+        for _ in range(CONFIG.iterations):
+            trainer.train_step()
+        ends.append(trainer.checkpoint()[0])
+        assert (trainer.pending.redone > 0) == capacity
+    for name, values in ends[0].items():
+        assert_same_bits(ends[1][name], values, name)
+
+
+def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:
+    config: TrainConfig = replace(CONFIG, batch=2)
+    models = []
+    for further in ((), (default_device,)):
+        trainer = Trainer(scene, config, default_device, further=further)
+        for _ in range(config.iterations // 2):
+            trainer.train_step()
+        models.append(trainer.gaussians().arrays())
+        trainer.close()
+    for name, values in models[0].items():
+        assert_same_bits(models[1][name], values, name)
+
+
+def test_every_driver_trains_alike(device: Device, default_device: Device, scene: Scene) -> None:
+    """In one shape of the kernels, to the bit."""
+    ends = []
+    for opened in (device, default_device):
+        trainer = Trainer(scene, replace(CONFIG, iterations=24), opened.with_shape(lanes=1, items=1))
+        for _ in range(24):
+            trainer.train_step()
+        ends.append(trainer.gaussians().arrays())
+    for name, values in ends[0].items():
+        assert_same_bits(ends[1][name], values, name)
