@@ -13,6 +13,7 @@ from clsplat.arrays import Float32
 from clsplat.config.masks import MaskUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.images.reading import find_images, image_size, read_image
+from clsplat.images.writing import write_image
 from clsplat.scenes.data_set import PosedImage
 
 FOLDERS = ("masks", "mask")
@@ -140,6 +141,15 @@ def _beside(images: Sequence[PosedImage]) -> dict[str, Path]:
             masks = find_masks(folder, {*names, *others})
             return {names[key]: path for key, path in masks.items() if key in names}
     return {}
+
+
+def stage_mask(path: Path, target: Path, size: tuple[int, int], *, invert: bool) -> None:
+    """Write a mask as black and white, for a photo of this width and height. Raises InputError for another size."""
+    mask = read_mask(path, orient=False, invert=invert)
+    if mask.shape[:2] != size[::-1]:
+        raise _misfit(path, (mask.shape[1], mask.shape[0]), size)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_image(target, np.repeat(mask, 3, axis=2))
 
 
 def _misfit(path: Path, size: tuple[int, int], photo: tuple[int, int]) -> InputError:
