@@ -5,8 +5,8 @@
 // Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's. An item has pixels; with
 //   BY_GAUSSIAN it has one Gaussian after the other.
 // Buffers: blend's, its transmittance and stops, image_gradient (3, height, width): of the loss by colour,
-//   slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE), every one of them: sums over the tile's pixels in blend's
-//   whitened units (49).
+//   with ALPHA_GRADIENT a fourth plane: by what is left for the background; slot_from_sorted (pairs) -> slots (pairs,
+//   SLOT_STRIDE), every one of them: sums over the tile's pixels in blend's whitened units (49).
 // Equations: docs/gradients.md, (14), (22) to (26), (48), (49) and (55).
 //
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
@@ -138,6 +138,13 @@ static inline float row_sum(__local const float *row) {
 }
 #endif
 
+// The gradient by a pixel's transmittance at the end; background: of what is behind.
+#ifdef ALPHA_GRADIENT
+#define AT_END(background) ((background) + by_t)
+#else
+#define AT_END(background) (background)
+#endif
+
 GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
                                __global const uint *gaussian_from_sorted, __global const uint *slot_from_sorted,
                                __global const float *splats, __global const float *background,
@@ -165,7 +172,10 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
       f.y = image_gradient[plane + pixel];
       f.z = image_gradient[2 * plane + pixel];
     }
-    passing[PLACE(x, y)] = (Passing)(t, t * (f.x * background[0] + f.y * background[1] + f.z * background[2]));
+#ifdef ALPHA_GRADIENT
+    const float by_t = stop >= 0 ? image_gradient[3 * plane + pixel] : 0.0f;
+#endif
+    passing[PLACE(x, y)] = (Passing)(t, t * AT_END(f.x * background[0] + f.y * background[1] + f.z * background[2]));
     fixed[PLACE(x, y)] = f;
     last = max(last, stop);
   }
@@ -183,11 +193,19 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
         AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + plane + pixel, stride) & inside);
     const floatL blue =
         AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + 2 * plane + pixel, stride) & inside);
-    const floatL behind = t * (red * background[0] + green * background[1] + blue * background[2]);
+#ifdef ALPHA_GRADIENT
+    const floatL by_t =
+        AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + 3 * plane + pixel, stride) & inside);
+#endif
+    const floatL behind = t * AT_END(red * background[0] + green * background[1] + blue * background[2]);
     const Pixels p = {t, behind, red, green, blue, stop};
     pixels[cell] = p;
     last = max(last, maxL(stop));
+#ifdef ALPHA_GRADIENT
+    if (ANYL((red != 0.0f) | (green != 0.0f) | (blue != 0.0f) | (by_t != 0.0f))) OPEN_CELL(live, cell);
+#else
     if (ANYL((red != 0.0f) | (green != 0.0f) | (blue != 0.0f))) OPEN_CELL(live, cell);
+#endif
   }
 #endif
   RAISE_TO_GROUP_MAX(last)

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from clsplat.cli.options import Flag, OptionalInt, Output, Verb
 from clsplat.cli.session import Services
+from clsplat.config.masks import MaskUse
 from clsplat.errors import InputError
 from clsplat.progress import StageProgress
 
@@ -34,6 +35,11 @@ class Sfm(Verb):
     seed: int = 0
     """Seed of what is random in matching and reconstruction. The same seed gives the same cameras, for up to 80
     photos."""
+    masks: Flag = False
+    """Look for no features under the masks beside the photos (masks/IMAGE.jpg.png and the like), where they are black,
+    and put the masks, undistorted, beside the scene's images."""
+    invert_masks: Flag = False
+    """Take the masks' black parts for those that count, and their white ones for those that do not."""
     overwrite: Flag = False
     """Replace a scene in the output folder that was made of other photos or with other settings."""
     json: Flag = False
@@ -48,6 +54,10 @@ def run(verb: Sfm, services: Services) -> int:
         raise InputError(f"--threads {verb.threads}: expected at least 1")
     names = ("matching", "camera_model", "threads", "seed", "overwrite")
     settings = {name: getattr(verb, name) for name in names}
+    if verb.invert_masks and not verb.masks:
+        raise InputError("--invert-masks: no masks are used, expected --masks too")
+    if verb.masks:
+        settings["masks"] = MaskUse("ignore", invert=verb.invert_masks)
     services.reconstruct(verb.photos, verb.output, **settings, progress=StageProgress())
     if verb.json:
         from clsplat.scenes.sfm import RECORD

@@ -11,6 +11,7 @@ from math import inf
 from typing import Literal
 
 from clsplat.config.checks import Rule, check_kinds, check_rules, check_steps
+from clsplat.config.masks import AlphaMeaning, MaskMeaning, MaskUse
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
@@ -206,6 +207,18 @@ class TrainConfig:
     antialiased: bool = False
     """Train for pictures of any size (Mip-Splatting): a narrower low-pass that leaves a Gaussian its light, and no
     Gaussian smaller than the photographs show. The model is drawn so too, and its file says it."""
+    masks: MaskMeaning = "none"
+    """Meaning of the masks beside the photographs, white where a pixel counts. ignore: what is black is not looked at,
+    such as people; transparent: there is nothing there, such as around a thing on a turntable; none: no masks are
+    used."""
+    invert_masks: bool = False
+    """Take the masks' black parts for those that count, and their white ones for those that do not."""
+    alpha: AlphaMeaning = "blend"
+    """Meaning of the photographs' alpha channels. blend: their colours are laid over the background; ignore and
+    transparent: as of masks."""
+    alpha_weight: float = 0.1
+    """Weight of the alpha loss, the mean absolute difference between the render's alpha and the photograph's, where
+    masks or alpha mean transparent. Training's background is random then, and --background that of evaluations."""
     warmup: tuple[int, ...] = (250, 500)
     """Steps after which the training resolution doubles: with two of them training starts at a quarter of the size,
     with '' at the full size."""
@@ -237,6 +250,7 @@ class TrainConfig:
         rules: tuple[Rule, ...] = (
             (("sh_degree",), lambda value: 0 <= value <= 3, "0 to 3"),
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
+            (("alpha_weight",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
             (
                 ("seed", "frequency_steps", "resolution", "test_every", "checkpoint_every", "stages_every"),
@@ -253,9 +267,26 @@ class TrainConfig:
             raise InputError(
                 f"--eval-at {late}: training ends before that, expected at most --iterations {self.iterations}"
             )
+        if self.invert_masks and self.masks == "none":
+            raise InputError("--invert-masks: no masks are used, expected --masks ignore or --masks transparent too")
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
+
+    @property
+    def mask_use(self) -> MaskUse:
+        """The use of the scene's masks."""
+        return MaskUse(self.masks, self.alpha, self.invert_masks)
+
+    @property
+    def random_background(self) -> bool:
+        """True if each step has a background of its own."""
+        return self.background == "random" or "transparent" in (self.masks, self.alpha)
+
+    @property
+    def alpha_loss(self) -> float:
+        """Weight of the alpha loss, 0 where there is none."""
+        return self.alpha_weight if "transparent" in (self.masks, self.alpha) else 0.0
 
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
         """The settings for `count` devices: a batch of a view for each, unless it is told. Raises InputError for a

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation import metrics
@@ -36,25 +36,29 @@ def evaluate(
     render: gives a view's image (H, W, 3), float, over `background` (3,), at the size of `view.load()`; save_dir: the
     renders go there as PNG in sRGB, under the view's name. space: the colour space of renders and photographs, in
     which they are measured. step, gaussians, seconds are passed through. Without views the
-    mean is empty; lpips_missing says why there is no LPIPS, where there is none. Raises ClsplatError where a render is
+    mean is empty. Pixels that a mask leaves out count in no score (`metrics.ssim`), and "counted" is the share of those
+    that do. lpips_missing says why there is no LPIPS, where there is none. Raises ClsplatError where a render is
     not finite, InputError naming a view that is too small, or a space that is not known.
     """
     records: list[dict[str, Any]] = []
     names = picture_names([view.name for view in views])
     for view, name in zip(views, names, strict=True):
-        truth = composite(view.load(), background)
-        image = np.asarray(render(view))
+        pixels, counts = _split(view)
+        truth, image = composite(pixels, background), np.asarray(render(view))
         if not np.isfinite(image).all():
             raise ClsplatError(f"the render of {view.name} has values that are not finite")
         try:
             record: dict[str, Any] = {
                 "name": view.name,
-                "psnr": metrics.psnr(image, truth),
-                "ssim": metrics.ssim(image, truth),
+                "psnr": metrics.psnr(image, truth, counts),
+                "ssim": metrics.ssim(image, truth, counts),
             }
+            if counts is not None:
+                record["counted"] = float(counts.mean())
         except (InputError, ValueError) as error:
             raise InputError(f"{view.name}: {error}") from None
-        if (perceptual := metrics.lpips(image, truth)) is not None:
+        seen = image if counts is None else np.where(counts[:, :, None], image, 0)
+        if (perceptual := metrics.lpips(seen, truth)) is not None:
             record["lpips"] = perceptual
         records.append(record)
         if save_dir is not None:
@@ -67,6 +71,17 @@ def evaluate(
     if records and (reason := metrics.lpips_missing()):
         result["lpips_missing"] = reason
     return result
+
+
+def _split(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
+    """A view's pixels, and those of them that count, (H, W), where it has a mask. Raises InputError where none does."""
+    image = view.load_masked()
+    if image.shape[2] < 5:
+        return image, None
+    counts = image[:, :, 4] > 0
+    if not counts.any():
+        raise InputError(f"{view.name}: its mask leaves nothing to measure; hold out another view")
+    return image[:, :, :4] * counts[:, :, None], counts
 
 
 def picture_names(names: Sequence[str]) -> list[str]:

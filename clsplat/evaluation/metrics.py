@@ -27,14 +27,19 @@ SSIM_WINDOW = 11
 Image = NDArray[Any]
 
 
-def psnr(image: Image, truth: Image) -> float:
-    """Peak signal-to-noise ratio in dB, at most 120. Raises ValueError for images of different shapes."""
+def psnr(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, at most 120. counts (H, W): the pixels that count. Raises ValueError for images
+    of different shapes."""
     a, b = _pair(image, truth)
-    return float(-10 * np.log10(max(float(np.mean(np.square(a - b))), MIN_SQUARED_ERROR)))
+    squares = np.square(a - b) if counts is None else np.square(a - b)[counts]
+    return float(-10 * np.log10(max(float(np.mean(squares)), MIN_SQUARED_ERROR)))
 
 
-def ssim(image: Image, truth: Image) -> float:
+def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
     """Mean structural similarity: the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5, mean of the channels.
+
+    counts (H, W): the pixels that count. Others are black in both pictures, and the mean is over windows around pixels
+    that count.
 
     Raises InputError for images smaller than the window, ValueError for images of different shapes.
     """
@@ -43,10 +48,12 @@ def ssim(image: Image, truth: Image) -> float:
     height, width = a.shape[:2]
     if min(height, width) < SSIM_WINDOW:
         raise InputError(f"an image of {width}x{height} pixels is too small for SSIM, expected at least 11x11")
-    value = structural_similarity(
-        a, b, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2
-    )
-    return float(value)
+    settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
+    if counts is None:
+        return float(structural_similarity(a, b, channel_axis=2, **settings))
+    a, b = (np.where(counts[:, :, None], picture, 0.0) for picture in (a, b))
+    _, values = structural_similarity(a, b, channel_axis=2, full=True, **settings)
+    return float(values[counts].mean())
 
 
 def lpips(image: Image, truth: Image) -> float | None:

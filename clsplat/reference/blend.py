@@ -112,11 +112,14 @@ def blend_grad(
     height: int,
     background: Sequence[float] | Float64,
     d_image: Float64,
+    d_transmittance: Float64 | None = None,
 ) -> BlendGradients:
-    """Eqs. (22) to (29) and (55), back to front: d_image (H, W, 3) is dL/dC."""
+    """Eqs. (22) to (29) and (55), back to front: d_image (H, W, 3) is dL/dC, d_transmittance (H, W) dL/dT at the end,
+    (82)."""
     forward, order = blend(projected, width, height, background), projected.order
     transmittance = forward.transmittance.copy()
     behind = np.broadcast_to(np.asarray(background, np.float64), (height, width, 3)).copy()
+    at_end = transmittance * (0.0 if d_transmittance is None else d_transmittance)
     number = len(projected.depths)
     gradients = BlendGradients(
         means2d=np.zeros((number, 2)),
@@ -142,6 +145,7 @@ def blend_grad(
         weight = transmittance[box] * alpha
         gradients.contributions[gaussian] = weight.sum()
         d_alpha = transmittance[box] * (d_image[box] * (color - behind[box])).sum(axis=2)
+        d_alpha = d_alpha - at_end[box] / (1 - alpha)
         gradients.colors[gaussian] = (weight[:, :, None] * d_image[box]).sum(axis=(0, 1))
         behind[box] += alpha[:, :, None] * (color - behind[box])
 

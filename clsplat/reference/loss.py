@@ -61,3 +61,21 @@ def l1_dssim(x: Float64, y: Float64, weight: float = 0.2) -> tuple[float, Float6
     loss = (1 - weight) * np.abs(difference).mean() + weight * (1 - values.mean())
     gradient = ((1 - weight) * np.sign(difference) - weight * d_sum) / x.size
     return float(loss), gradient
+
+
+def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2) -> tuple[float, Float64]:
+    """Eq. (80): the same where only pixels with counts (H, W) of 1 count, those with 0 not."""
+    mask = counts[:, :, None]
+    samples = max(3 * counts.sum(), 1)
+    difference = (x - y) * mask
+    values, d_sum = ssim(x * mask, y * mask)
+    loss = ((1 - weight) * np.abs(difference).sum() + weight * (1 - values).sum()) / samples
+    gradient = mask * ((1 - weight) * np.sign(difference) - weight * d_sum) / samples
+    return float(loss), gradient
+
+
+def alpha_loss(transmittance: Float64, alpha: Float64, counts: Float64, weight: float) -> tuple[float, Float64]:
+    """Eq. (81): weight times the mean |1 - T - alpha| of the pixels that count, and its gradient by T; all (H, W)."""
+    difference = counts * (1 - transmittance - alpha)
+    scale = weight / max(counts.sum(), 1)
+    return float(scale * np.abs(difference).sum()), -scale * np.sign(difference)

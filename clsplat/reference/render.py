@@ -70,12 +70,13 @@ def render_grad(
     d_image: Float64,
     background: Sequence[float] | Float64 = BLACK,
     sh_degree: int | None = None,
+    d_transmittance: Float64 | None = None,
 ) -> Gradients:
-    """Gradients of a loss with dL/dimage = d_image (H, W, 3)."""
+    """Gradients of a loss with dL/dimage = d_image (H, W, 3), and by the transmittance at the end (H, W)."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     arrays = parameters(gaussians)
     projected = project(**arrays, camera=camera, sh_degree=degree, antialiased=gaussians.antialiased)
-    screen = blend_grad(projected, camera.width, camera.height, background, d_image)
+    screen = blend_grad(projected, camera.width, camera.height, background, d_image, d_transmittance)
     by_parameter = project_grad(
         **arrays,
         camera=camera,

@@ -56,13 +56,15 @@ def plan_step(
     turns: int = 1,
     antialiased: bool = False,
     models: int = _MODELS,
+    masks: bool = False,
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
-    photographs: pixels of all that may stay on the device; turns: of `loss`; antialiased: of the
-    model; models: arrays for each parameter, where they are not those of a step of one view. Raises CapacityError."""
-    planes = 0
+    photographs: pixels of all that may stay on the device; turns: of `loss`; antialiased: of the model; models: arrays
+    for each parameter, where they are not those of a step of one view; masks: photographs have masks, or an alpha loss.
+    Raises CapacityError."""
+    planes, extra = 0, masks * (target.MASK_BYTES + loss.ALPHA_PIXEL_BYTES + turns)
     for camera in cameras:
-        pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES)
+        pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES + extra)
         planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, turns))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
     screen = project.SCREEN_BYTES + 4 * fields.contributions
@@ -78,7 +80,7 @@ def plan_step(
         model=models * frame.model,
         pair=frame.pair + blend.gradient_pair_bytes(fields),
         most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS),
-        photographs=0 if device.shares_memory else target.SOURCE_BYTES * photographs,
+        photographs=0 if device.shares_memory else (target.SOURCE_BYTES + masks * target.MASK_BYTES) * photographs,
     )
     return _plan(device, step)
 

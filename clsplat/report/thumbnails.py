@@ -68,7 +68,12 @@ def scene_of(run: Run) -> Scene | str:
             source = source.with_name(f"{source.name}_colmap")
             if not source.is_dir():
                 return "the scene is a folder of photos, and what was reconstructed of it is gone"
-        return load_scene(source, resolution=run.config.resolution, test_every=run.config.test_every)
+        return load_scene(
+            source,
+            resolution=run.config.resolution,
+            test_every=run.config.test_every,
+            masks=run.config.mask_use,
+        )
     except (InputError, OSError) as error:
         return f"the scene cannot be read ({str(error).replace(str(source), source.name)})"
 

@@ -117,7 +117,7 @@ class PosedImage:
     """An image of a data set: its name, its lens at the listed size, and `cam_from_world`.
 
     rotation (3, 3), translation (3,), float64; path: the file, where the data set says which; split: "train", "test",
-    or None where the data set has no split of its own.
+    or None where the data set has no split of its own; mask: the file of its mask, where the data set says which.
     """
 
     name: str
@@ -126,6 +126,7 @@ class PosedImage:
     translation: Float64
     path: Path = Path()
     split: str | None = None
+    mask: Path | None = None
 
 
 @dataclass(eq=False)

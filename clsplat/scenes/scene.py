@@ -17,6 +17,7 @@ import numpy as np
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, NEARS, Camera
 from clsplat.config.checks import misfit
+from clsplat.config.masks import MaskUse
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError, examples, plain, warn
 from clsplat.files import digest, short_digest
@@ -24,6 +25,7 @@ from clsplat.images.reading import companions, downscale, find_images, image_siz
 from clsplat.progress import Progress
 from clsplat.scenes import colmap, transforms
 from clsplat.scenes.data_set import DataSet, Lens, PosedImage, undistort
+from clsplat.scenes.masks import HALF, Mask, masks_of
 from clsplat.scenes.sfm import reconstruct
 
 Kind = Literal["colmap", "blender", "transforms", "photos"]
@@ -47,7 +49,8 @@ class View:
 
     name: as in the data set, with extension, unique in the scene; camera: at the working size; path: the file that is
     read; split: "train" or "test"; lens: what the file was taken through, at the file's size; upright: the camera
-    belongs to the picture turned as its EXIF orientation says, not as stored.
+    belongs to the picture turned as its EXIF orientation says, not as stored; mask: what of the picture counts, None
+    for all.
     """
 
     name: str
@@ -56,22 +59,51 @@ class View:
     split: Split
     lens: Lens
     upright: bool = False
+    mask: Mask | None = None
 
     def load(self, width: int | None = None, height: int | None = None) -> Float32:
         """Read the pixels, float32 (H, W, 3), or (H, W, 4) with straight alpha, undistorted, of the camera's size.
 
-        width, height: another size. Reads the file each time. Raises InputError for one that does not decode or has
-        changed its size since.
+        width, height: another size. Reads the file each time. What a mask leaves out is black, or transparent. Raises
+        InputError for one that does not decode or has changed its size since.
+        """
+        image = self.load_masked(width, height)
+        return image if image.shape[2] < 5 else np.ascontiguousarray(image[:, :, : 3 + _has_alpha(image)])
+
+    def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:
+        """The same; if something is left out with five channels, the last 1 where a pixel counts, else 0.
+
+        A pixel counts if half of its area does. Its colour is the mean of that part alone, so that none leaks in.
         """
         width, height = width or self.camera.width, height or self.camera.height
         image = self._read()
+        if self.mask is None:
+            return self._fitted(image, width, height)
+        image, counts = self.mask.applied(image, orient=self.upright)
+        if counts is None:
+            return self._fitted(image, width, height)
+        parts = [np.where(counts > 0, image[:, :, :3], np.float32(0)), counts]
+        if image.shape[2] == 4:  # alpha is averaged where it counts, as a colour
+            there = np.where(counts > 0, image[:, :, 3:], np.float32(0))
+            alpha = self._fitted(np.concatenate([there, there, there, counts], axis=2), width, height)
+            parts[0] = parts[0] * there
+        scaled = self._fitted(np.concatenate(parts, axis=2), width, height)
+        whole = scaled[:, :, 3:] >= HALF
+        opacity = np.clip(alpha[:, :, :1], 0, 1) if image.shape[2] == 4 else np.ones_like(scaled[:, :, :1])
+        colour = scaled[:, :, :3] / np.where(opacity > 0, opacity, np.float32(1))
+        result = np.concatenate([colour, opacity, np.ones_like(opacity)], axis=2)
+        return np.ascontiguousarray(np.where(whole, result, np.float32(0)), np.float32)
+
+    def _fitted(self, image: Float32, width: int, height: int) -> Float32:
         if self.lens.is_pinhole:
             return downscale(image, width, height)
         return undistort(image, self.lens, self.camera.resized(width, height))
 
     def check(self) -> None:
         """Raise InputError where `load` would."""
-        self._read()
+        image = self._read()
+        if self.mask is not None:
+            self.mask.applied(image, orient=self.upright)
 
     def _read(self) -> Float32:
         image = read_image(self.path, orient=self.upright)
@@ -123,14 +155,14 @@ class Scene:
 
         def look(view: View) -> str | None:
             view.check()
-            return short_digest(view.path)
+            return _digest(view)
 
         self.__dict__["digests"] = self._of_each(look)
 
     @cached_property
     def digests(self) -> dict[str, str | None]:
-        """Digest of each view's file, by the view's name."""
-        return self._of_each(lambda view: short_digest(view.path))
+        """Digest of each view's file, with that of its mask, by the view's name."""
+        return self._of_each(_digest)
 
     def _of_each(self, work: Callable[[View], T]) -> dict[str, T]:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -187,6 +219,16 @@ class Scene:
         return min(NEAR, self.extent / NEARS)
 
 
+def _has_alpha(image: Float32) -> bool:
+    """True if a picture with a mask is not opaque wherever it counts."""
+    return bool((image[:, :, 3] < image[:, :, 4]).any())
+
+
+def _digest(view: View) -> str | None:
+    own = short_digest(view.path)
+    return own if view.mask is None else f"{own} {view.mask.use} {view.mask.path and short_digest(view.mask.path)}"
+
+
 def detect(path: Path) -> Kind:
     """Layout of a scene's folder (or transforms.json). Raises InputError if it has none, naming what was looked for."""
     path = Path(path)
@@ -220,6 +262,7 @@ def load_scene(
     images: str | Path | None = None,
     work_dir: Path | None = None,
     progress: Progress | None = None,
+    masks: MaskUse | None = None,
 ) -> Scene:
     """Read a scene's cameras, points and picture headers; the pixels are read by `View.load`.
 
@@ -236,8 +279,10 @@ def load_scene(
     `transforms.read_transforms`; pictures that are listed and missing, or of another size than their camera; pictures
     whose header does not decode. Pictures that are there and not listed are named in the scene's warnings, but for
     masks, depths and the like (`reading.companions`), and so are those on both sides of the split.
+
+    masks: what masks and alpha channels mean (`clsplat.scenes.masks`); no other folder of pictures stands in then.
     """
-    path = Path(path)
+    path, use = Path(path), masks or MaskUse()
     for name, number in (("resolution", resolution), ("test_every", test_every)):
         if (expected := misfit(int, number)) or number < 0:
             raise InputError(f"{name} {number}: expected {expected or '0 or more'}")
@@ -248,7 +293,7 @@ def load_scene(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if kind in ("blender", "transforms"):
-            data = _read_transforms(path, kind)
+            data = _read_transforms(path, kind, masks=use.masks != "none")
         else:
             folder = path
             if kind == "photos":
@@ -256,11 +301,15 @@ def load_scene(
                 folder = reconstruct(photos, work_dir or photos.with_name(f"{photos.name}_colmap"), progress=progress)
             data, smaller = _read_colmap(folder, images)
         posed = sorted(data.images, key=lambda image: image.name)
+        if use != MaskUse():
+            smaller = []
+        of_pictures = masks_of(use, posed, path)
         own_split = any(image.split for image in posed)
         views = []
         for index, image in enumerate(posed):
             held_out = image.split == "test" if own_split else test_every > 0 and index % test_every == 0
-            views.append(_view(image, "test" if held_out else "train", resolution, smaller))
+            view = _view(image, "test" if held_out else "train", resolution, smaller)
+            views.append(replace(view, mask=of_pictures.get(image.name)))
         _warn_of_copies(views)
     if kind == "blender":
         bounds = (np.full(3, -BLENDER_CUBE), np.full(3, BLENDER_CUBE))
@@ -325,14 +374,14 @@ def _read_colmap(path: Path, chosen: str | Path | None) -> tuple[DataSet, list[P
     return model, [candidate for candidate in smaller if candidate.is_dir()]
 
 
-def _read_transforms(path: Path, kind: Kind) -> DataSet:
+def _read_transforms(path: Path, kind: Kind, *, masks: bool) -> DataSet:
     folder = path.parent if path.is_file() else path
     if kind == "blender":
         data = transforms.read_blender(folder)
         listed_in = folder / "transforms_*.json"
     else:
         listed_in = path if path.is_file() else folder / "transforms.json"
-        data = transforms.read_transforms(listed_in)
+        data = transforms.read_transforms(listed_in, masks=masks)
     parents = {image.path.parent for image in data.images}
     present = [file for parent in parents for file in find_images(parent, deep=False)]
     _warn_of_unlisted(present, data, listed_in, folder)

@@ -17,11 +17,13 @@ import time
 from pathlib import Path
 from typing import IO, Any, Literal
 
+from clsplat.config.masks import MaskUse
 from clsplat.errors import ClsplatError, InputError, examples, warn
 from clsplat.files import is_file, replace
 from clsplat.process import apart
 from clsplat.progress import Progress, no_progress
 from clsplat.scenes import sfm_photos
+from clsplat.scenes.masks import find_masks, folder_of, stage_mask
 from clsplat.scenes.transforms import load_document
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -56,6 +58,7 @@ def reconstruct(
     threads: int | None = None,
     seed: int = 0,
     overwrite: bool = False,
+    masks: MaskUse | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Recover the cameras of the photos under `images` and write a COLMAP scene to `output`, which is returned.
@@ -68,7 +71,8 @@ def reconstruct(
     SIMPLE_RADIAL (one distortion coefficient) for others. shared_camera: see `sfm_photos.camera_groups`.
     max_image_size: pixels, longest side for features alone, the undistorted photos keep their size. threads: all
     cores if None. The same seed gives the same cameras, bit by bit up to 80 photos. overwrite: replace a result of
-    other photos. progress(text, fraction or None) is called in every stage.
+    other photos. masks: leave features under the photos' masks out; the output gets them too, as `masks/IMAGE.jpg.png`,
+    white where a pixel counts. progress(text, fraction or None) is called in every stage.
 
     Warns of photos that could not be placed, are of a kind that cannot be read, or lost their alpha. Raises InputError
     for a folder without photos, a photo that does not decode, an output that is something else, and photos that no
@@ -81,6 +85,10 @@ def reconstruct(
         raise InputError(f"camera model {camera_model!r}: expected one of {', '.join(CAMERA_MODELS)}")
     paths, left_out = sfm_photos.find_photos(images, excluded=output)
     settings = f"{matching} {camera_model} {shared_camera} {max_image_size} {max_features} {seed}"
+    shapes = _masks(images, paths, masks)
+    if masks is not None:
+        stats = [(name, path.stat()) for name, path in sorted(shapes.items())]
+        settings += f" {masks} {[(name, status.st_size, status.st_mtime_ns) for name, status in stats]}"
     fingerprint = sfm_photos.fingerprint(images, paths, settings)
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
         report("using the cameras recovered before", 1.0)
@@ -99,7 +107,11 @@ def reconstruct(
         photos = sfm_photos.stage_photos(
             images, paths, work / "photos", lambda fraction: report("reading photos", fraction), workers
         )
+        sizes = {photo.name: (photo.width, photo.height) for photo in photos}
+        for name, path in shapes.items():
+            stage_mask(path, work / "masks" / f"{name}.png", sizes[name], invert=masks is not None and masks.invert)
         task = {
+            "masks": sorted(shapes),
             "photos": str(work / "photos"),
             "work": str(work),
             "groups": sfm_photos.camera_groups(photos, shared_camera),
@@ -127,6 +139,20 @@ def reconstruct(
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return output
+
+
+def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Path]:
+    """The masks by the photos' names. Raises InputError where they are asked for, and there are none or one fits no
+    photo."""
+    if use is None:
+        return {}
+    folder = folder_of(images)
+    found = find_masks(folder, (sfm_photos.photo_name(images, path) for path in paths)) if folder is not None else {}
+    if not found:
+        raise InputError(
+            f"{images}: there are no masks, expected masks/IMAGE.jpg.png beside the photos or in their folder"
+        )
+    return found
 
 
 def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], result: Path) -> list[str]:
@@ -170,7 +196,7 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
 
 def _sizes(result: Path) -> dict[str, int]:
     """Bytes of the files of a result, by their names in it."""
-    folders = (result / "images", result / "sparse")
+    folders = (result / "images", result / "sparse", result / "masks")
     paths = (path for folder in folders for path in folder.rglob("*"))
     return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(paths) if is_file(path)}
 

@@ -88,6 +88,8 @@ class Worker:
                 model = "OPENCV" if shared else "SIMPLE_RADIAL"
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model = model
+            if self.task["masks"]:
+                reader.mask_path = self.work / "masks"
             pycolmap.extract_features(
                 database_path=self.database,
                 image_path=self.photos,
@@ -170,6 +172,19 @@ class Worker:
         (flat / "sparse").rename(result / "sparse" / "0")
         as_pinhole(result / "sparse" / "0")
         shutil.rmtree(flat)
+        self.undistort_masks(model, result / "masks")
+
+    def undistort_masks(self, model: Path, result: Path) -> None:
+        """Resample the masks of the registered photos likewise, by the photos' names and .png."""
+        placed = pycolmap.Reconstruction(model)
+        named = {placed.images[image].name: placed.images[image] for image in placed.reg_image_ids()}
+        for name in set(self.task["masks"]) & named.keys():
+            mask = pycolmap.Bitmap.read(self.work / "masks" / f"{name}.png", as_rgb=False)
+            camera = placed.cameras[named[name].camera_id]
+            flat, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), mask, camera)
+            path = result / f"{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            flat.write(path)
 
     def evidence(self) -> dict[str, Any]:
         """Counts of features and matches, for the message that says why no model could be built."""

@@ -40,7 +40,7 @@ some take them before they refine the lens."""
 EXPORT_AGAIN = "export the data set anew or add it"
 
 
-def read_transforms(path: Path) -> DataSet:
+def read_transforms(path: Path, *, masks: bool = False) -> DataSet:
     """Read one transforms.json.
 
     docs/conventions.md (Scenes) has the keys that are read, in the file or in each frame. `file_path` is relative to
@@ -53,8 +53,8 @@ def read_transforms(path: Path) -> DataSet:
     readers = _readers(path, document)
     require_images([_find_file(keys) for keys in readers], path)
     data = DataSet(_images(path, readers))
-    if any("mask_path" in keys.frame for keys in readers):
-        warn(f"{path}: 'mask_path' is ignored, masks are not supported")
+    if not masks and any("mask_path" in keys.frame for keys in readers):
+        warn(f"{path}: 'mask_path' is ignored; --masks ignore or --masks transparent uses it")
     data.box = _ngp_box(Keys(path, None, {}, document))
     cloud = document.get("ply_file_path")
     if isinstance(cloud, str) and cloud:
@@ -96,7 +96,7 @@ def _images(path: Path, readers: list[Keys], size: tuple[int, int] | None = None
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
         if name in images:
             raise InputError(f"{path}: lists {name} twice, expected each picture once; remove one of the frames")
-        images[name] = PosedImage(name, lens, rotation, translation, file)
+        images[name] = PosedImage(name, lens, rotation, translation, file, mask=_mask_of(keys))
     _warn_of_contradictions(path, readers, list(images.values()))
     return _split(path, readers, list(images.values()))
 
@@ -267,6 +267,14 @@ def _find_file(keys: Keys) -> Path:
         if is_file(candidate):
             return candidate
     return path
+
+
+def _mask_of(keys: Keys) -> Path | None:
+    listed = keys.frame.get("mask_path")
+    if not isinstance(listed, str) or not listed:
+        return None
+    _inside(keys.path.parent, listed, f"{keys.where}: 'mask_path'")
+    return Path(os.path.normpath(keys.path.parent / listed.replace("\\", "/")))
 
 
 def _inside(folder: Path, listed: str, where: str) -> None:

@@ -135,7 +135,7 @@ def blend_grad(
     fields: SlotFields = PLAIN_SLOTS,
 ) -> DeviceArray:
     """Partial gradients of every pair of the lists at its slot, (pairs, fields.floats), from image_gradient (3, rows,
-    stride)."""
+    stride), or (4, rows, stride) with the loss's gradient by the transmittance."""
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]
     slots = work.array("slots", (pairs, fields.floats))
@@ -145,6 +145,8 @@ def blend_grad(
     defines = {**fields.defines, **({"RECORD_CELLS": True} if cells else {})}
     if device.shape.by_gaussian:
         defines["BY_GAUSSIAN"] = True
+    if image_gradient.shape[0] == 4:
+        defines["ALPHA_GRADIENT"] = True
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
     planes = (image_gradient, blended.transmittance, blended.stops)
     arrays = (*listed, splats, background, *planes, slots, *([cells] if cells else []))

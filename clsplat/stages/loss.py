@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches loss.cl: L1 + D-SSIM and its gradient."""
+"""Launches loss.cl and alpha_loss.cl: L1 + D-SSIM, the alpha loss, and their gradients."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
-from clsplat.device.launch import launch_groups
+from clsplat.device.launch import launch_grid, launch_groups
 from clsplat.device.layout import LOSS_COLUMNS, LOSS_GROUP_COLUMNS, LOSS_RING, TILE
 from clsplat.device.profile import stage
+from clsplat.stages.blend import Blended
 
 PIXEL_BYTES = 12
 """Bytes of the image's gradient, of each pixel with its padding."""
+ALPHA_PIXEL_BYTES = 9
+"""Bytes of the alpha loss, of each pixel with its padding: alpha, its gradient and, rounded up, its sums."""
 
 _LEAST_ROWS = 32
 """Rows of such a block, at least: ten more are worked out anew."""
@@ -63,14 +66,18 @@ def scratch_bytes(device: Device, height: int, stride: int, turns: int = 1) -> i
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """gradient (3, rows, stride); sums (3, ...): partial sums of SSIM, of |x - y| and of its square; copy: the sums
-    where a copy to the host is under way."""
+    """gradient (3, rows, stride), with the alpha loss (4, ...); sums (3, ...): partial sums of SSIM, of |x - y| and of
+    its square, in one row with those of the alpha loss behind them where it is there; samples: that count, masked:
+    that do not, in whose windows SSIM is counted all the same; copy: the sums where a copy to the host is under way;
+    alpha: the weight of the alpha loss, and its number of sums."""
 
     gradient: DeviceArray
     sums: DeviceArray
     samples: int
     weight: float
     copy: Callable[[], NDArray[Any]] | None = None
+    masked: int = 0
+    alpha: tuple[float, int] = (0.0, 0)
 
     def fetched(self) -> Loss:
         """The same, its sums on their way to the host: `read` then does not wait for what comes behind them."""
@@ -78,9 +85,15 @@ class Loss:
 
     def read(self) -> tuple[float, float]:
         """(loss, mean squared error); waits for the device."""
-        sums = self.copy() if self.copy is not None else self.sums.get()
-        ssim, absolute, squared = sums.reshape(3, -1).sum(axis=1, dtype=np.float64) / self.samples
-        return float((1 - self.weight) * absolute + self.weight * (1 - ssim)), float(squared)
+        sums = (self.copy() if self.copy is not None else self.sums.get()).reshape(-1)
+        weight, behind = self.alpha
+        own = sums.size - behind
+        ssim, absolute, squared = sums[:own].reshape(3, -1).sum(axis=1, dtype=np.float64) / self.samples
+        unlike = 1 - ssim if not self.masked else (self.samples + self.masked) / self.samples - ssim
+        value = (1 - self.weight) * absolute + self.weight * unlike
+        if behind:
+            value += weight * sums[own:].sum(dtype=np.float64) / (self.samples / 3)
+        return float(value), float(squared)
 
 
 @stage("loss")
@@ -93,14 +106,25 @@ def loss(
     height: int,
     weight: float,
     turn: int = 0,
+    *,
+    kept: int | None = None,
+    blended: Blended | None = None,
+    alpha_weight: float = 0.0,
 ) -> Loss:
     """(1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero right of and below the image. turn: those
-    of another turn keep their sums."""
+    of another turn keep their sums.
+
+    kept: pixels that count, where others are zero in both pictures: the means are over these. alpha_weight: with a
+    fourth plane in `target`, the alpha, this times the mean absolute difference of the render's is added.
+    """
     _, rows, stride = image.shape
-    samples, blocks, items = 3 * width * height, _blocks(device, height, stride), device.shape.items
+    every, blocks, items = 3 * width * height, _blocks(device, height, stride), device.shape.items
+    samples = every if kept is None else max(3 * kept, 1)
+    alphas = rows // TILE * stride if target.shape[0] == 4 else 0
     partials = work.array("loss_partials", (blocks.partials,))
-    gradient = work.array("image_gradient", (3, rows, stride))
-    sums = work.array(f"loss_sums{turn or ''}", (3, blocks.sums // 3))
+    gradient = work.array("image_gradient", (4 if alphas else 3, rows, stride))
+    own = blocks.sums // 3 * 3
+    sums = work.array(f"loss_sums{turn or ''}", (own + alphas,) if alphas else (3, own // 3))
     sizes, pictures, results = (width, height, stride, rows * stride), (image, target), (partials, gradient, sums)
     weights = ((1 - weight) / samples, weight / samples)
     if items == 1:
@@ -111,4 +135,14 @@ def loss(
         kernels = device.kernels("loss")
         launch_groups(device, kernels.loss_ssim, blocks.groups, items, *sizes, *pictures, partials, sums)
         launch_groups(device, kernels.loss_grad, blocks.groups, items, *sizes, *weights, *pictures, *results)
-    return Loss(gradient, sums, samples, weight)
+    if alphas:
+        assert blended is not None, "the alpha loss is of a render"
+        planes = (blended.stops, blended.transmittance, target, gradient)
+        scale = alpha_weight / (samples / 3)
+        kernel = device.kernels("alpha_loss").alpha_loss
+        launch_grid(device, kernel, (stride, rows // TILE), stride, rows, own, scale, *planes, sums)
+    return Loss(
+        *(gradient, sums, samples, weight),
+        masked=every - 3 * kept if kept is not None else 0,
+        alpha=(alpha_weight, alphas),
+    )

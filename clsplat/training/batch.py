@@ -181,7 +181,7 @@ class Replica:
         room = _gradients(self.rasterizer.work, parameters)
         pixels = (photograph, sample.camera, sample.background)
         result = _RemoteView(*settings, arrays, gradients, explore=step.explore).run(
-            (parameters,), *pixels, StepProbe(), room, reads_loss=True
+            (parameters,), *pixels, StepProbe(), room, reads_loss=True, kept=sample.kept
         )
         return Outcome(arrays, gradients, result)
 
@@ -319,7 +319,7 @@ class Batch:
         """A view on the device that has the model, which here are its parameters and the sums."""
         gradients = _gradients(self.rasterizer.work, model[0])
         pixels = (self.photographs.bring(sample.view, factor), sample.camera, sample.background)
-        return step.run(model, *pixels, probes(sample, step), gradients, reads_loss=True)
+        return step.run(model, *pixels, probes(sample, step), gradients, reads_loss=True, kept=sample.kept)
 
     def _take(self, sums: AnyGaussians, outcome: Outcome, step: _AddedView, probe: StepProbe) -> Loss:
         """Add what a view has found on another device, in the memory of a view on this one."""

@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import View
 
 
+def kept_pixels(image: NDArray[Any]) -> int | None:
+    """Pixels of a photograph that its mask, a fifth channel, leaves; None where it has none."""
+    return int(np.count_nonzero(image[:, :, 4])) if image.shape[2] == 5 else None
+
+
 class Photographs:
     """The training views' pixels at one resolution, decoded once each; uint8 where that holds them exactly.
 
@@ -27,6 +32,7 @@ class Photographs:
         self._factor = 0.0
         self._held: dict[tuple[int, float], NDArray[Any]] = {}
         self._on_device: dict[int, DeviceArray] = {}
+        self._kept: dict[tuple[int, float], int | None] = {}
         self._taken = self.allowed = 0
 
     def for_device(self, device: Device) -> Photographs:
@@ -42,7 +48,8 @@ class Photographs:
             self._leave_device()
 
     def load(self, index: int, factor: float) -> NDArray[Any]:
-        """View `index` at 1/factor of its size, (H, W, 3 or 4), straight alpha; not to be written to."""
+        """View `index` at 1/factor of its size, (H, W, 3 or 4), straight alpha, or 5 with its mask, 0 where a pixel
+        does not count; not to be written to."""
         if factor != self._factor:
             self._factor = factor
             for key in [key for key in self._held if key[1] != factor]:
@@ -50,7 +57,7 @@ class Photographs:
             self._leave_device()
         if (index, factor) not in self._held:
             camera = self._views[index].camera
-            image: NDArray[np.float32] = self._views[index].load(
+            image: NDArray[np.float32] = self._views[index].load_masked(
                 max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
             )
             levels = np.rint(image * 255)
@@ -60,6 +67,12 @@ class Photographs:
             )
             self._held[index, factor] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
         return self._held[index, factor]
+
+    def kept(self, index: int, factor: float) -> int | None:
+        """Pixels of the same that count; None where there is no mask."""
+        if (index, factor) not in self._kept:
+            self._kept[index, factor] = kept_pixels(self.load(index, factor))
+        return self._kept[index, factor]
 
     def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
         """The same, on the device where there is room for it: it goes up once, and stays. A device that shares the

@@ -47,6 +47,7 @@ from clsplat.stages.loss import Loss
 from clsplat.stages.project import Slots
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.health import Incident, finite_or_zero
+from clsplat.training.photographs import kept_pixels
 from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ _KINDS = ("parameters", "first", "second")
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """One training step. record: step, stage, name of the view, rates, size, versions, device; config: the settings;
-    camera: at the size of photograph (H, W, 3 or 4); background (3,); models: parameters and moments by group."""
+    camera: at the size of photograph (H, W, 3 to 5); background (3,); models: parameters and moments by group."""
 
     record: dict[str, Any]
     config: TrainConfig
@@ -150,7 +151,7 @@ def _checked(bundle: Bundle) -> Bundle:
     sides = camera.height, camera.width
     if not all(type(side) is int for side in sides):
         raise ValueError(f"a camera of {sides} pixels")
-    if bundle.photograph.shape not in ((*sides, 3), (*sides, 4)) or bundle.photograph.dtype not in (
+    if bundle.photograph.shape not in [(*sides, n) for n in (3, 4, 5)] or bundle.photograph.dtype not in (
         np.uint8,
         np.float32,
     ):
@@ -203,7 +204,7 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     fields = slot_fields(strategy_of(config).needs(record["step"]))
     step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
     pixels = (bundle.photograph, bundle.camera, bundle.background)
-    step.run((parameters, first, second), *pixels, probe, gradients)
+    step.run((parameters, first, second), *pixels, probe, gradients, kept=kept_pixels(bundle.photograph))
     return {**probe.counts, "adam": int(rasterizer.readback.get()[-len(REFUSED) :].sum())}
 
 

@@ -28,14 +28,15 @@ from clsplat.training.density import StatisticsNeeds
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """A view of a step: its index, photograph (H, W, 3 or 4), camera of that size, background; begins: with it a pass
-    through all views begins."""
+    """A view of a step: its index, photograph (H, W, 3 to 5), camera of that size, background; begins: with it a pass
+    through all views begins; kept: pixels that its mask leaves, None without one."""
 
     view: int
     photograph: NDArray[Any] | DeviceArray
     camera: Camera
     background: NDArray[np.float32]
     begins: bool
+    kept: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +123,11 @@ class GradientStep:
         gradients: DeviceGaussians | None = None,
         *,
         reads_loss: bool = False,
+        kept: int | None = None,
     ) -> Loss:
-        """Update the model (parameters, first and second moments) by a photograph (H, W, 3 or 4) of the camera's size.
+        """Update the model (parameters, first and second moments) by a photograph (H, W, 3 to 5) of the camera's size.
+
+        kept: pixels that the photograph's mask, its fifth channel, leaves.
 
         gradients: room for those of the rows that are on the device at once, zeros before and after, for a probe that
         looks at them; the bits of the model are the same without; reads_loss: the loss will be read.
@@ -131,9 +135,18 @@ class GradientStep:
         device, rasterizer, work = self.device, self.rasterizer, self.rasterizer.work
         frame = rasterizer.forward(model[0], camera, background, room=self.room)
         probe.forward(frame)
-        planes = target(device, work, photograph, frame.background)
-        size = (camera.width, camera.height)
-        result = loss(device, work, frame.blended.image, planes, *size, self.config.dssim_weight, self.turn)
+        alpha_weight = self.config.alpha_loss if photograph.shape[2] > 3 else 0.0
+        planes = target(device, work, photograph, frame.background, frame.blended, alpha=alpha_weight > 0)
+        size, weight = (camera.width, camera.height), self.config.dssim_weight
+        result = loss(
+            *(device, work, frame.blended.image, planes),
+            *size,
+            weight,
+            self.turn,
+            kept=kept,
+            blended=frame.blended,
+            alpha_weight=alpha_weight,
+        )
         if reads_loss:
             result = result.fetched()
         probe.loss(result)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.config.marking import FRESH
+from clsplat.config.masks import MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
@@ -149,6 +150,7 @@ class Trainer:
                 photographs=sum(view.camera.width * view.camera.height for view in self.views),
                 turns=self.pending.turns,
                 antialiased=self.config.antialiased,
+                masks=self.config.mask_use != MaskUse(),
                 **models,
             )
 
@@ -224,7 +226,7 @@ class Trainer:
             sample, step = samples[0], replace(exact, turn=turn, room=room)
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
-            result = step.run(model, *pixels, probe, reads_loss=reads_loss)
+            result = step.run(model, *pixels, probe, reads_loss=reads_loss, kept=sample.kept)
             self._limit_scales()
             return result
 
@@ -267,7 +269,8 @@ class Trainer:
         bring = self.photographs.bring if self.batch is None else self.photographs.load
         image = bring(view, factor)
         self.background = self._background_colour()
-        return Sample(view, image, self._camera(view, image.shape[1], image.shape[0]), self.background, begins)
+        camera, kept = self._camera(view, image.shape[1], image.shape[0]), self.photographs.kept(view, factor)
+        return Sample(view, image, camera, self.background, begins, kept)
 
     def _watched_in_batch(self, sample: Sample, step: GradientStep) -> StepProbe:
         """The probe of a view, when the statistics of those before it are complete."""
@@ -338,7 +341,7 @@ class Trainer:
         self.statistics = self.statistics.next_epoch()
 
     def _background_colour(self) -> NDArray[np.float32]:
-        if self.config.background == "random":
+        if self.config.random_background:
             return self.rng.random(3, dtype=np.float32)
         return np.array(background_colour(self.config.background), np.float32)
 

@@ -22,6 +22,8 @@ class Photo:
     def load(self) -> np.ndarray:
         return self.pixels
 
+    load_masked = load
+
 
 def photos() -> list[Photo]:
     rng = np.random.default_rng(0)
@@ -106,3 +108,25 @@ def test_renders_are_left_as_pictures(tmp_path: Path) -> None:
     assert files == ["a.png", "b/0.png", "c.png"]
     picture = imread(tmp_path / "test" / "b" / "0.png")
     np.testing.assert_allclose(picture / 255, half(views[0]), atol=0.5 / 255 + 1e-6)
+
+
+def test_pixels_that_a_mask_leaves_out_are_not_measured() -> None:
+    rng = np.random.default_rng(1)
+    truth = np.concatenate([rng.random((30, 40, 3)), np.ones((30, 40, 2))], axis=2).astype(np.float32)
+    truth[8:20, 5:30] = 0
+    render = np.clip(truth[:, :, :3] + 0.1, 0, 1)
+    scores = []
+    for fill in (0.0, 0.7):
+        image = np.where(truth[:, :, 4:] > 0, render, fill).astype(np.float32)
+        view = Photo("a.png", truth)
+        scores.append(evaluate(lambda _view, i=image: i, [view], (0, 0, 0), step=1, gaussians=1, seconds=0.0)["views"])
+    assert scores[0] == scores[1]
+    assert scores[0][0]["counted"] == 0.75
+    kept = truth[:, :, 4] > 0
+    assert scores[0][0]["psnr"] == pytest.approx(-10 * np.log10(np.mean((render - truth[:, :, :3])[kept] ** 2)))
+
+
+def test_a_mask_that_leaves_nothing_is_named() -> None:
+    view = Photo("a.png", np.zeros((30, 40, 5), np.float32))
+    with pytest.raises(InputError, match=r"a\.png: its mask leaves nothing"):
+        evaluate(lambda v: v.pixels[:, :, :3], [view], (0, 0, 0), step=1, gaussians=1, seconds=0.0)

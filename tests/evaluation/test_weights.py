@@ -154,6 +154,8 @@ def test_without_the_extra_the_file_says_so(server: str, monkeypatch: pytest.Mon
         def load(self) -> np.ndarray:
             return np.zeros((16, 16, 3), np.float32)
 
+        load_masked = load
+
     result = held_out.evaluate(View.load, [View()], (0, 0, 0), step=1, gaussians=1, seconds=0.0)
     assert result["lpips_missing"] == "the optional extra is not installed (no lpips): pip install 'clsplat[lpips]'"
     assert not lpips_weights.place().exists(), "nothing is fetched that nobody could use"

@@ -15,9 +15,11 @@ from calls import warnings_of
 from PIL import Image as Pillow
 from systems import can_link
 
+from clsplat.config.masks import MaskUse
 from clsplat.demo import ray_caster
 from clsplat.errors import ClsplatError, InputError
 from clsplat.scenes import sfm, sfm_photos
+from clsplat.scenes.scene import load_scene
 
 WIDTH, HEIGHT, COUNT = 240, 180, 12
 # EXIF orientation: what a viewer does to stored pixels to show the photo; here its inverse, shown to stored
@@ -379,3 +381,26 @@ def test_the_whole_demo_registers(tmp_path):
 def test_cameras_of_their_own_and_sequential_matching(photos, tmp_path):
     output = sfm.reconstruct(photos, tmp_path / "scene", matching="sequential", shared_camera=False)
     assert len(pycolmap.Reconstruction(output / "sparse/0").cameras) == COUNT
+
+
+def test_features_under_masks_are_left_out_and_masks_are_undistorted(photos, tmp_path):
+    folder = tmp_path / "capture"
+    shutil.copytree(photos, folder / "images")
+    (folder / "masks").mkdir()
+    mask = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    mask[: HEIGHT // 4] = 0
+    for path in (folder / "images").iterdir():
+        write_png(folder / "masks" / f"{path.name}.png", mask)
+    out = sfm.reconstruct(folder / "images", tmp_path / "out", masks=MaskUse("ignore"))
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    seen = [point.xy[1] for image in model.images.values() for point in image.points2D if point.has_point3D()]
+    assert min(seen) > HEIGHT // 4 - 6, "no feature is under the mask, but for what undistortion moves"
+    view = load_scene(out, masks=MaskUse("ignore")).views[0]
+    pixels = view.load_masked()
+    assert not pixels[: HEIGHT // 4 - 6].any()
+    assert pixels[HEIGHT // 4 + 6 :, :, 4].all()
+
+
+def test_masks_that_are_asked_for_and_not_there(photos, tmp_path):
+    with pytest.raises(InputError, match="there are no masks, expected masks/"):
+        sfm.reconstruct(photos, tmp_path / "out", masks=MaskUse("ignore"))

@@ -1,0 +1,29 @@
+// The alpha loss, weight mean |A - alpha| over the pixels that count, of the render's A = 1 - T, and its gradient by T.
+//
+// Owner: A work-item owns a column of TILE rows.
+// Launch: A grid of stride x rows / TILE.
+// Buffers: stops (rows, stride), negative where a pixel does not count; transmittance, alpha (rows, stride);
+//   scale: the weight over the number of pixels -> gradient (rows, stride) by the transmittance, 0 where none counts;
+//   sums (rows / TILE, stride) of |A - alpha|. alpha and gradient are the planes behind three of colour.
+// Equations: docs/gradients.md, (81).
+#include "shared/math.h"
+
+__kernel void alpha_loss(const int stride, const int height, const int first_sum, const float scale,
+                         __global const int *stops, __global const float *transmittance, __global const float *alpha,
+                         __global float *gradient, __global float *sums) {
+  const int x = get_global_id(0), block = get_global_id(1);
+  if (x >= stride || block * TILE >= height) return;
+  float sum = 0.0f;
+  const size_t plane = (size_t)stride * height;
+  for (int row = 0; row < TILE; ++row) {
+    const size_t at = (size_t)stride * (block * TILE + row) + x;
+    float by_t = 0.0f;
+    if (stops[at] >= 0) {
+      const float difference = (1.0f - transmittance[at]) - alpha[3 * plane + at];
+      by_t = difference > 0.0f ? -scale : (difference < 0.0f ? scale : 0.0f);
+      sum += fabs(difference);
+    }
+    gradient[3 * plane + at] = by_t;
+  }
+  sums[(size_t)first_sum + (size_t)stride * block + x] = sum;
+}
