@@ -13,6 +13,7 @@ from clsplat.errors import warn
 from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
+    from clsplat.config.training import Lenses
     from clsplat.device.context import Device, DeviceInfo
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
@@ -45,9 +46,10 @@ class Services:
     run_demo: Callable[..., dict[str, Any]] = imported("clsplat.demo.run.run_demo")
 
 
-def load_scene(services: Services, path: Path, resolution: int, test_every: int) -> Scene:
+def load_scene(services: Services, path: Path, resolution: int, test_every: int, lenses: Lenses = "undistort") -> Scene:
     """The scene, with its warnings printed."""
-    scene = services.load_scene(path, resolution=resolution, test_every=test_every, progress=StageProgress())
+    how = {"resolution": resolution, "test_every": test_every, "lenses": lenses}
+    scene = services.load_scene(path, **how, progress=StageProgress())
     for text in scene.warnings:
         warn(text)
     return scene

@@ -169,7 +169,7 @@ def tangents_grad(gaussians: Gaussians, camera: Camera, seen: Tangents, screen: 
     axes = camera.rotation @ factor
     half = plane @ axes / depths[:, None, None]
 
-    conics = np.stack([seen.conic(row) for row in rows]) if len(rows) else np.zeros((0, 3))
+    conics = np.stack([seen.conic(row) for row in rows.tolist()]) if len(rows) else np.zeros((0, 3))
     gxx, gxy, gyy = covariance_grad(conics, screen.conics[rows]).T
     d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
     d_half = 2 * d_covariance @ half

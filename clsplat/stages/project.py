@@ -145,13 +145,13 @@ def project_grad(
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` from the pairs' slots,
     which have `fields`."""
-    lanes = _lanes(device)
-    defines = {**_defines(gaussians, slots, fields, sh_rest=sh_rest), **lanes.defines}
+    build = _build(device)
+    defines = {**_defines(gaussians, slots, fields, sh_rest=sh_rest), **build.defines}
     n = gaussians.count
     launch_items(
         device,
         device.kernels("project_grad", **defines).project_grad,
-        -(-n // lanes.count) if slots.values.shape[0] else 0,
+        -(-n // build.lanes) if slots.values.shape[0] else 0,
         *_inputs(gaussians, camera_array, projected, slots),
         *(model[group] for model in (gaussians, gradients) for group in GROUPS),
         screen.gradients,
@@ -196,9 +196,9 @@ def project_step(
         readback.buffer,  # no array that a step goes through: it is touched where something is wrong
         *(arrays[group] for arrays in model for group in GROUPS),
     )
-    lanes = _lanes(device)
-    defines |= lanes.defines
-    if lanes.count > 1:
+    build = _build(device)
+    defines |= build.defines
+    if build.lanes > 1:
         kernel = device.kernels("project_grad", ROWS=ROWS, **defines).project_step
         launch_groups(device, kernel, -(-parameters.count // ROWS), 1, *arguments)
     else:
@@ -206,16 +206,16 @@ def project_step(
         launch_items(device, kernel, parameters.count, *arguments)
 
 
-class _Lanes(NamedTuple):
+class _Build(NamedTuple):
     """Gaussians of a work-item of the gradient, and defines where these are not the shape's."""
 
-    count: int
+    lanes: int
     defines: dict[str, object]
 
 
-def _lanes(device: Device) -> _Lanes:
+def _build(device: Device) -> _Build:
     """Of rays one, as of their projection."""
-    return _Lanes(1, {"LANES": 1}) if device.switched("RAYS") else _Lanes(device.shape.lanes, {})
+    return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 
 def _defines(gaussians: DeviceGaussians, slots: Slots, fields: SlotFields, *, sh_rest: bool) -> dict[str, object]:
