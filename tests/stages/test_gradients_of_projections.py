@@ -102,3 +102,40 @@ def test_the_same_bits_twice_in_every_shape(device: Device, every: bool) -> None
         first, second = (Pipeline.run(shaped(device, *shape), scene).backward(d_image)[0] for _ in range(2))
         for group in GROUPS:
             assert_same_bits(getattr(first, group), getattr(second, group))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_poisoned_memory_changes_no_bit(default_device: Device, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    scene, (d_image, _) = subject(name, 200), wanted(name)
+    got = []
+    for word in ("1", "0xff800000"):
+        monkeypatch.setenv("CLSPLAT_POISON", word)
+        got.append(Pipeline.run(default_device, scene).backward(d_image, absolute=True))
+    for group in GROUPS:
+        assert np.isfinite(getattr(got[0][0], group)).all(), group
+        assert_same_bits(getattr(got[0][0], group), getattr(got[1][0], group))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_extreme_gaussians_have_finite_gradients(shaped_device: Device, name: str) -> None:
+    """Needles, discs, specks and giants, some next to the camera, at a pole, straight behind or not numbers at all."""
+    (gaussians, camera), (d_image, _) = subject(name, 200), wanted(name)
+    rng = np.random.default_rng(8)
+    arrays = {group: values.copy() for group, values in gaussians.arrays().items()}
+    arrays["log_scales"] += rng.uniform(-20, 5, arrays["log_scales"].shape).astype(np.float32)
+    arrays["log_scales"][:20] = [-30.0, -30.0, 1.0]
+    arrays["log_scales"][20:40] = [-30.0, 1.0, 1.0]
+    arrays["quaternions"][::7] *= np.float32(1e-9)
+    arrays["quaternions"][1::7] *= np.float32(1e9)
+    position = camera.position.astype(np.float32)
+    axis = camera.rotation.astype(np.float32)
+    for row, place in enumerate((axis[1], -axis[1], axis[2], -axis[2], 0.011 * axis[2], 1e6 * axis[0])):
+        arrays["means"][50 + row] = position + place
+    arrays["means"][60], arrays["log_scales"][61], arrays["quaternions"][62] = np.nan, np.nan, 0.0
+    arrays["means"][63], arrays["log_scales"][64], arrays["opacity_logits"][65] = np.inf, 40.0, np.nan
+    run = Pipeline.run(shaped_device, (Gaussians(**arrays, near=gaussians.near), camera))
+    got, screen = run.backward(d_image, absolute=True)
+    assert run.visible.sum() > 30
+    for group in GROUPS:
+        assert np.isfinite(getattr(got, group)[run.visible]).all(), group
+    assert np.isfinite(screen[run.visible]).all()
