@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -21,21 +22,27 @@ class ProjectionKind:
     """Properties of a projection.
 
     flat: True if there is an image plane, on which Gaussians are ellipses and depth is z; else a pixel is a ray, and
-    depth the distance; gradient: True if the backward pass has it; defines: those that the kernels are built with.
+    depth the distance; defines: those that the kernels are built with.
     """
 
     flat: bool = True
-    gradient: bool = False
     defines: Mapping[str, object] = field(default_factory=dict)
 
 
 PROJECTIONS: dict[Projection, ProjectionKind] = {
-    "perspective": ProjectionKind(gradient=True),
+    "perspective": ProjectionKind(),
     "orthographic": ProjectionKind(defines={"ORTHOGRAPHIC": True}),
     "equirectangular": ProjectionKind(flat=False, defines={"RAYS": 1}),
     "fisheye": ProjectionKind(flat=False, defines={"RAYS": 2}),
 }
 """Every projection. Its equations are in kernels/project*.cl and, in float64, in clsplat/reference/cameras.py."""
+
+BENT_FISHEYE = ProjectionKind(flat=False, defines={"RAYS": 2, "KANNALA_BRANDT": True})
+"""The fisheye with coefficients (`Camera.radial`)."""
+
+LEAST_SLOPE = 0.1
+"""Pixels a radian, in those of the axis, from which on a fisheye's picture counts as folded over: it has nothing there,
+and float32 finds the angle of every pixel before."""
 
 FRAME_CLAMP = 0.3
 NEAR = 0.01
@@ -78,6 +85,9 @@ class Camera:
     seen; depth is z, for fisheye and equirectangular the distance. A near of NEAR, the default,
     stands for the model's (`Gaussians.near`). Nothing applies `far` yet.
 
+    radial: k1 to k4 of a fisheye (Kannala and Brandt; OpenCV's and COLMAP's OPENCV_FISHEYE): the angle t from the axis
+    is t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from it; 0 for the equidistant one.
+
     window: where the picture is a part of a frame, or more than it: width and height are the picture's, cx and cy are
     measured from the frame's corner. What both show has the same bits where x and y are multiples of a tile and the
     Jacobian's clamp is the same (docs/pictures.md).
@@ -95,11 +105,24 @@ class Camera:
     far: float = math.inf
     projection: Projection = "perspective"
     window: Window | None = None
+    radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @property
     def kind(self) -> ProjectionKind:
         """The properties of its projection."""
-        return PROJECTIONS[self.projection]
+        return BENT_FISHEYE if any(self.radial) else PROJECTIONS[self.projection]
+
+    @cached_property
+    def fold(self) -> tuple[float, float]:
+        """The largest angle from its axis, radians, that a fisheye shows, and its distance there in focal lengths."""
+        if not any(self.radial):
+            return math.pi, math.pi
+        powers = 2 * np.arange(5)
+        factors = np.array([1.0, *self.radial])
+        angles = np.linspace(0.0, math.pi, 4097)
+        folded = (((1 + powers) * factors) @ angles ** powers[:, None]) < LEAST_SLOPE
+        angle = float(angles[np.argmax(folded) - 1]) if folded.any() else math.pi
+        return angle, float(angle * (factors @ angle**powers))
 
     @property
     def position(self) -> Float64:
@@ -134,6 +157,12 @@ class Camera:
             raise InputError(f"camera: near is {self.near}, far {self.far}, expected 0 < near < far")
         if self.projection not in PROJECTIONS:
             raise InputError(f"camera: projection is {self.projection!r}, expected one of {', '.join(PROJECTIONS)}")
+        if any(self.radial) and self.projection != "fisheye":
+            raise InputError(
+                f"camera: radial is {self.radial} of a camera that is {self.projection}, expected a fisheye"
+            )
+        if len(self.radial) != 4 or not all(math.isfinite(value) for value in self.radial):
+            raise InputError(f"camera: radial is {self.radial}, expected four finite numbers")
 
     def from_origin(self, origin: Float64) -> Camera:
         """The same view, for coordinates of the world that are counted from origin (3,)."""

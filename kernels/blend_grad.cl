@@ -7,7 +7,7 @@
 // Buffers: blend's, its transmittance and stops, image_gradient (3, height, width): of the loss by colour,
 //   with ALPHA_GRADIENT a fourth plane: by what is left for the background; slot_from_sorted (pairs) -> slots (pairs,
 //   SLOT_STRIDE), every one of them: sums over the tile's pixels in blend's whitened units (49).
-// Equations: docs/gradients.md, (14), (22) to (26), (48), (49) and (55).
+// Equations: docs/gradients.md, (14), (22) to (26), (48), (49) and (55); with RAYS docs/cameras.md, (21).
 //
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
@@ -72,14 +72,38 @@ static inline Share take_out(Pixels *p, floatL uncapped, float c_red, float c_gr
   return share;
 }
 
+#ifdef RAYS
+// The mean's fields are of the gradient on its tangent plane: it is not linear in (u, v), as the plane turns with the
+// mean, (21) of docs/cameras.md.
+static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, float l12, float l22, floatL *sums) {
+  const floatL gu = g * u, gv = g * v, q = fmaL(u, u, v * v);
+  const floatL y = v / l22, x = fmaL((floatL)(-l12), y, u) / l11;
+  const floatL by_x = g * fmaL(q, x, l11 * u), by_y = g * fmaL(q, y, fmaL((floatL)(l12), u, l22 * v));
+  sums[SLOT_G] += g;
+  sums[SLOT_GU] += by_x;
+  sums[SLOT_GV] += by_y;
+  sums[SLOT_GUU] = fmaL(gu, u, sums[SLOT_GUU]);
+  sums[SLOT_GUV] = fmaL(gu, v, sums[SLOT_GUV]);
+  sums[SLOT_GVV] = fmaL(gv, v, sums[SLOT_GVV]);
+#ifdef ABSOLUTE_GRADIENTS
+  sums[SLOT_ABSX] += fabs(by_x);
+  sums[SLOT_ABSY] += fabs(by_y);
+#endif
+}
+#endif
+
 // Adds a cell's gradients to a pair's sums (SLOT_STRIDE).
 static inline void add_gradients(floatL *sums, const Pixels *p, Share share, floatL u, floatL v, float l11, float l12,
                                  float l22) {
   sums[SLOT_RED] = fmaL(share.weight, p->red, sums[SLOT_RED]);
   sums[SLOT_GREEN] = fmaL(share.weight, p->green, sums[SLOT_GREEN]);
   sums[SLOT_BLUE] = fmaL(share.weight, p->blue, sums[SLOT_BLUE]);
+#ifdef RAYS
+  add_ray_moments(share.g, u, v, l11, l12, l22, sums);
+#else
   add_moments(share.g, u, v, sums);
-#ifdef ABSOLUTE_GRADIENTS
+#endif
+#if defined(ABSOLUTE_GRADIENTS) && !defined(RAYS)
   sums[SLOT_ABSX] += fabs(share.g * (l11 * u));
   sums[SLOT_ABSY] += fabs(share.g * fmaL((floatL)(l12), u, l22 * v));
 #endif
@@ -89,15 +113,34 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
 }
 
 // Alpha of the i-th pair of the tile's list in a cell's pixels.
+#ifdef RAYS
+#define WHITENING_HERE                                                                                                 \
+  float whitening[3];                                                                                                  \
+  whitening_of_ray(splat, whitening, whitening + 1, whitening + 2);
+#define W11 whitening[0]
+#define W12 whitening[1]
+#define W22 whitening[2]
+#define ALPHA_IN(cell)                                                                                                 \
+  floatL u, v;                                                                                                         \
+  const floatL power = offset_of_ray(ray_x[cell], ray_y[cell], ray_z[cell], splat, &u, &v);                            \
+  const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels[cell].stop);                            \
+  u = AS_FLOATL(AS_INTL(u) & taken); /* of a ray that goes away from the mean they are nothing */                      \
+  v = AS_FLOATL(AS_INTL(v) & taken);
+#else
+#define WHITENING_HERE
+#define W11 l11
+#define W12 l12
+#define W22 l22
 #define ALPHA_IN(cell)                                                                                                 \
   const floatL dy = my - AT_Y(cell);                                                                                   \
   const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;                                            \
   const floatL power = log2_alpha(u, v, log2o);                                                                        \
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels[cell].stop);
+#endif
 
 // The pair in the pixels of the cells that it reaches. Where a work-item walks many cells there is a loop for each of
 // three tasks: with short chains and few registers a processor has more cells under way (docs/performance.md).
-#if LANES >= 8
+#if LANES >= 8 && !defined(RAYS)
 #define TAKE_PAIR(reach)                                                                                               \
   floatL alpha_of[CELLS], u_of[CELLS];                                                                                 \
   Share share_of[CELLS];                                                                                               \
@@ -113,12 +156,13 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
   add_gradients(sums, pixels + cell, share_of[cell], u_of[cell], l22 * (my - AT_Y(cell)), l11, l12, l22);
 #else
 #define TAKE_PAIR(reach)                                                                                               \
+  WHITENING_HERE                                                                                                       \
   FOR_CELLS(cell, reach) {                                                                                             \
     ALPHA_IN(cell)                                                                                                     \
     if (CONTRIBUTES(taken)) {                                                                                          \
       const floatL alpha = AS_FLOATL(AS_INTL(exp2L(power)) & taken);                                                   \
       const Share share = take_out(pixels + cell, alpha, c_red, c_green, c_blue);                                      \
-      add_gradients(sums, pixels + cell, share, u, v, l11, l12, l22);                                                  \
+      add_gradients(sums, pixels + cell, share, u, v, W11, W12, W22);                                                  \
     }                                                                                                                  \
   }
 #endif
@@ -154,6 +198,10 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
                                ,
                                __global const uint *cells_from_sorted
 #endif
+#ifdef RAYS
+                               ,
+                               __constant float *camera
+#endif
 ) {
   TILE_OF_GROUP
   int last = begin;
@@ -181,6 +229,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
   }
 #else
   PIXEL_TABLES
+  RAY_TABLES
   Pixels pixels[OWNED];
   Open live = 0; // cells with a pixel that has a gradient
   ALL_CELLS(cell) {

@@ -7,6 +7,10 @@
 // Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
 #include "shared/splat.h"
+#ifdef RAYS
+#include "shared/lanes.h"
+#include "shared/rays.h"
+#endif
 
 // Norm of the gradient of mean i on the image, (n, 2) in pixels, brought to NDC (docs/gradients.md, equation 43).
 static inline float ndc_norm(__global const float *screen, const size_t i, const float x_scale, const float y_scale) {
@@ -18,6 +22,9 @@ static inline float ndc_norm(__global const float *screen, const size_t i, const
 // x_scale, y_scale to NDC -> gradient_sums (n): norms added up; seen (n): views; radii (n): largest radius in pixels
 // at 3 sigma. A view in which one of them is not finite does not count, here and below.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
+#ifdef RAYS
+                                 const float pixels, // a radian's
+#endif
                                  __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums, __global float *seen,
                                  __global float *radii) {
@@ -25,8 +32,14 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   if (i >= n || tile_counts[i] == 0) return;
   const float norm = ndc_norm(screen, i, x_scale, y_scale);
   __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
+#ifdef RAYS
+  float w11, w12, w22;
+  whitening_of_ray(splat, &w11, &w12, &w22);
+  const float radius = ceil(3.0f * (pixels * WHITEN * sqrt(larger_eigenvalue(w11, w12, w22))));
+#else
   const float l11 = splat[SPLAT_L11] / WHITEN, l12 = splat[SPLAT_L12] / WHITEN, l22 = splat[SPLAT_L22] / WHITEN;
   const float radius = ceil(3.0f * sqrt(larger_eigenvalue(l11, l12, l22)));
+#endif
   if (!(norm < INFINITY && radius < INFINITY)) return;
   gradient_sums[i] += norm;
   seen[i] += 1.0f;

@@ -15,15 +15,25 @@
 //   the scalars are those of Step, one a group where they differ. The gradient of a Gaussian that is not visible is
 //   zero, or with SPARSE its row stays as it is. After a pass that has stopped (duplicate.cl) nothing changes. With
 //   PENALTIES the gradient has that of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
-// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91).
+// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91). With RAYS
+//   docs/cameras.md, (22) to (28); with ORTHOGRAPHIC (20).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/splat.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
+#ifdef RAYS
+#include "shared/angles.h"
+#include "shared/rays.h"
+#include "shared/tangent.h"
+#endif
 #ifdef ADAM
 #include "shared/adam.h"
+#endif
+
+#if defined(ANTIALIASED) && !defined(RAYS) // which are not trained with it
+#define COMPENSATED
 #endif
 
 #ifndef ADAM
@@ -120,13 +130,23 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     for (uint k = 0; k < addends; ++k, slot += SLOT_STRIDE)
       for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] += slot[field];
     for (int field = 0; field < SLOT_STRIDE; ++field) m[field].lane[lane] = sums[field];
+#ifndef RAYS
     __global const float *splat = splats + (size_t)SPLAT_SIZE * (first_row + lane);
     whitening[0].lane[lane] = splat[SPLAT_L11];
     whitening[1].lane[lane] = splat[SPLAT_L12];
     whitening[2].lane[lane] = splat[SPLAT_L22];
+#endif
   }
+#ifdef RAYS
+  RayProjection p;
+  if (!any || !project_ray(first_row, means, quaternions, log_scales, camera, &p)) return 0;
+  whitening[0].all = WHITEN * sqrt(p.syy / p.det);
+  whitening[1].all = -(p.sxy / p.syy) * whitening[0].all;
+  whitening[2].all = WHITEN / sqrt(p.syy);
+#else
   Projection p;
   if (!any || !project_gaussians(row, means, quaternions, log_scales, camera, &p)) return 0;
+#endif
   const floatL l11 = whitening[0].all, l12 = whitening[1].all, l22 = whitening[2].all;
   const floatL m_g = m[SLOT_G].all, m_gu = m[SLOT_GU].all, m_gv = m[SLOT_GV].all;
 
@@ -138,6 +158,18 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   d->opacity.all = fmaL(opacity_weight * opacity, sigmoidL(-GATHER(opacity_logits, 1, 0)), d->opacity.all);
 #endif
 
+#ifdef RAYS // along e1 and e2 of the tangent plane; on the screen per pixel there
+  const floatL d_mx = INVERSE_WHITEN2 * m_gu, d_my = INVERSE_WHITEN2 * m_gv;
+  const float side_x = sqrt(fma1(p.t.k[0], p.t.k[0], p.t.k[1] * p.t.k[1]));
+  const float side_y = sqrt(fma1(p.t.k[2], p.t.k[2], p.t.k[3] * p.t.k[3]));
+#ifdef ABSOLUTE_GRADIENTS
+  d_screen[0].all = side_x * (INVERSE_WHITEN2 * m[SLOT_ABSX].all);
+  d_screen[1].all = side_y * (INVERSE_WHITEN2 * m[SLOT_ABSY].all);
+#else
+  d_screen[0].all = side_x * d_mx;
+  d_screen[1].all = side_y * d_my;
+#endif
+#else
   // (50). Mean on the image: -W^T (sum of g w).
   const floatL d_mx = -INVERSE_WHITEN2 * (l11 * m_gu);
   const floatL d_my = -INVERSE_WHITEN2 * fmaL(l12, m_gu, l22 * m_gv);
@@ -148,10 +180,11 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   d_screen[0].all = d_mx;
   d_screen[1].all = d_my;
 #endif
+#endif
 
   // (58). The columns of M = J A S, whitened: w[k] times the scale. Of order one, and differences of nothing large.
   const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
-#ifdef ANTIALIASED
+#ifdef COMPENSATED
   // (84). The compensated opacity falls with the determinant of the filtered covariance, and rises with the other's.
   const intL compensated = p.det0 / p.det > LEAST_COMPENSATION * LEAST_COMPENSATION;
   const floatL thinner = compensated ? m_g : (floatL)(0.0f), by_det0 = compensated ? m_g / p.det0 : (floatL)(0.0f);
@@ -165,10 +198,22 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   floatL wu[3], wv[3];
   const floatL lean = l11 / p.syy;
   FOR_AXES(k) {
+#ifdef RAYS // the same by minors of the directions' plane, and of the low-pass' columns
+    const float inverse = 1.0f / p.distance, b1 = inverse * p.c1[k], b2 = inverse * p.c2[k];
+    float minors = 0.0f;
+    for (int j = 3; j < 5; ++j) minors = fma1(p.m2[j], fma1(p.m2[j], b1, -(p.m1[j] * b2)), minors);
+    const int l = (k + 1) % 3, n = (k + 2) % 3;
+    const float by_n = camera[CAMERA_HAND] * depth_of_axis(&p, n) * (inverse * inverse);
+    const float by_l = camera[CAMERA_HAND] * depth_of_axis(&p, l) * (inverse * inverse);
+    minors = fma1(p.m2[l], p.s[l] * by_n, fma1(-p.m2[n], p.s[n] * by_l, minors));
+    wu[k] = lean * minors;
+    wv[k] = l22 * b2;
+#else
     const int l = (k + 1) % 3, n = (k + 2) % 3;
     const floatL minors = fmaL(p.s[l] * p.b2[l], p.s[l] * p.c[n], -(p.s[n] * p.b2[n] * (p.s[n] * p.c[l])));
     wu[k] = lean * fmaL((floatL)(LOW_PASS), p.b1[k], minors);
     wv[k] = l22 * p.b2[k];
+#endif
   }
 
   // (59) to (61): log scales, the turn in the Gaussian's own frame, and what the Jacobian takes of the gradient.
@@ -178,7 +223,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     const floatL nu = p.s[k] * wu[k], nv = p.s[k] * wv[k];
     const floatL tu = fmaL(uu, nu, uv * nv), tv = fmaL(uv, nu, vv * nv);
     d->scale[k].all = fmaL(nu, tu, nv * tv);
-#ifdef ANTIALIASED
+#ifdef COMPENSATED
     const floatL area = p.s[l] * p.s[n], minor = area * p.c[k]; // (85) to (87)
     const floatL other_l = p.s[n] * p.s[k] * p.c[l], other_n = p.s[k] * p.s[l] * p.c[n];
     d->scale[k].all = fmaL(by_det0, fmaL(other_l, other_l, other_n * other_n), d->scale[k].all);
@@ -187,13 +232,17 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     across_y = fmaL(lever, fmaL(p.jy * p.ry, p.a2[k], p.b2[k]), across_y);
 #endif
     d_size += d->scale[k].all;
+#ifdef RAYS
+    const floatL depth = p.s[k] * depth_of_axis(&p, k);
+#else
     const floatL depth = p.s[k] * p.a2[k];
+#endif
     along_u = fmaL(tu, depth, along_u);
     along_v = fmaL(tv, depth, along_v);
     const floatL apart = scale_difference(GATHER(log_scales, 3, l) - GATHER(log_scales, 3, n), p.s[l], p.s[n]);
     const floatL au = apart * wu[l], av = apart * wv[l], sum = p.s[l] + p.s[n];
     turned[k] = fmaL(fmaL(uu, au, uv * av), sum * wu[n], fmaL(uv, au, vv * av) * (sum * wv[n]));
-#ifdef ANTIALIASED
+#ifdef COMPENSATED
     turned[k] = fmaL(-(by_det0 * p.s[k] * p.c[l]), apart * sum * (p.s[k] * p.c[n]), turned[k]);
 #endif
   }
@@ -207,10 +256,26 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   d->quaternion[2].all = turn * fmaL(w, turned[1], fmaL(z, turned[0], -(x * turned[2])));
   d->quaternion[3].all = turn * fmaL(w, turned[2], fmaL(x, turned[1], -(y * turned[0])));
 
+#ifdef RAYS                                               // (22) to (28) of docs/cameras.md
+  const float half_u = 0.5f * l11, half_uu = half_u * uu; // G = W^T (sum of g w w^T) W / 2
+  const float turned_v = fma1(l12, uu, l22 * uv);
+  const float by_covariance[3] = {half_uu * l11, half_u * turned_v,
+                                  0.5f * fma1(l12, turned_v, l22 * fma1(l12, uv, l22 * vv))};
+  float by_low_pass[2];
+  low_pass_gradient(p.f, camera, by_covariance, by_low_pass);
+  const float turn_x = (d_mx + by_low_pass[0] - l11 * along_u / p.distance) / p.distance;
+  const float turn_y = (d_my + by_low_pass[1] - fma1(l12, along_u, l22 * along_v) / p.distance) / p.distance;
+  const float shrink = d_size / p.distance;
+  const float d_x = fma1(turn_x, p.t.e1[0], fma1(turn_y, p.t.e2[0], -(shrink * p.f[0])));
+  const float d_y = fma1(turn_x, p.t.e1[1], fma1(turn_y, p.t.e2[1], -(shrink * p.f[1])));
+  const float d_z = fma1(turn_x, p.t.e1[2], fma1(turn_y, p.t.e2[2], -(shrink * p.f[2])));
+#elif defined(ORTHOGRAPHIC) // the image is linear in x and y, and in nothing else
+  const floatL d_x = p.jx * d_mx, d_y = p.jy * d_my, d_z = (floatL)(0.0f);
+#else
   // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, J moves with
   // z alone.
   const floatL rx = p.x / p.z, ry = p.y / p.z;
-#ifdef ANTIALIASED
+#ifdef COMPENSATED
   const float hand = camera[CAMERA_HAND];
   const floatL by_j02 = fmaL(l11, along_u, -(hand * (p.jy / p.jx) * across_x));
   const floatL by_j12 = fmaL(l12, along_u, fmaL(l22, along_v, -(hand * (p.jx / p.jy) * across_y)));
@@ -222,14 +287,21 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
   const floatL d_x = p.jx * (d_mx - d_j02 / p.z), d_y = p.jy * (d_my - d_j12 / p.z);
   const floatL d_z = -fmaL(d_x, rx, fmaL(d_y, ry, d_size / p.z));
+#endif
 
   // Colour, (38) to (40): a channel that is clamped has no gradient; the basis depends on the mean through the view
   // direction, but for SH so large that the sum overflows.
   floatL vx = FROM_CAMERA(means, X, 0), vy = FROM_CAMERA(means, Y, 1), vz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(vx, vx, fmaL(vy, vy, vz * vz)));
+#ifdef ORTHOGRAPHIC // one direction for all
+  vx = (floatL)(camera[CAMERA_R20]);
+  vy = (floatL)(camera[CAMERA_R21]);
+  vz = (floatL)(camera[CAMERA_R22]);
+#else
   vx /= length;
   vy /= length;
   vz /= length;
+#endif
   Lanes weight[16];
   sh_basis(SH_USED(coefficients), vx, vy, vz, &d->basis[0].all);
   for (uint lane = 0; lane < lanes_used; ++lane) {
@@ -263,7 +335,11 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   const floatL along = d_v[0] * vx + d_v[1] * vy + d_v[2] * vz;
   FOR_AXES(k) {
     const floatL v = k == 0 ? vx : (k == 1 ? vy : vz);
+#ifdef ORTHOGRAPHIC
+    const floatL by_colour = (floatL)(0.0f);
+#else
     const floatL by_colour = (d_v[k] - along * v) / length;
+#endif
     const floatL above = by_colour < 1e37f ? by_colour : (floatL)(0.0f);
     d->mean[k].all = camera[CAMERA_R00 + k] * d_x + camera[CAMERA_R10 + k] * d_y + camera[CAMERA_R20 + k] * d_z +
                      (by_colour > -1e37f ? above : (floatL)(0.0f));

@@ -5,7 +5,7 @@
 // Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
 // Buffers: As in project.cl, but for what that can leave out of a model that is held -> splats (n, RAY_SIZE),
 //   directions in the camera's axes and distance in world units; tile_counts (n).
-// Equations: docs/cameras.md, (8) to (14); colour docs/gradients.md, (12).
+// Equations: docs/cameras.md, (8) to (14), (18), (19); colour docs/gradients.md, (12).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -14,55 +14,18 @@
 #include "shared/sh.h"
 #include "shared/angles.h"
 #include "shared/rays.h"
+#include "shared/tangent.h"
 
 // Slack of a box in pixels, over TILE_SLACK: what float32 angles lose of a picture 32768 wide.
 #define BOX_SLACK 0.1f
 
 typedef struct {
-  float e1[3], e2[3];                 // right and down on the tangent plane
-  float k[4];                         // tangent plane by pixels: what one pixel is there
-  float low_x, high_x, low_y, high_y; // box in pixels, not clamped
-  int whole_rows;                     // the box goes all the way round
-} Tangent;
-
-// (10): f: the direction; reach: of the ellipse on the tangent plane, filled in by box_of.
-static inline void tangent_of(const float *f, __constant float *camera, Tangent *t) {
-  const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
-#if RAYS == 1
-  const float level = sqrt(fma1(f[0], f[0], f[2] * f[2]));
-  const float s = level > 0.0f ? f[0] / level : 0.0f, c = level > 0.0f ? f[2] / level : 1.0f;
-  t->e1[0] = c;
-  t->e1[1] = 0.0f;
-  t->e1[2] = -s;
-  t->e2[0] = -f[1] * s;
-  t->e2[1] = level;
-  t->e2[2] = -f[1] * c;
-  const float least = 0.5f / fy; // half a row from the pole, where a pixel is a point
-  t->k[0] = (level > least ? level : least) / fx;
-  t->k[1] = t->k[2] = 0.0f;
-  t->k[3] = 1.0f / fy;
-#else
-  const float across = sqrt(fma1(f[0], f[0], f[1] * f[1]));
-  const float c = across > 0.0f ? f[0] / across : 1.0f, s = across > 0.0f ? f[1] / across : 0.0f;
-  t->e1[0] = f[2] * c;
-  t->e1[1] = f[2] * s;
-  t->e1[2] = -across;
-  t->e2[0] = -s;
-  t->e2[1] = c;
-  t->e2[2] = 0.0f;
-  const float theta = half_atan(across, f[2]);
-  const float ratio = theta > 1e-6f ? across / theta : 1.0f;
-  const float least = 0.5f / (HALF_TURN * fx);
-  const float around = ratio > least ? ratio : least;
-  t->k[0] = c / fx;
-  t->k[1] = s / fy;
-  t->k[2] = -(s * around) / fx;
-  t->k[3] = c * around / fy;
-#endif
-}
+  float low_x, high_x, low_y, high_y; // in pixels, not clamped
+  int whole_rows;                     // it goes all the way round
+} Box;
 
 // The box of all directions within an angle of f whose tangent is `reach`.
-static inline void box_of(const float *f, float reach, __constant float *camera, Tangent *t) {
+static inline void box_of(const float *f, float reach, __constant float *camera, Box *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
   const float cx = camera[CAMERA_CX] - camera[CAMERA_WINDOW_X], cy = camera[CAMERA_CY] - camera[CAMERA_WINDOW_Y];
   const float cap = quarter_atan(reach, 1.0f), sine = reach / sqrt(fma1(reach, reach, 1.0f));
@@ -85,14 +48,15 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
 #else
   const float across = sqrt(fma1(f[0], f[0], f[1] * f[1]));
   const float theta = half_atan(across, f[2]);
-  const float far = theta + cap < HALF_TURN ? theta + cap : HALF_TURN;
-  float middle_x = 0.0f, middle_y = 0.0f, half_x = far, half_y = far;
-  if (sine < 0.999f * across && theta > cap && theta + cap < HALF_TURN) {
+  const float far = theta + cap < FARTHEST_ANGLE(camera) ? theta + cap : FARTHEST_ANGLE(camera);
+  const float outer = radius_of(far, camera);
+  float middle_x = 0.0f, middle_y = 0.0f, half_x = outer, half_y = outer;
+  if (sine < 0.999f * across && theta > cap && theta + cap < FARTHEST_ANGLE(camera)) {
     // the part of a ring about the axis, in a rectangle along the mean's direction from it
     const float ratio = sine / across, cosine = sqrt(1.0f - ratio * ratio);
     const float c = f[0] / across, s = f[1] / across;
-    const float near = (theta - cap) * cosine;
-    const float middle = 0.5f * (near + far), along = 0.5f * (far - near), aside = far * ratio;
+    const float near = radius_of(theta - cap, camera) * cosine;
+    const float middle = 0.5f * (near + outer), along = 0.5f * (outer - near), aside = outer * ratio;
     middle_x = middle * c;
     middle_y = middle * s;
     half_x = fma1(fabs(c), along, fabs(s) * aside);
@@ -106,8 +70,8 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
 }
 
 // The box's tiles, as `ellipse_of` takes them.
-static inline void store_box(const Tangent *t, int width, int height, int tiles_x, int tiles_y,
-                             __constant float *camera, __global float *splat) {
+static inline void store_box(const Box *t, int width, int height, int tiles_x, int tiles_y, __constant float *camera,
+                             __global float *splat) {
   int x0 = 0, x1 = tiles_x;
   if (!t->whole_rows) {
     float low = t->low_x - BOX_SLACK, high = t->high_x + BOX_SLACK;
@@ -151,83 +115,43 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
   const size_t i = get_global_id(0);
   if (i >= n) return;
   tile_counts[i] = 0;
-  const float x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];
-  const Double in_x = CAMERA_ROW(0), in_y = CAMERA_ROW(1), in_z = CAMERA_ROW(2);
-  const float p[3] = {in_x.high, in_y.high, in_z.high};
-  const float distance = sqrt(fma1(p[0], p[0], fma1(p[1], p[1], p[2] * p[2])));
   float opacity = sigmoidL(opacity_logits[i]);
-  if (!(distance > camera[CAMERA_NEAR] && distance < 1e15f && opacity > ALPHA_MIN)) return;
-  const float f[3] = {p[0] / distance, p[1] / distance, p[2] / distance};
-  Tangent t;
-  tangent_of(f, camera, &t);
-
-  // (11), (12): M = e A S / distance, and the low-pass as two columns more; the determinant by its minors.
-  __global const float *raw = quaternions + 4 * i;
-  float norm2 = 0.0f, q[4], r[9], m1[5], m2[5];
-  for (int k = 0; k < 4; ++k) norm2 = fma1(raw[k], raw[k], norm2);
-  if (!(norm2 > 1e-30f && norm2 < 1e30f)) return;
-  const float length = sqrt(norm2);
-  for (int k = 0; k < 4; ++k) q[k] = raw[k] / length;
-  rotation_of(q, r);
-  for (int k = 0; k < 3; ++k) {
-    const float scale = expL(log_scales[3 * i + k]) / distance;
-    float a[3]; // the axis in the camera
-    for (int row = 0; row < 3; ++row)
-      a[row] = fma1(camera[CAMERA_R00 + 3 * row], r[k],
-                    fma1(camera[CAMERA_R01 + 3 * row], r[3 + k], camera[CAMERA_R02 + 3 * row] * r[6 + k]));
-    m1[k] = scale * fma1(t.e1[0], a[0], fma1(t.e1[1], a[1], t.e1[2] * a[2]));
-    m2[k] = scale * fma1(t.e2[0], a[0], fma1(t.e2[1], a[1], t.e2[2] * a[2]));
-  }
-  const float blur = sqrt(LOW_PASS);
-  for (int k = 0; k < 2; ++k) {
-    m1[3 + k] = blur * t.k[k];
-    m2[3 + k] = blur * t.k[2 + k];
-  }
-  float sxx = 0.0f, sxy = 0.0f, syy = 0.0f, det = 0.0f;
+  if (!(opacity > ALPHA_MIN)) return;
+  RayProjection p;
+  if (!project_ray(i, means, quaternions, log_scales, camera, &p)) return;
 #ifdef ANTIALIASED
-  float det0 = 0.0f;
-#endif
-  for (int k = 0; k < 5; ++k) {
-    sxx = fma1(m1[k], m1[k], sxx);
-    sxy = fma1(m1[k], m2[k], sxy);
-    syy = fma1(m2[k], m2[k], syy);
-    for (int l = 0; l < k; ++l) {
-      const float minor = fma1(m1[k], m2[l], -(m1[l] * m2[k]));
-      det = fma1(minor, minor, det);
-#ifdef ANTIALIASED
-      if (k < 3) det0 = fma1(minor, minor, det0);
-#endif
-    }
-  }
-  if (!(sxx < 1e15f && syy < 1e15f && syy > 0.0f && det > 0.0f && det < 1e30f)) return;
-#ifdef ANTIALIASED
-  opacity *= compensation(det0, det);
+  opacity *= compensation(p.det0, p.det);
   if (!(opacity > ALPHA_MIN)) return;
 #endif
+  const float *f = p.f;
+  const float sxx = p.sxx, sxy = p.sxy, syy = p.syy, det = p.det;
 
   const float l11 = WHITEN * sqrt(syy / det), l12 = -(sxy / syy) * l11, l22 = WHITEN / sqrt(syy);
   const float log2o = log2L(opacity);
   const float half_difference = 0.5f * (sxx - syy);
   const float largest = 0.5f * (sxx + syy) + sqrt(fma1(half_difference, half_difference, sxy * sxy));
-  box_of(f, sqrt(EXTENT(log2o) * largest) / WHITEN * 1.0001f, camera, &t);
+  Box box;
+  box_of(f, sqrt(EXTENT(log2o) * largest) / WHITEN * 1.0001f, camera, &box);
   __global float *splat = splats + (size_t)SPLAT_SIZE * i;
   const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
-  store_box(&t, width, height, tiles_x, tiles_y, camera, splat);
+  store_box(&box, width, height, tiles_x, tiles_y, camera, splat);
   const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
   const uint count = tile_count(&e, tiles_x);
   if (count == 0) return;
   tile_counts[i] = count;
   for (int k = 0; k < 3; ++k) {
     splat[RAY_FX + k] = f[k];
-    splat[RAY_UX + k] = fma1(l11, t.e1[k], l12 * t.e2[k]);
+    splat[RAY_UX + k] = fma1(l11, p.t.e1[k], l12 * p.t.e2[k]);
   }
+  const Tangent t = p.t;
   splat[RAY_VX] = l22 * t.e2[0];
   splat[RAY_VY] = l22 * t.e2[1];
   splat[RAY_VZ] = l22 * t.e2[2];
   splat[RAY_LOG2O] = log2o;
-  splat[RAY_DEPTH] = distance;
+  splat[RAY_DEPTH] = p.distance;
 
-  const float away[3] = {x - camera[CAMERA_PX], y - camera[CAMERA_PY], z - camera[CAMERA_PZ]};
+  const float away[3] = {means[3 * i] - camera[CAMERA_PX], means[3 * i + 1] - camera[CAMERA_PY],
+                         means[3 * i + 2] - camera[CAMERA_PZ]};
   const float far = sqrt(fma1(away[0], away[0], fma1(away[1], away[1], away[2] * away[2])));
   Lanes basis[16];
   sh_basis(SH_USED(coefficients), away[0] / far, away[1] / far, away[2] / far, &basis[0].all);

@@ -14,6 +14,7 @@ from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
     from clsplat.config.masks import MaskUse
+    from clsplat.config.training import Lenses
     from clsplat.device.context import Device, DeviceInfo
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
@@ -46,9 +47,16 @@ class Services:
     run_demo: Callable[..., dict[str, Any]] = imported("clsplat.demo.run.run_demo")
 
 
-def load_scene(services: Services, path: Path, resolution: int, test_every: int, masks: MaskUse | None = None) -> Scene:
+def load_scene(
+    services: Services,
+    path: Path,
+    resolution: int,
+    test_every: int,
+    masks: MaskUse | None = None,
+    lenses: Lenses = "undistort",
+) -> Scene:
     """The scene, with its warnings printed."""
-    how = {} if masks is None else {"masks": masks}
+    how = {"lenses": lenses} if masks is None else {"lenses": lenses, "masks": masks}
     scene = services.load_scene(path, resolution=resolution, test_every=test_every, progress=StageProgress(), **how)
     for text in scene.warnings:
         warn(text)

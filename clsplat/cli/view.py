@@ -125,7 +125,8 @@ def _scene(services: Services, path: Path | None, config: TrainConfig, *, given:
     if path is None:
         return None
     try:
-        return services.load_scene(path, resolution=config.resolution, test_every=config.test_every)
+        how = {"resolution": config.resolution, "test_every": config.test_every, "lenses": config.lenses}
+        return services.load_scene(path, **how)
     except (InputError, OSError) as error:
         if given:
             raise

@@ -17,6 +17,7 @@ from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
 
 Background = Literal["black", "white", "random"]
+Lenses = Literal["undistort", "native"]
 Growth = Literal["paper", "budget", "mcmc"]
 
 
@@ -229,6 +230,9 @@ class TrainConfig:
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, the first too; 0 holds out none. A data set's own split goes first."""
+    lenses: Lenses = "undistort"
+    """Photographs of fisheyes: undistort, to the pinhole pictures that they hold; native: trained through their own
+    lens, which sees all of them, also beyond 180 degrees. Panoramas (EQUIRECTANGULAR) always are."""
     random_points: int = 100_000
     """Number of Gaussians to start from, at random places, where a scene has no points."""
     checkpoint_every: int = 1000

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64, Int64
-from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Projected, Seen
+from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Seen
 
 ALPHA_MAX = float(np.float32(0.99))
 TRANSMITTANCE_MIN = float(np.float32(1e-4))
@@ -36,9 +36,9 @@ class Blended:
 
 @dataclass(frozen=True, eq=False)
 class BlendGradients:
-    """means2d (N, 2), abs_means2d (N, 2): per pixel of displacement, the latter the sum of the absolute values of
-    every image pixel's part; conics (N, 3): by a, b, c; opacities (N,); colors (N, 3); and contributions (N,), what
-    each adds to the image: eq. (55)."""
+    """means2d (N, 2), abs_means2d (N, 2): per pixel of displacement, or of rays per radian along the axes of the
+    tangent plane, the latter the sum of the absolute values of every image pixel's part; conics (N, 3): by a, b, c;
+    opacities (N,); colors (N, 3); and contributions (N,), what each adds to the image: eq. (55)."""
 
     means2d: Float64
     abs_means2d: Float64
@@ -107,7 +107,7 @@ def blend(
 
 
 def blend_grad(
-    projected: Projected,
+    projected: Seen,
     width: int,
     height: int,
     background: Sequence[float] | Float64,
@@ -152,8 +152,7 @@ def blend_grad(
         free = added & (splat.raw <= ALPHA_MAX)  # under the clamp alpha moves with its Gaussian
         g = np.where(free, d_alpha * alpha, 0.0)
         dx, dy = splat.dx, splat.dy
-        a, b, c = projected.conics[gaussian]
-        by_x, by_y = g * (a * dx + b * dy), g * (b * dx + c * dy)
+        by_x, by_y = (g * along for along in projected.by_mean(gaussian, splat))
         gradients.means2d[gaussian] = by_x.sum(), by_y.sum()
         gradients.abs_means2d[gaussian] = np.abs(by_x).sum(), np.abs(by_y).sum()
         gradients.conics[gaussian] = (

@@ -28,11 +28,12 @@ def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
         origins = np.stack([a, b, zero], axis=1)
         directions = np.stack([zero, zero, one], axis=1)
     elif camera.projection == "fisheye":
-        theta = np.hypot(a, b)
+        radius = np.hypot(a, b)
+        theta = angles(camera, radius)
         # sin(theta) / theta, also on the axis; np.sinc(x) is sin(pi x) / (pi x)
-        ratio = np.sinc(theta / np.pi)
+        ratio = np.sinc(theta / np.pi) * np.where(radius > 0, theta / np.where(radius > 0, radius, 1.0), 1.0)
         directions = np.stack([ratio * a, ratio * b, np.cos(theta)], axis=1)
-        directions[theta > np.pi] = np.nan
+        directions[radius > camera.fold[1]] = np.nan
     else:
         directions = np.stack([np.cos(b) * np.sin(a), np.sin(b), np.cos(b) * np.cos(a)], axis=1)
         directions[np.abs(b) > np.pi / 2] = np.nan
@@ -42,8 +43,9 @@ def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
 def pixel_from_cam(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
     """Pixels (N, 2) and depths (N,) of points (N, 3) in the camera's axes: eqs. (2) to (5).
 
-    A point without a pixel (behind a perspective or an orthographic camera, or straight behind a fisheye, where a whole
-    circle shows it) has NaN pixels. near and far are not looked at. A pixel may lie beyond the image.
+    A point without a pixel (behind a perspective or an orthographic camera, straight behind a fisheye, where a whole
+    circle shows it, or beyond its fold-over) has NaN pixels. near and far are not looked at. A pixel may lie
+    beyond the image.
     """
     x, y, z = np.asarray(points, np.float64).T
     if camera.projection == "perspective":
@@ -57,7 +59,9 @@ def pixel_from_cam(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
         across = np.hypot(x, y)
         theta = np.arctan2(across, z)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(across > 0, theta / across, np.where(z > 0, 0.0, np.nan))
+            ratio = np.where(across > 0, radii(camera, theta)[0] / across, np.where(z > 0, 0.0, np.nan))
+        if any(camera.radial):
+            ratio = np.where(theta < camera.fold[0], ratio, np.nan)
         a, b = ratio * x, ratio * y
         depths = np.hypot(across, z)
     else:
@@ -69,6 +73,28 @@ def pixel_from_cam(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
     if camera.projection == "equirectangular":
         pixels[:, 0] = wrapped(camera, pixels[:, 0])
     return pixels, depths
+
+
+def radii(camera: Camera, theta: Float64) -> tuple[Float64, Float64, Float64]:
+    """Distances of a fisheye's directions from the picture's middle in focal lengths, by their angles from the axis:
+    eq. (18); and the first and second derivative."""
+    powers, factors = 2 * np.arange(5), np.array([1.0, *camera.radial])
+    series = theta[:, None] ** powers
+    radius, slope = theta * (series @ factors), series @ (factors * (powers + 1))
+    bend = theta * (series[:, :4] @ (factors * (powers + 1) * powers)[1:])
+    return radius, slope, bend
+
+
+def angles(camera: Camera, radius: Float64) -> Float64:
+    """The inverse of `radii`, by bisection; the distance itself where nothing is bent."""
+    if not any(camera.radial):
+        return radius
+    low, high = np.zeros_like(radius), np.full_like(radius, camera.fold[0])
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        over = radii(camera, middle)[0] > radius
+        low, high = np.where(over, low, middle), np.where(over, middle, high)
+    return 0.5 * (low + high)
 
 
 def period(camera: Camera) -> float:

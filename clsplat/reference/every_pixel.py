@@ -12,11 +12,12 @@ import numpy as np
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
-from clsplat.reference.blend import blend
+from clsplat.reference import render as on_plane
+from clsplat.reference.blend import blend, blend_grad
 from clsplat.reference.channels import Channels, channels
 from clsplat.reference.project import Footprint, Projected, Seen, project
-from clsplat.reference.rays import tangents
-from clsplat.reference.render import BLACK, parameters
+from clsplat.reference.rays import footprints, pixel_sides, tangents, tangents_grad
+from clsplat.reference.render import BLACK, Gradients, parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,3 +59,18 @@ def render(
     blended = blend(seen, camera.width, camera.height, background)
     others = channels(seen, gaussians, camera, after or camera)
     return Picture(**vars(others), image=blended.image, alpha=1 - blended.transmittance, margin=blended.margin)
+
+
+def render_grad(
+    gaussians: Gaussians, camera: Camera, d_image: Float64, background: Sequence[float] | Float64 = BLACK
+) -> Gradients:
+    """Gradients of a loss with dL/dimage = d_image (H, W, 3), of a camera of any projection; those of means on the
+    image of rays are along the axes of the tangent plane, per pixel there."""
+    if camera.kind.flat:
+        return on_plane.render_grad(gaussians, camera, d_image, background)
+    seen = tangents(gaussians, camera)
+    screen = blend_grad(seen, camera.width, camera.height, background, d_image)
+    by_parameter = tangents_grad(gaussians, camera, seen, screen)
+    sides = pixel_sides(footprints(seen.directions, camera)[2])
+    on_image = {"means2d": sides * screen.means2d, "abs_means2d": sides * screen.abs_means2d}
+    return Gradients(**{**vars(screen), **on_image}, parameters=by_parameter, visible=seen.visible)

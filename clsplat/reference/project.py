@@ -63,6 +63,15 @@ class Seen(ABC):
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:
         """One of them on the image; None where it misses that."""
 
+    @abstractmethod
+    def conic(self, gaussian: int) -> Float64:
+        """a, b, c with which q is a dx^2 + 2 b dx dy + c dy^2, of one of them."""
+
+    def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
+        """Derivatives of -q / 2 by the mean in each pixel, along the axes of dx and dy: eq. (25)."""
+        a, b, c = self.conic(gaussian)
+        return a * splat.dx + b * splat.dy, b * splat.dx + c * splat.dy
+
 
 @dataclass(frozen=True, eq=False)
 class Projected(Seen):
@@ -79,6 +88,10 @@ class Projected(Seen):
     conics: Float64
     whitening: Float64
     half_extents: Float64
+
+    def conic(self, gaussian: int) -> Float64:
+        found: Float64 = self.conics[gaussian]
+        return found
 
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:
         """Eqs. (9), (14) on the box that alpha >= 1/255 can reach."""
@@ -264,7 +277,7 @@ def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
     return np.stack([result[:, 0, 0], result[:, 0, 1], result[:, 1, 1]], axis=1)
 
 
-def _quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
+def quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
     """Eqs. (34), (35): raw quaternions (N, 4), dL/dR (N, 3, 3) -> dL/dq (N, 4), orthogonal to q."""
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
     unit = quaternions / norms
@@ -281,6 +294,20 @@ def _quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
     )
     gradient: Float64 = (d_unit - unit * (unit * d_unit).sum(axis=1, keepdims=True)) / norms
     return gradient
+
+
+def colour_grad(
+    means: Float64, sh: Float64, camera: Camera, sh_degree: int, colors: Float64, d_colors: Float64
+) -> tuple[Float64, Float64, Float64]:
+    """Eqs. (38) to (40): the basis (N, K), the gradient by the colour before its clamp (N, 3), and by the mean through
+    the direction it is seen in (N, 3)."""
+    directions, distances = view_directions(means, camera)
+    basis = sh_basis(directions, sh_degree)
+    d_value = np.where(colors > 0, d_colors, 0.0)  # (39)
+    of_direction = sh_basis_grad(directions, sh_degree)
+    d_directions = np.einsum("nkd,nkc,nc->nd", of_direction, sh[:, : basis.shape[1]], d_value)
+    radial = (directions * d_directions).sum(axis=1, keepdims=True)
+    return basis, d_value, (d_directions - directions * radial) / distances  # (38), (40)
 
 
 def project_grad(
@@ -303,9 +330,10 @@ def project_grad(
     where culled.
 
     projected: what `project` made; d_means2d (N, 2), d_covariances (N, 3): xx, xy, yy as in (28), d_opacities (N,),
-    d_colors (N, 3). For perspective cameras alone.
+    d_colors (N, 3). Of an orthographic camera J does not change, and no colour follows the mean. Those of rays:
+    `reference.rays`.
     """
-    assert camera.projection == "perspective"
+    assert camera.kind.flat
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
     x, y, z = geometry.p.T
@@ -320,28 +348,29 @@ def project_grad(
     d_jacobian = d_half @ (camera.rotation @ factor).transpose(0, 2, 1)  # (32)
     d_factor = (geometry.jacobian @ camera.rotation).transpose(0, 2, 1) @ d_half  # (32)
     d_log_scales = (d_factor * factor).sum(axis=1)  # (33)
-    d_quaternions = _quaternion_grad(quaternions[rows], d_factor * geometry.scales[:, None, :])
+    d_quaternions = quaternion_grad(quaternions[rows], d_factor * geometry.scales[:, None, :])
 
-    # (36): the Jacobian's entries by z and by the clamped ratios; a clamped ratio does not move with the mean
-    d00, d02, d11, d12 = d_jacobian[:, 0, 0], d_jacobian[:, 0, 2], d_jacobian[:, 1, 1], d_jacobian[:, 1, 2]
-    d_z = (-camera.fx * d00 + camera.fx * geometry.ratios[:, 0] * d02) / z**2
-    d_z += (-camera.fy * d11 + camera.fy * geometry.ratios[:, 1] * d12) / z**2
-    d_ratio_x = np.where(geometry.unclamped[:, 0], -camera.fx * d02 / z, 0.0)
-    d_ratio_y = np.where(geometry.unclamped[:, 1], -camera.fy * d12 / z, 0.0)
-    # (37): the mean itself is projected unclamped
-    d_ratio_x = d_ratio_x + camera.fx * d_means2d[rows, 0]
-    d_ratio_y = d_ratio_y + camera.fy * d_means2d[rows, 1]
-    d_z -= (d_ratio_x * x + d_ratio_y * y) / z**2
-    d_p = np.stack([d_ratio_x / z, d_ratio_y / z, d_z], axis=1)
+    if camera.projection == "orthographic":
+        d_p = d_means2d[rows] * [camera.fx, camera.fy]
+        d_p = np.concatenate([d_p, np.zeros((len(rows), 1))], axis=1)
+    else:
+        # (36): the Jacobian's entries by z and by the clamped ratios; a clamped ratio does not move with the mean
+        d00, d02, d11, d12 = d_jacobian[:, 0, 0], d_jacobian[:, 0, 2], d_jacobian[:, 1, 1], d_jacobian[:, 1, 2]
+        d_z = (-camera.fx * d00 + camera.fx * geometry.ratios[:, 0] * d02) / z**2
+        d_z += (-camera.fy * d11 + camera.fy * geometry.ratios[:, 1] * d12) / z**2
+        d_ratio_x = np.where(geometry.unclamped[:, 0], -camera.fx * d02 / z, 0.0)
+        d_ratio_y = np.where(geometry.unclamped[:, 1], -camera.fy * d12 / z, 0.0)
+        # (37): the mean itself is projected unclamped
+        d_ratio_x = d_ratio_x + camera.fx * d_means2d[rows, 0]
+        d_ratio_y = d_ratio_y + camera.fy * d_means2d[rows, 1]
+        d_z -= (d_ratio_x * x + d_ratio_y * y) / z**2
+        d_p = np.stack([d_ratio_x / z, d_ratio_y / z, d_z], axis=1)
 
-    directions, distances = view_directions(means[rows], camera)
-    basis = sh_basis(directions, sh_degree)
+    basis, d_value, d_by_colour = colour_grad(
+        means[rows], sh[rows], camera, sh_degree, projected.colors[rows], d_colors[rows]
+    )
     count = basis.shape[1]
-    free = projected.colors[rows] > 0
-    d_value = np.where(free, d_colors[rows], 0.0)  # (39)
-    d_directions = np.einsum("nkd,nkc,nc->nd", sh_basis_grad(directions, sh_degree), sh[rows, :count], d_value)
-    radial = (directions * d_directions).sum(axis=1, keepdims=True)
-    d_means = d_p @ camera.rotation + (d_directions - directions * radial) / distances  # (38), (40)
+    d_means = d_p @ camera.rotation + d_by_colour
 
     opacities = projected.opacities[rows]
     gradients = {

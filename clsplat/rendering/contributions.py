@@ -13,7 +13,6 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
 from clsplat.device.layout import SlotFields
-from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import drop_sh
 from clsplat.rendering.memory_needs import plan_step
@@ -30,15 +29,10 @@ def largest_contributions(
     """(n,) the most that each adds to one camera's picture: the sum over its pixels of alpha times transmittance, in
     pixels, like `--density.min-contribution`; 0 where no camera sees it.
 
-    It comes from the gradient of blending, and is the same for any gradient of the image. Raises InputError for a
-    camera without an image plane, CapacityError where the device is too small.
+    It comes from the gradient of blending, and is the same for any gradient of the image. Raises
+    CapacityError where the device is too small.
     """
     config = config or RasterizerConfig()
-    for camera in cameras:
-        if not camera.kind.flat:
-            raise InputError(
-                f"contributions to {camera.projection} cameras are not known, expected perspective or orthographic ones"
-            )
     alpha_alone = drop_sh(gaussians, 0)  # colour does not matter
     plan = plan_step(device, len(gaussians), 1, cameras, config, fields=FIELDS, agreement=False)
     rasterizer = Rasterizer(device, config)
@@ -56,7 +50,7 @@ def largest_contributions(
 
 def sums_of_weights(rasterizer: Rasterizer, frame: Frame) -> Float32:
     """(n,) the sum over the frame's pixels of each Gaussian's alpha times transmittance."""
-    slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=FIELDS, contributions_alone=True)
+    slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=FIELDS)
     sums, tile_counts = slots.values, frame.projected.tile_counts
     if slots.first_slots is not None:
         sums = add_slots(rasterizer.device, rasterizer.work, tile_counts, slots, None, fields=FIELDS)

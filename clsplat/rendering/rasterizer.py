@@ -11,12 +11,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import PROJECTIONS, Camera
+from clsplat.camera import BENT_FISHEYE, PROJECTIONS, Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, pinned
 from clsplat.device.context import Device
 from clsplat.device.layout import CAMERA, PLAIN_SLOTS, READBACK, WIDEST_SLOTS, SlotFields
-from clsplat.errors import InputError
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
 from clsplat.stages.blend import Blended, blend, blend_grad
@@ -106,9 +105,9 @@ class Rasterizer:
     def antialias(self, *, on: bool) -> None:
         """Draw models that are antialiased from here on, or those that are not (`Gaussians.antialiased`)."""
         self.device = self._bare.with_switches(kernel_defines(self.config, antialiased=on))
-        self._by_projection = {
-            name: self.device.with_switches(kind.defines) if kind.defines else self.device
-            for name, kind in PROJECTIONS.items()
+        self._by_kind = {
+            id(kind): self.device.with_switches(kind.defines) if kind.defines else self.device
+            for kind in (*PROJECTIONS.values(), BENT_FISHEYE)
         }
 
     def follow(self, plan: Plan) -> None:
@@ -202,7 +201,7 @@ class Rasterizer:
 
     def device_of(self, camera: Camera) -> Device:
         """The device with the switches that the camera's projection wants of the kernels."""
-        return self._by_projection[camera.projection]
+        return self._by_kind[id(camera.kind)]
 
     def _part(
         self,
@@ -231,7 +230,7 @@ class Rasterizer:
         slots = self.pair_gradients(frame, image_gradient, fields=fields)
         screen = self.screen(gaussians.count, fields)
         arrays = (gaussians, frame.camera_array, frame.projected, slots, gradients, screen)
-        project_grad(self.device, *arrays, fields=fields)
+        project_grad(self.device_of(frame.camera), *arrays, fields=fields)
         return screen
 
     def screen(self, count: int, fields: SlotFields) -> Screen:
@@ -245,20 +244,13 @@ class Rasterizer:
         image_gradient: DeviceArray,
         *,
         fields: SlotFields = PLAIN_SLOTS,
-        contributions_alone: bool = False,
     ) -> Slots:
-        """The gradient of blending: of every pair, or with several bands their sums by Gaussian. Raises InputError for
-        a projection that has no gradient. contributions_alone: the caller takes nothing else from the slots; these an
-        orthographic camera has too."""
-        camera, device, work = frame.camera, self.device, self.work
-        if not (camera.kind.gradient or (contributions_alone and camera.kind.flat)):
-            raise InputError(
-                f"a gradient is asked for of a camera that is {camera.projection}, expected a perspective one"
-            )
+        """The gradient of blending: of every pair, or with several bands their sums by Gaussian."""
+        device, work = self.device_of(frame.camera), self.work
         pixels = (frame.projected.splats, frame.background, frame.blended, image_gradient)
 
         def slots(part: Part) -> Slots:
-            values = blend_grad(device, work, part.lists, *pixels, fields=fields)
+            values = blend_grad(device, work, part.lists, *pixels, fields=fields, camera_array=frame.camera_array)
             return Slots(values, part.counted.first_slots)
 
         if len(frame.bands) == 1:

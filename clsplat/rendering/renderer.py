@@ -106,6 +106,8 @@ class Renderer:
         after = after or camera
         camera.check()
         after.check()
+        if "motion" in wanted and any(camera.radial):
+            raise InputError("motion is not defined for a fisheye with coefficients, expected one without or a pinhole")
         if "motion" in wanted and after.projection != camera.projection:
             raise InputError(
                 f"motion goes from a camera to one that is {after.projection}, expected {camera.projection}"

@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
+from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples, warn
 from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
@@ -27,7 +28,15 @@ with undisturbed():  # it says of a Ctrl-C that it is not installed, and puts a 
     import pycolmap
 
 
-REFUSED = {"EQUIRECTANGULAR": "a panorama has no pinhole camera; cut it into perspective views first"}
+RADIAL: dict[str, int] = {
+    "SIMPLE_FISHEYE": 0,
+    "FISHEYE": 0,
+    "SIMPLE_RADIAL_FISHEYE": 1,
+    "RADIAL_FISHEYE": 2,
+    "OPENCV_FISHEYE": 4,
+}
+"""Models of fisheyes that a camera can be without undistortion, and their numbers of coefficients."""
+PANORAMA = "EQUIRECTANGULAR"
 
 MAX_SIZE = 1 << 20
 """Pixels a side; larger is a damaged file. Also keeps width times height far from overflow."""
@@ -67,7 +76,7 @@ class Lens:
         if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
             return True
         camera = self._camera()
-        bends = self.model in ("FOV", "EUCM") or "FISHEYE" in self.model
+        bends = self.model in ("FOV", "EUCM", PANORAMA) or "FISHEYE" in self.model
         return not bends and not any(self.params[index] for index in camera.extra_params_idxs())
 
     def pinhole(self, rotation: Float64, translation: Float64) -> Camera:
@@ -91,8 +100,26 @@ class Lens:
             translation=translation,
         )
 
+    def camera(self, rotation: Float64, translation: Float64, lenses: Lenses) -> Camera:
+        """The camera that its pictures are trained with: itself where that is a panorama, or a fisheye that is left as
+        it is, else `pinhole`."""
+        of = self._camera()
+        if self.model == PANORAMA:
+            fx, fy, cx, cy = self.width / math.tau, self.height / math.pi, self.width / 2, self.height / 2
+            where = (self.width, self.height, fx, fy, cx, cy, rotation, translation)
+            return Camera(*where, projection="equirectangular")
+        if lenses == "undistort" or self.model not in RADIAL:
+            return self.pinhole(rotation, translation)
+        given = [self.params[index] for index in of.extra_params_idxs()]
+        radial = (*given, *[0.0] * (4 - len(given)))
+        focal, centre = (of.focal_length_x, of.focal_length_y), (of.principal_point_x, of.principal_point_y)
+        where = (self.width, self.height, *focal, *centre, rotation, translation)
+        return Camera(*where, projection="fisheye", radial=radial)
+
     def resized(self, width: int, height: int) -> Lens:
         """The same lens on another pixel grid."""
+        if self.model == PANORAMA:
+            return Lens(self.model, width, height, (float(width), float(height)))
         camera = self._camera()
         sx, sy = width / self.width, height / self.height
         params = list(self.params)
@@ -141,10 +168,13 @@ class DataSet:
 
 
 def cameras_of(images: Sequence[PosedImage]) -> dict[str, Camera]:
-    """The pinhole cameras that the images become, at full size, by name. Warns of lenses beyond reason."""
+    """The cameras that the images become, pinhole ones but for panoramas, at full size, by name. Warns of lenses beyond
+    reason."""
     if doubt := absurd([(image.name, image.lens) for image in images]):
         warn(doubt)
-    pinholes = {lens: lens.pinhole(np.eye(3), np.zeros(3)) for lens in dict.fromkeys(image.lens for image in images)}
+    pinholes = {
+        lens: lens.camera(np.eye(3), np.zeros(3), "undistort") for lens in dict.fromkeys(image.lens for image in images)
+    }
     return {
         image.name: replace(pinholes[image.lens], rotation=image.rotation, translation=image.translation)
         for image in images
@@ -154,10 +184,8 @@ def cameras_of(images: Sequence[PosedImage]) -> dict[str, Camera]:
 def check_lens(lens: Lens, where: str) -> Lens:
     """`lens` itself; raises InputError, beginning with `where`, for one that cannot be used."""
     counts = dict(models().values())
-    if lens.model in REFUSED:
-        raise InputError(f"{where}: camera model {lens.model} is not supported: {REFUSED[lens.model]}")
     if lens.model not in counts:
-        listed = ", ".join(name for name in counts if name not in REFUSED)
+        listed = ", ".join(counts)
         raise InputError(f"{where}: unknown camera model {lens.model}, expected one of {listed}")
     if len(lens.params) != counts[lens.model]:
         raise InputError(
@@ -165,6 +193,13 @@ def check_lens(lens: Lens, where: str) -> Lens:
         )
     if not (0 < lens.width <= MAX_SIZE and 0 < lens.height <= MAX_SIZE):
         raise InputError(f"{where}: image size {lens.width} x {lens.height}, expected 1 to {MAX_SIZE} pixels a side")
+    if lens.model == PANORAMA:
+        if list(lens.params) != [lens.width, lens.height]:
+            sides = f"{lens.width} {lens.height}"
+            raise InputError(
+                f"{where}: parameters {list(lens.params)}, expected its size, {sides}, of a whole panorama"
+            )
+        return lens
     camera = lens._camera()  # noqa: SLF001
     focal = [lens.params[index] for index in camera.focal_length_idxs()]
     if not all(math.isfinite(value) for value in lens.params) or min(focal) <= 0:
@@ -189,7 +224,7 @@ def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
 def _bends(lens: Lens) -> bool:
     """True if the lens moves what a pinhole camera of its focal length has at the picture's edge by a large part of it.
     Fisheyes and the like are meant to, and count as False."""
-    if lens.is_pinhole or lens.model in ("FOV", "EUCM") or "FISHEYE" in lens.model:
+    if lens.is_pinhole or lens.model in ("FOV", "EUCM", PANORAMA) or "FISHEYE" in lens.model:
         return False
     pinhole = lens.pinhole(np.eye(3), np.zeros(3))
     half = np.array([lens.width, lens.height]) / 2

@@ -17,7 +17,8 @@ from clsplat.images.alpha import composite
 from clsplat.spherical_harmonics import C0
 
 if TYPE_CHECKING:
-    from clsplat.scenes.scene import Scene
+    from clsplat.scenes.data_set import Lens
+from clsplat.scenes.scene import Scene
 
 INITIAL_OPACITY = 0.1
 MIN_SQUARED_DISTANCE = 1e-7
@@ -133,17 +134,26 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
             max(round(factor * view.camera.width), 1), max(round(factor * view.camera.height), 1)
         ).before(scene.near)
         picture = composite(view.load(camera.width, camera.height), background)
-        rows, columns, inside = pixels_of(scene.points, camera)
+        rows, columns, inside = pixels_of(scene.points, camera, view.lens)
         sums[inside] += picture[rows, columns]
         seen[inside] += 1
     means = np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], UNSEEN)
     return np.clip(means, 0, 1).astype(np.float32)
 
 
-def pixels_of(points: Float64, camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+def pixels_of(
+    points: Float64, camera: Camera, lens: Lens | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Rows and columns of the pixels that show the points (N, 3) of the world, of those before the camera and in its
-    picture, which are `inside` (N,)."""
+    picture, which are `inside` (N,). lens: of a camera that is no pinhole."""
     local = points @ camera.rotation.T + camera.translation
+    if lens is not None and camera.projection != "perspective":
+        place = lens.resized(camera.width, camera.height).img_from_cam(local)
+        angle = np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
+        ahead = (np.linalg.norm(local, axis=1) > camera.near) & (angle <= camera.fold[0])
+        with np.errstate(invalid="ignore"):
+            shown = ahead & ((place >= 0) & (place < [camera.width, camera.height])).all(axis=1)
+        return place[shown, 1].astype(np.int64), place[shown, 0].astype(np.int64), shown
     depth = local[:, 2]
     ahead = depth > camera.near
     by = np.where(ahead, depth, 1.0)

@@ -18,6 +18,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, NEARS, Camera
 from clsplat.config.checks import misfit
 from clsplat.config.masks import MaskUse
+from clsplat.config.training import Lenses
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError, examples, plain, warn
 from clsplat.files import digest, short_digest
@@ -45,7 +46,7 @@ BLENDER_CUBE = 1.3
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture and the pinhole camera that took it.
+    """A picture and the camera that took it.
 
     name: as in the data set, with extension, unique in the scene; camera: at the working size; path: the file that is
     read; split: "train" or "test"; lens: what the file was taken through, at the file's size; upright: the camera
@@ -95,7 +96,7 @@ class View:
         return np.ascontiguousarray(np.where(whole, result, np.float32(0)), np.float32)
 
     def _fitted(self, image: Float32, width: int, height: int) -> Float32:
-        if self.lens.is_pinhole:
+        if self.lens.is_pinhole or self.camera.projection != "perspective":
             return downscale(image, width, height)
         return undistort(image, self.lens, self.camera.resized(width, height))
 
@@ -260,6 +261,7 @@ def load_scene(
     resolution: int = 0,
     test_every: int = TEST_EVERY,
     images: str | Path | None = None,
+    lenses: Lenses = "undistort",
     work_dir: Path | None = None,
     progress: Progress | None = None,
     masks: MaskUse | None = None,
@@ -270,7 +272,7 @@ def load_scene(
     larger than the pictures are; 0 keeps their size up to 1600. test_every: each n-th view by name is held out, 0 for
     none; a data set's own split goes before it. images: another folder of pictures for a COLMAP model, relative to
     `path`, such as "images_4". Without it, images_2, images_4 or images_8 stand in where their pictures have just the
-    size that is wanted.
+    size that is wanted. lenses: fisheyes become pinhole cameras, or stay what they are ("native").
 
     A folder of photos goes through `clsplat.scenes.sfm` first, into work_dir (NAME_colmap beside it if not given),
     where a result for the same photos is found again; progress(text, fraction or None) is called on the way.
@@ -308,7 +310,7 @@ def load_scene(
         views = []
         for index, image in enumerate(posed):
             held_out = image.split == "test" if own_split else test_every > 0 and index % test_every == 0
-            view = _view(image, "test" if held_out else "train", resolution, smaller)
+            view = _view(image, "test" if held_out else "train", resolution, smaller, lenses)
             views.append(replace(view, mask=of_pictures.get(image.name)))
         _warn_of_copies(views)
     if kind == "blender":
@@ -417,10 +419,10 @@ def _warn_of_copies(views: list[View]) -> None:
         )
 
 
-def _view(image: PosedImage, split: Split, resolution: int, smaller: list[Path]) -> View:
+def _view(image: PosedImage, split: Split, resolution: int, smaller: list[Path], lenses: Lenses) -> View:
     """The image at the working size, its header checked."""
     lens, upright = _fit(image.path, image.lens)
-    camera = lens.pinhole(image.rotation, image.translation)
+    camera = lens.camera(image.rotation, image.translation, lenses)
     longest = max(camera.width, camera.height)
     scale = min(1.0, (resolution or MAX_SIZE) / longest)
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))

@@ -23,7 +23,7 @@ from clsplat.errors import InputError, examples, warn
 from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.images.reading import EXTENSIONS, image_size, require_images
 from clsplat.models.formats import ply
-from clsplat.scenes.data_set import MAX_NUMBER, MAX_SIZE, DataSet, Lens, PosedImage, cameras_of, check_lens
+from clsplat.scenes.data_set import MAX_NUMBER, MAX_SIZE, PANORAMA, DataSet, Lens, PosedImage, cameras_of, check_lens
 
 DRIVE = re.compile(r"\A[A-Za-z]:/")
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -307,6 +307,9 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
         else:
             width, height = actual
     assert height is not None
+    if keys.get("camera_model") == PANORAMA:
+        sides = round(width), round(height)
+        return check_lens(Lens(PANORAMA, *sides, tuple(map(float, sides))), keys.where)
     fx = _focal(keys, "fl_x", "camera_angle_x", width)
     fy = _focal(keys, "fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
@@ -344,7 +347,7 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
     if model in FISHEYE or keys.get("is_fisheye") is True:
         return "OPENCV_FISHEYE", [k1, k2, k3, k4]
     if model not in PERSPECTIVE:
-        listed = ", ".join(name for name in (*PERSPECTIVE, *FISHEYE) if name)
+        listed = ", ".join(name for name in (*PERSPECTIVE, *FISHEYE, PANORAMA) if name)
         raise InputError(f"{keys.where}: unknown 'camera_model' {short(model)}, expected one of {listed}")
     if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
         return "PINHOLE", []

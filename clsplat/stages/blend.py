@@ -88,7 +88,7 @@ def blend(
     left as they are.
 
     record: keep the cells that the gradient has to go through, where the kernels' shape has them; camera_array: for
-    pixels that are rays, which have no gradient.
+    pixels that are rays.
     """
     planes = _planes(work, width, height, kept=lists.band.first > 0)
     cells, rays = None, device.switched("RAYS")
@@ -133,22 +133,25 @@ def blend_grad(
     image_gradient: DeviceArray,
     *,
     fields: SlotFields = PLAIN_SLOTS,
+    camera_array: DeviceArray | None = None,
 ) -> DeviceArray:
     """Partial gradients of every pair of the lists at its slot, (pairs, fields.floats), from image_gradient (3, rows,
-    stride), or (4, rows, stride) with the loss's gradient by the transmittance."""
+    stride), or (4, rows, stride) with the loss's gradient by the transmittance; camera_array: for pixels that are
+    rays."""
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]
     slots = work.array("slots", (pairs, fields.floats))
     if pairs == 0:
         return slots
-    cells = blended.cells_from_sorted
+    cells, rays = blended.cells_from_sorted, device.switched("RAYS")
     defines = {**fields.defines, **({"RECORD_CELLS": True} if cells else {})}
-    if device.shape.by_gaussian:
+    if device.shape.by_gaussian and not rays:
         defines["BY_GAUSSIAN"] = True
     if image_gradient.shape[0] == 4:
         defines["ALPHA_GRADIENT"] = True
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
     planes = (image_gradient, blended.transmittance, blended.stops)
-    arrays = (*listed, splats, background, *planes, slots, *([cells] if cells else []))
+    extra = ([cells] if cells else []) + ([camera_array] if rays else [])
+    arrays = (*listed, splats, background, *planes, slots, *extra)
     launch_tiles(device, "blend_grad", defines, lists, stride // TILE, rows, *arrays)
     return slots

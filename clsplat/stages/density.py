@@ -111,10 +111,12 @@ def add_statistics(
     """Add one view: the norm of each visible mean's gradient, in NDC as the paper's threshold is. Where agreeing views
     are counted, those with at least the threshold count."""
     n = projected.tile_counts.shape[0]
-    kernels = device.kernels("density")
+    rays = not camera.kind.flat
+    kernels = device.kernels("density", **({"RAYS": camera.kind.defines["RAYS"]} if rays else {}))
     to_ndc = (0.5 * camera.width, 0.5 * camera.height)
     view, sums = (projected.tile_counts, screen.gradients), (statistics.gradient_sums, statistics.seen)
-    launch_items(device, kernels.density_statistics, n, n, *to_ndc, *view, projected.splats, *sums, statistics.radii)
+    sizes = (*to_ndc, camera.fx) if rays else to_ndc
+    launch_items(device, kernels.density_statistics, n, n, *sizes, *view, projected.splats, *sums, statistics.radii)
     if statistics.agreeing is not None:
         launch_items(device, kernels.view_agreement, n, n, *to_ndc, threshold, *view, statistics.agreeing)
 

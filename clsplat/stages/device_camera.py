@@ -39,7 +39,9 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "YMAX": (window.height - camera.cy) / camera.fy + window.clamp * half_h,
         "WINDOW_X": window.x,
         "WINDOW_Y": window.y,
+        **{f"K{index}": value for index, value in enumerate(camera.radial, 1)},
     }
+    values["FOLD"], values["FOLD_RADIUS"] = camera.fold
     position = camera.position
     for row in range(3):
         values[_TRANSLATION[row]] = camera.translation[row]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -146,13 +147,14 @@ def project_grad(
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` from the pairs' slots,
     which have `fields`; explore: its penalties are added."""
-    weights = _weights(explore)
-    defines = {**_defines(gaussians, slots, fields, sh_rest=sh_rest), **({"PENALTIES": True} if weights else {})}
+    weights, build = _weights(explore), _build(device)
+    defines = {**_defines(gaussians, slots, fields, sh_rest=sh_rest), **build.defines}
+    defines |= {"PENALTIES": True} if weights else {}
     n = gaussians.count
     launch_items(
         device,
         device.kernels("project_grad", **defines).project_grad,
-        -(-n // device.shape.lanes) if slots.values.shape[0] else 0,
+        -(-n // build.lanes) if slots.values.shape[0] else 0,
         *_inputs(gaussians, camera_array, projected, slots),
         *(model[group] for model in (gaussians, gradients) for group in GROUPS),
         screen.gradients,
@@ -202,7 +204,9 @@ def project_step(
         readback.buffer,  # no array that a step goes through: it is touched where something is wrong
         *(arrays[group] for arrays in model for group in GROUPS),
     )
-    if device.shape.lanes > 1:
+    build = _build(device)
+    defines |= build.defines
+    if build.lanes > 1:
         kernel = device.kernels("project_grad", ROWS=ROWS, **defines).project_step
         launch_groups(device, kernel, -(-parameters.count // ROWS), 1, *arguments)
     else:
@@ -213,6 +217,18 @@ def project_step(
 def _weights(explore: Exploration | None) -> tuple[float, ...]:
     """Weights of the penalties on opacity and scale, none where there are none."""
     return (explore.opacity, explore.scale) if explore is not None and explore.penalised else ()
+
+
+class _Build(NamedTuple):
+    """Gaussians of a work-item of the gradient, and defines where these are not the shape's."""
+
+    lanes: int
+    defines: dict[str, object]
+
+
+def _build(device: Device) -> _Build:
+    """Of rays one, as of their projection."""
+    return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 
 def _defines(gaussians: DeviceGaussians, slots: Slots, fields: SlotFields, *, sh_rest: bool) -> dict[str, object]:

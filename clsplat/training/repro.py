@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import clsplat
-from clsplat.camera import Camera
+from clsplat.camera import PROJECTIONS, Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.context import Device, open_device
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 
 RECORD = "bundle.json"
 """The member of a bundle with everything that is no array."""
+_LENS = ("width", "height", "fx", "fy", "cx", "cy", "near", "projection", "radial")
 _KINDS = ("parameters", "first", "second")
 
 
@@ -82,7 +83,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
         "stage": incident.stage,
         "message": str(incident),
         "rates": trainer.rates(),
-        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "near")},
+        "camera": {name: getattr(camera, name) for name in _LENS},
         "settings": config_text(trainer.config, None),
         "versions": {
             "clsplat": clsplat.__version__,
@@ -140,7 +141,8 @@ def read_bundle(path: Path) -> Bundle:
 def _bundle_of(arrays: dict[str, NDArray[Any]], path: Path) -> Bundle:
     record = parse_json(arrays[RECORD].tobytes())
     config, _ = parse_config(record["settings"], path)
-    camera = Camera(**record["camera"], rotation=arrays["rotation"], translation=arrays["translation"])
+    lens = {**record["camera"], "radial": tuple(record["camera"].get("radial", (0.0,) * 4))}
+    camera = Camera(**lens, rotation=arrays["rotation"], translation=arrays["translation"])
     models = {kind: host_model(arrays, kind) for kind in _KINDS}
     return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
 
@@ -159,6 +161,8 @@ def _checked(bundle: Bundle) -> Bundle:
     numbers = (camera.rotation, camera.translation, [camera.fx, camera.fy, camera.cx, camera.cy, camera.near])
     if not all(np.isfinite(values).all() for values in numbers) or bundle.background.shape != (3,):
         raise ValueError("a camera that is none")
+    if camera.projection not in PROJECTIONS or len(camera.radial) != 4 or not np.isfinite(camera.radial).all():
+        raise ValueError("a camera without a projection")
     rates = record["rates"]
     if type(record["step"]) is not int or not np.isfinite([float(rates[group]) for group in GROUPS]).all():
         raise ValueError("no step and no learning rates")

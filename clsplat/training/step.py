@@ -56,10 +56,11 @@ class ViewRows:
 @dataclass(frozen=True, eq=False)
 class StepRows(ViewRows):
     """The same with all that a step has of them: model: their parameters, and their moments or whatever else the step
-    changes; camera_array, slots: the step's view, and the gradients of their pairs; gradients: the rows' own, where
-    they are asked for."""
+    changes; device: with the switches of the view's projection; camera_array, slots: the step's view, and the gradients
+    of their pairs; gradients: the rows' own, where they are asked for."""
 
     model: tuple[DeviceGaussians, ...]
+    device: Device
     camera_array: DeviceArray
     slots: Slots
     gradients: DeviceGaussians | None
@@ -155,11 +156,12 @@ class GradientStep:
         for start, stop, part in parts(work, *model, keep=True):
             projected, row_slots = frame.projected.rows(start, stop), slots.rows(start, stop)
             screen = rasterizer.screen(stop - start, self.fields)
-            rows = StepRows(start, stop, projected, screen, part, frame.camera_array, row_slots, gradients)
+            of_view = (rasterizer.device_of(camera), frame.camera_array, row_slots)
+            rows = StepRows(start, stop, projected, screen, part, *of_view, gradients)
             if gradients is not None:
                 sh_rest = updates_sh_rest(self.config.optimiser, self.step)
                 arrays = (part[0], frame.camera_array, projected, row_slots, gradients, screen)
-                project_grad(rasterizer.device, *arrays, fields=self.fields, sh_rest=sh_rest, explore=self.explore)
+                project_grad(rows.device, *arrays, fields=self.fields, sh_rest=sh_rest, explore=self.explore)
             probe.before_rows(rows)
             self.update(rows)
             probe.after_rows(rows)
@@ -174,8 +176,10 @@ class GradientStep:
             adam(self.device, self.step, self.rates, optimiser, *models, rows.projected.tile_counts, readback)
         else:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            device, fields, explore = self.rasterizer.device, self.fields, self.explore
-            project_step(device, self.step, self.rates, optimiser, rows.model, *view, fields=fields, explore=explore)
+            fields, explore = self.fields, self.explore
+            project_step(
+                rows.device, self.step, self.rates, optimiser, rows.model, *view, fields=fields, explore=explore
+            )
         if self.explore is not None:
             noise(self.device, self.explore, rows.parameters, rows.start, readback)
 

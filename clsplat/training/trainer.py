@@ -127,6 +127,11 @@ class Trainer:
         self.sampling: SamplingFilter | None = None
         if self.config.antialiased:
             cameras = [self.local(view.camera) for view in self.views]
+            if (rays := next((view for view in self.views if not view.camera.kind.flat), None)) is not None:
+                raise InputError(
+                    f"--antialiased: {rays.name} is {rays.camera.projection}, expected perspective or orthographic "
+                    "photographs; --lenses undistort makes these of a fisheye's"
+                )
             self.sampling = SamplingFilter(self.device, self.rasterizer.work, cameras)
         self._make_plan(len(initial))
         if self.plan.streamed:

@@ -59,9 +59,10 @@ class Watched(StepProbe):
         trainer, step, parameters = self.trainer, self.step, rows.parameters
         sh_rest = updates_sh_rest(step.config.optimiser, step.step)
         size = (parameters.count, parameters.coefficients)
-        key = (*size, sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
+        build = (sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
+        key = (*size, *build, *self.sample.camera.kind.defines.items())
         if key not in trainer.rehearsed:
-            with only_tried(trainer.device), only_tried(trainer.rasterizer.device):
+            with only_tried(trainer.device), only_tried(trainer.rasterizer.device), only_tried(rows.device):
                 step.update(rows)
                 self.add_statistics(trainer.statistics.rows(0, rows.stop - rows.start), rows)
             trainer.rehearsed.add(key)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import get_args
 
 import clsplat
-from clsplat.camera import PROJECTIONS, Projection
+from clsplat.camera import BENT_FISHEYE, PROJECTIONS, Projection
 from clsplat.device.layout import COUNTED, RAY, READBACK, REFUSED, SPLAT, header
 from clsplat.device.source import kernel_root
 
@@ -21,13 +21,12 @@ OF_FILES = {"shots/nerfstudio.py", "shots/usd.py"}
 
 def test_every_projection_has_a_row() -> None:
     assert tuple(PROJECTIONS) == get_args(Projection)
-    defines = [tuple(kind.defines.items()) for kind in PROJECTIONS.values()]
+    defines = [tuple(kind.defines.items()) for kind in (*PROJECTIONS.values(), BENT_FISHEYE)]
     assert len(set(defines)) == len(defines), "each is a build of its own"
-    assert all(kind.flat for kind in PROJECTIONS.values() if kind.gradient)
 
 
 def test_the_kernels_look_at_every_define() -> None:
-    for kind in PROJECTIONS.values():
+    for kind in (*PROJECTIONS.values(), BENT_FISHEYE):
         assert ("RAYS" in kind.defines) == (not kind.flat)
         for name in kind.defines:
             assert re.search(rf"#\s*(if|ifdef|ifndef|elif)\b.*\b{name}\b", KERNELS), name

@@ -119,7 +119,7 @@ def test_habits_of_file_path(tmp_path: Path, listed: str, name: str) -> None:
         ({"fl_x": -3}, "focal lengths above 0"),
         ({"fl_x": None, "camera_angle_x": 30.0}, "'camera_angle_x' is 30, expected an angle between 0 and pi"),
         ({"k1": 0.1, "k4": 0.1}, "'k4' is 0.1 in a perspective camera"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "unknown 'camera_model' 'EQUIRECTANGULAR', expected one of"),
+        ({"camera_model": "KALEIDOSCOPE"}, "unknown 'camera_model' 'KALEIDOSCOPE', expected one of"),
         ({"aabb_scale": 4, "scale": "x"}, "'scale' or 'offset'"),
     ],
 )

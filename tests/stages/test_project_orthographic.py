@@ -238,10 +238,3 @@ def test_deep_slices(device: Device) -> None:
         # As of a perspective frame (test_deep.py).
         assert_close(values[sure][:, :4], of[sure][:, :4], absolute=2e-5)
         assert_close(values[sure][:, 4:], of[sure][:, 4:], relative=1e-6, absolute=1e-6)
-
-
-def test_it_is_not_trained_with(default_device: Device) -> None:
-    gaussians, camera = orthographic(scenes.one())
-    run = Pipeline.run(default_device, (gaussians, camera))
-    with pytest.raises(InputError, match="asked for of a camera that is orthographic, expected a perspective one"):
-        run.backward(np.ones((camera.height, camera.width, 3)))

@@ -118,7 +118,10 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             size = (camera.height, camera.width)
             return Result(np.full((*size, 3), 0.25, np.float32), np.full(size, 0.5, np.float32))
 
-    def load_scene(path: Path, *, resolution: int, test_every: int, progress: Callable[..., None]) -> Scene:
+    def load_scene(
+        path: Path, *, resolution: int, test_every: int, lenses: str, progress: Callable[..., None]
+    ) -> Scene:
+        assert lenses == "undistort"
         if not Path(path).is_dir():
             raise InputError(f"{path}: no such folder")
         pipe.calls.append(("load_scene", str(path), resolution, test_every))

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gradient of orthographic, fisheye and equirectangular pictures: the twin against central differences, and the
+kernels against the twin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import scenes
+from compare import assert_close_gradient, assert_same_bits
+from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
+from test_project_rays import all_around, fisheye, panorama
+
+from clsplat.camera import Camera
+from clsplat.device.context import Device
+from clsplat.device.layout import SlotFields
+from clsplat.gaussians import Gaussians
+from clsplat.reference import every_pixel
+
+BENT = (0.04, -0.012, 0.004, -0.0006)
+CAMERAS: dict[str, Camera] = {
+    "orthographic": replace(scenes.tilted_camera(50, 40), fx=14.0, fy=15.0, projection="orthographic"),
+    "panorama": panorama(70, 35),
+    "half a turn": panorama(64, 40, np.pi),
+    "fisheye of 190 degrees": fisheye(60, 50, 190),
+    "fisheye of 300 degrees": fisheye(60, 60, 300),
+    "bent fisheye": replace(fisheye(60, 50, 190), radial=BENT),
+    "fisheye that folds over": replace(fisheye(60, 50, 150), radial=(-0.06, 0.0, 0.0, 0.0)),
+}
+GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+BAND = 3e-4
+STEP = 1e-7
+
+
+def subject(name: str, count: int) -> tuple[Gaussians, Camera]:
+    if name == "orthographic":
+        return scenes.overlap(count=count)[0], CAMERAS[name]
+    return all_around(count, 5), CAMERAS[name]
+
+
+def direction_of_loss(gaussians: Gaussians, camera: Camera, band: float) -> np.ndarray:
+    """The image's gradient, which is 0 where float32 or a step may decide otherwise."""
+    d_image = np.random.default_rng(5).standard_normal((camera.height, camera.width, 3))
+    d_image[every_pixel.render(gaussians, camera, BACKGROUND).margin < band] = 0
+    return d_image
+
+
+@cache
+def wanted(name: str) -> tuple[np.ndarray, every_pixel.Gradients]:
+    gaussians, camera = subject(name, 200)
+    d_image = direction_of_loss(gaussians, camera, BAND)
+    assert (d_image != 0).mean() > 0.8
+    return d_image, every_pixel.render_grad(gaussians, camera, d_image, BACKGROUND)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_the_twin_by_central_differences(name: str) -> None:
+    gaussians, camera = subject(name, 40)
+    arrays = {group: np.asarray(values, np.float64) for group, values in gaussians.arrays().items()}
+    model = Gaussians(**arrays, near=gaussians.near)
+    d_image = direction_of_loss(model, camera, 2e-4)
+    gradients = every_pixel.render_grad(model, camera, d_image, BACKGROUND).parameters
+    rng = np.random.default_rng(6)
+    for group in GROUPS:
+        direction = rng.standard_normal(arrays[group].shape)
+        moved = [Gaussians(**{**arrays, group: arrays[group] + step * direction}) for step in (STEP, -STEP)]
+        losses = [float((every_pixel.render(other, camera, BACKGROUND).image * d_image).sum()) for other in moved]
+        slope = (losses[0] - losses[1]) / (2 * STEP)
+        error = abs(slope - float((gradients[group] * direction).sum()))
+        assert error <= 2e-6 * np.linalg.norm(gradients[group]), group
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize("name", CAMERAS)
+def test_the_kernels_against_the_twin(shaped_device: Device, name: str, absolute: bool) -> None:
+    (gaussians, camera), (d_image, exact) = subject(name, 200), wanted(name)
+    got, screen = Pipeline.run(shaped_device, (gaussians, camera)).backward(d_image, absolute=absolute)
+    for group in GROUPS:
+        assert_close_gradient(getattr(got, group), exact.parameters[group], 1e-4, name=group)
+    on_image = exact.abs_means2d if absolute else exact.means2d
+    shown = np.abs(on_image).sum(axis=1) > 0
+    assert shown.sum() > 20
+    assert_close_gradient(screen[shown], on_image[shown], 1e-4, name="screen")
+
+
+def test_contributions(default_device: Device) -> None:
+    for name in ("panorama", "bent fisheye"):
+        (gaussians, camera), (d_image, exact) = subject(name, 200), wanted(name)
+        _, screen = Pipeline.run(default_device, (gaussians, camera)).screened(d_image, SlotFields(contributions=True))
+        assert screen.contributions is not None
+        shown = exact.contributions > 0
+        assert_close_gradient(screen.contributions.get()[shown], exact.contributions[shown], 1e-4, name=name)
+
+
+@EVERY_SHAPE
+def test_the_same_bits_twice_in_every_shape(device: Device, every: bool) -> None:
+    scene, (d_image, _) = subject("bent fisheye", 200), wanted("bent fisheye")
+    for shape in shapes_of(device, every=every):
+        first, second = (Pipeline.run(shaped(device, *shape), scene).backward(d_image)[0] for _ in range(2))
+        for group in GROUPS:
+            assert_same_bits(getattr(first, group), getattr(second, group))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_poisoned_memory_changes_no_bit(default_device: Device, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    scene, (d_image, _) = subject(name, 200), wanted(name)
+    got = []
+    for word in ("1", "0xff800000"):
+        monkeypatch.setenv("CLSPLAT_POISON", word)
+        got.append(Pipeline.run(default_device, scene).backward(d_image, absolute=True))
+    for group in GROUPS:
+        assert np.isfinite(getattr(got[0][0], group)).all(), group
+        assert_same_bits(getattr(got[0][0], group), getattr(got[1][0], group))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_extreme_gaussians_have_finite_gradients(shaped_device: Device, name: str) -> None:
+    """Needles, discs, specks and giants, some next to the camera, at a pole, straight behind or not numbers at all."""
+    (gaussians, camera), (d_image, _) = subject(name, 200), wanted(name)
+    rng = np.random.default_rng(8)
+    arrays = {group: values.copy() for group, values in gaussians.arrays().items()}
+    arrays["log_scales"] += rng.uniform(-20, 5, arrays["log_scales"].shape).astype(np.float32)
+    arrays["log_scales"][:20] = [-30.0, -30.0, 1.0]
+    arrays["log_scales"][20:40] = [-30.0, 1.0, 1.0]
+    arrays["quaternions"][::7] *= np.float32(1e-9)
+    arrays["quaternions"][1::7] *= np.float32(1e9)
+    position = camera.position.astype(np.float32)
+    axis = camera.rotation.astype(np.float32)
+    for row, place in enumerate((axis[1], -axis[1], axis[2], -axis[2], 0.011 * axis[2], 1e6 * axis[0])):
+        arrays["means"][50 + row] = position + place
+    arrays["means"][60], arrays["log_scales"][61], arrays["quaternions"][62] = np.nan, np.nan, 0.0
+    arrays["means"][63], arrays["log_scales"][64], arrays["opacity_logits"][65] = np.inf, 40.0, np.nan
+    run = Pipeline.run(shaped_device, (Gaussians(**arrays, near=gaussians.near), camera))
+    got, screen = run.backward(d_image, absolute=True)
+    assert run.visible.sum() > 30
+    for group in GROUPS:
+        assert np.isfinite(getattr(got, group)[run.visible]).all(), group
+    assert np.isfinite(screen[run.visible]).all()

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A fisheye capture of 190 degrees against pinhole photographs of the same scene, each trained as it is.
+
+    .venv/bin/python tools/quality_fisheye.py FOLDER [--iterations 2000] [--photos 40] [--width 120] [--seed 0]
+
+Both captures are made by the demo's ray caster from the same places: one through Kannala and Brandt's lens, one through
+a pinhole with as many pixels a radian on the axis. Both models are measured on the same held-out pinhole pictures, and
+on those pixels alone that a fisheye has too, which is all. Writes FOLDER/fisheye, FOLDER/pinhole and FOLDER/views.png:
+truth, fisheye's model, pinhole's, and the fisheye's own held-out picture. The last line is what the fisheye loses, dB.
+"""
+
+from __future__ import annotations
+
+import argparse
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from clsplat.api import train
+from clsplat.arrays import Float32
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.demo.ray_caster import Surface, bake, cameras, still_life
+from clsplat.device.context import Device, open_device
+from clsplat.evaluation.metrics import psnr
+from clsplat.gaussians import Gaussians
+from clsplat.images.writing import write_image
+from clsplat.reference.cameras import cam_from_pixel, pixel_grid
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.scene import load_scene
+
+RADIAL = (0.03, -0.012, 0.003, -0.0004)
+"""Of the fisheye: a lens that is bent by a few pixels."""
+ANGLE = np.deg2rad(190)
+POINTS = 4000
+HELD_OUT = 8
+
+
+def fisheye_of(pinhole: Camera, side: int) -> Camera:
+    """The fisheye in the place of a pinhole, with a circle of 190 degrees as wide as its square picture."""
+    theta = ANGLE / 2
+    reach = theta * (1 + sum(k * theta ** (2 * power) for power, k in enumerate(RADIAL, 1)))
+    focal, middle = side / 2 / reach, side / 2
+    lens = {"fx": focal, "fy": focal, "cx": middle, "cy": middle, "projection": "fisheye", "radial": RADIAL}
+    return replace(pinhole, width=side, height=side, **lens)  # type: ignore[arg-type]
+
+
+def photograph(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32:
+    """The ray caster's picture of a camera of any projection: samples^2 rays a pixel; black beyond 190 degrees."""
+    fine = camera.resized(camera.width * samples, camera.height * samples)
+    rays = np.nan_to_num(cam_from_pixel(fine, pixel_grid(fine))[1])
+    shown = np.any(rays != 0, axis=1)
+    if camera.projection == "fisheye":
+        shown &= rays[:, 2] > np.cos(ANGLE / 2)
+    colours = np.zeros((len(rays), 3), np.float32)
+    colours[shown] = cast(surfaces, camera, rays[shown])
+    linear = colours.reshape(camera.height, samples, camera.width, samples, 3).mean(axis=(1, 3))
+    return np.asarray(np.clip(linear, 0, 1) ** np.float32(1 / 1.6), np.float32)
+
+
+def cast(surfaces: list[Surface], camera: Camera, rays: np.ndarray) -> Float32:
+    """Linear colours (N, 3) of rays (N, 3) of the camera, without gloss."""
+    direction = (rays @ camera.rotation).astype(np.float32)
+    origin = camera.position.astype(np.float32)
+    distances = np.stack([surface.distance(origin, direction) for surface in surfaces])
+    nearest, hit = distances.min(axis=0), distances.argmin(axis=0)
+    colours = np.zeros_like(direction)
+    for index, surface in enumerate(surfaces):
+        chosen = np.flatnonzero((hit == index) & np.isfinite(nearest))
+        colours[chosen] = surface.colour(origin + nearest[chosen, None] * direction[chosen])
+    return colours
+
+
+def write_scene(folder: Path, surfaces: list[Surface], views: list[Camera]) -> Path:
+    """A COLMAP scene of the cameras' photographs, with points on the surfaces and their colours."""
+    sparse, images = folder / "sparse" / "0", folder / "images"
+    sparse.mkdir(parents=True, exist_ok=True)
+    images.mkdir(exist_ok=True)
+    one = views[0]
+    model = "OPENCV_FISHEYE" if one.projection == "fisheye" else "PINHOLE"
+    radial = one.radial if one.projection == "fisheye" else ()
+    numbers = " ".join(map(str, (one.width, one.height, one.fx, one.fy, one.cx, one.cy, *radial)))
+    (sparse / "cameras.txt").write_text(f"1 {model} {numbers}\n")
+    lines = []
+    with ThreadPoolExecutor(2) as pool:
+        for index, picture in enumerate(pool.map(partial(photograph, surfaces), views)):
+            x, y, z, w = Rotation.from_matrix(views[index].rotation).as_quat()
+            pose = " ".join(map(repr, map(float, (w, x, y, z, *views[index].translation))))
+            lines.append(f"{index + 1} {pose} 1 {index:03d}.png\n\n")
+            write_image(images / f"{index:03d}.png", picture)
+    (sparse / "images.txt").write_text("".join(lines))
+    rng, rows = np.random.default_rng(1), []
+    for surface in surfaces:
+        places = rng.random((2, POINTS // len(surfaces))).astype(np.float32)
+        points, _ = surface.point(places[0], places[1])
+        colours = np.clip(surface.colour(points), 0, 1) ** (1 / 1.6)
+        for point, colour in zip(points.tolist(), (255 * colours).astype(int).tolist(), strict=True):
+            rows.append(f"{len(rows) + 1} {' '.join(map(repr, point))} {' '.join(map(str, colour))} 0\n")
+    (sparse / "points3D.txt").write_text("".join(rows))
+    return folder
+
+
+def trained(folder: Path, config: TrainConfig, device: Device) -> Gaussians:
+    """The model of a scene, trained through its own lens."""
+    scene = load_scene(folder, lenses="native", test_every=HELD_OUT)
+    model = train(scene, config, device=device)
+    print(f"{folder.name}: {len(scene.train_views)} photographs, {len(model):,} Gaussians", flush=True)
+    return model
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--iterations", type=int, default=2000)
+    parser.add_argument("--photos", type=int, default=40)
+    parser.add_argument("--width", type=int, default=120, help="of the pinhole's pictures, in pixels")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    surfaces = still_life()
+    bake(surfaces, options.seed)
+    pinholes = cameras(options.photos, options.width, options.width * 3 // 4, options.seed)
+    # as many pixels a radian on the axis
+    side = round(fisheye_of(pinholes[0], 1000).fx ** -1 * 1000 * pinholes[0].fx)
+    fisheyes = [fisheye_of(camera, side) for camera in pinholes]
+    device, config = open_device(), TrainConfig(iterations=options.iterations, seed=options.seed, report=False)
+    renderer, models = Renderer(device), {}
+    # The loss is a mean over pixels, and density control counts in half images: a threshold for a pinhole's picture
+    # stands for one that is smaller by the heights in a picture that shows more at the same scale.
+    least_height = pinholes[0].height
+    for name, views in (("fisheye", fisheyes), ("pinhole", pinholes)):
+        density = replace(
+            config.density, gradient_threshold=config.density.gradient_threshold * least_height / views[0].height
+        )
+        own_config = replace(config, density=density)
+        models[name] = trained(write_scene(options.folder / name, surfaces, views), own_config, device)
+    scores: dict[str, list[float]] = {name: [] for name in models}
+    rows = []
+    for index in range(0, options.photos, HELD_OUT):
+        truth = photograph(surfaces, pinholes[index])
+        found = {name: renderer.render(model, pinholes[index]).image for name, model in models.items()}
+        for name, image in found.items():
+            scores[name].append(psnr(image, truth))
+        own = renderer.render(models["fisheye"], fisheyes[index]).image[:, :, :3]
+        crop = own[(side - truth.shape[0]) // 2 :, (side - truth.shape[1]) // 2 :][: truth.shape[0], : truth.shape[1]]
+        whole = own[:: -(-side // truth.shape[0]), :: -(-side // truth.shape[0])]
+        shown = np.zeros((truth.shape[0], whole.shape[1], 3), np.float32)
+        shown[: whole.shape[0]] = whole
+        rows.append(np.concatenate([truth, *found.values(), crop, shown], axis=1))
+    write_image(options.folder / "views.png", np.clip(np.concatenate(rows), 0, 1).astype(np.float32))
+    means = {name: float(np.mean(values)) for name, values in scores.items()}
+    print(
+        f"PSNR on the pinhole's held-out pictures: {', '.join(f'{name} {value:.2f}' for name, value in means.items())}"
+    )
+    print(f"{means['pinhole'] - means['fisheye']:+.2f} dB lost by the fisheye")
+
+
+if __name__ == "__main__":
+    main()
