@@ -2,11 +2,14 @@
 """A fisheye capture of 190 degrees against pinhole photographs of the same scene, each trained as it is.
 
     .venv/bin/python tools/quality_fisheye.py FOLDER [--iterations 2000] [--photos 40] [--width 120] [--seed 0]
+        [--threshold 1]
 
 Both captures are made by the demo's ray caster from the same places: one through Kannala and Brandt's lens, one through
 a pinhole with as many pixels a radian on the axis. Both models are measured on the same held-out pinhole pictures, and
 on those pixels alone that a fisheye has too, which is all. Writes FOLDER/fisheye, FOLDER/pinhole and FOLDER/views.png:
-truth, fisheye's model, pinhole's, and the fisheye's own held-out picture. The last line is what the fisheye loses, dB.
+truth, fisheye's model, pinhole's, and the fisheye's own held-out picture. The loss is a mean over pixels, and density
+control counts in half images: in a fisheye's larger picture the same blur has a smaller gradient, and fewer Gaussians
+grow; --threshold makes up for it. The last line is what the fisheye loses, dB.
 """
 
 from __future__ import annotations
@@ -119,6 +122,9 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=40)
     parser.add_argument("--width", type=int, default=120, help="of the pinhole's pictures, in pixels")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--threshold", type=float, default=1.0, help="factor of the fisheye's threshold of density control"
+    )
     options = parser.parse_args()
     surfaces = still_life()
     bake(surfaces, options.seed)
@@ -128,13 +134,9 @@ def main() -> None:
     fisheyes = [fisheye_of(camera, side) for camera in pinholes]
     device, config = open_device(), TrainConfig(iterations=options.iterations, seed=options.seed, report=False)
     renderer, models = Renderer(device), {}
-    # The loss is a mean over pixels, and density control counts in half images: a threshold for a pinhole's picture
-    # stands for one that is smaller by the heights in a picture that shows more at the same scale.
-    least_height = pinholes[0].height
     for name, views in (("fisheye", fisheyes), ("pinhole", pinholes)):
-        density = replace(
-            config.density, gradient_threshold=config.density.gradient_threshold * least_height / views[0].height
-        )
+        factor = options.threshold if name == "fisheye" else 1.0
+        density = replace(config.density, gradient_threshold=factor * config.density.gradient_threshold)
         own_config = replace(config, density=density)
         models[name] = trained(write_scene(options.folder / name, surfaces, views), own_config, device)
     scores: dict[str, list[float]] = {name: [] for name in models}
