@@ -33,6 +33,15 @@ def psnr(image: Image, truth: Image) -> float:
     return float(-10 * np.log10(max(float(np.mean(np.square(a - b))), MIN_SQUARED_ERROR)))
 
 
+def corrected(image: Image, truth: Image) -> Image:
+    """The image (H, W, 3) after the affine map of its colours that brings it nearest to the truth, by least squares."""
+    colours = np.asarray(image, np.float64).reshape(-1, 3)
+    known = np.hstack([colours, np.ones((len(colours), 1))])
+    fit: NDArray[Any] = np.linalg.lstsq(known, np.asarray(truth, np.float64).reshape(-1, 3), rcond=None)[0]
+    fitted: Image = (known @ fit).reshape(image.shape)
+    return fitted
+
+
 def ssim(image: Image, truth: Image) -> float:
     """Mean structural similarity: the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5, mean of the channels.
 

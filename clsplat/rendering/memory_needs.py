@@ -55,13 +55,14 @@ def plan_step(
     photographs: int = 0,
     turns: int = 1,
     models: int = _MODELS,
+    further: int = 0,
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
     photographs: pixels of all that may stay on the device; turns: of `loss`; models: arrays for each parameter, where
-    they are not those of a step of one view. Raises CapacityError."""
+    they are not those of a step of one view; further: bytes of a pixel in further planes. Raises CapacityError."""
     planes = 0
     for camera in cameras:
-        pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES)
+        pixels = _plane_bytes(camera, _pixel_bytes(planes=further) + target.PIXEL_BYTES + loss.PIXEL_BYTES)
         planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, turns))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
     screen = project.SCREEN_BYTES + 4 * fields.contributions

@@ -21,6 +21,7 @@ from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.project import Projected, Screen, Slots, project_grad, project_step
 from clsplat.stages.target import target
+from clsplat.training.appearance import ViewAppearance
 from clsplat.training.density import StatisticsNeeds
 
 
@@ -95,7 +96,8 @@ class StepProbe:
 class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in the memory of a rasterizer.
 
-    fields: the fields of a slot that the step fills; turn: of `loss`; room: of `Rasterizer.forward`.
+    fields: the fields of a slot that the step fills; turn: of `loss`; room: of `Rasterizer.forward`;
+    appearance: of the view's photograph, where it is learnt.
     """
 
     device: Device
@@ -107,6 +109,7 @@ class GradientStep:
     _: KW_ONLY
     turn: int = 0
     room: Room | None = None
+    appearance: ViewAppearance | None = None
 
     def run(
         self,
@@ -128,11 +131,15 @@ class GradientStep:
         frame = rasterizer.forward(model[0], camera, background, room=self.room)
         probe.forward(frame)
         planes = target(device, work, photograph, frame.background)
-        size = (camera.width, camera.height)
-        result = loss(device, work, frame.blended.image, planes, *size, self.config.dssim_weight, self.turn)
+        size, image, appearance = (camera.width, camera.height), frame.blended.image, self.appearance
+        if appearance is not None:
+            image = appearance.apply(work, image)
+        result = loss(device, work, image, planes, *size, self.config.dssim_weight, self.turn)
         if reads_loss:
             result = result.fetched()
         probe.loss(result)
+        if appearance is not None:
+            columns = appearance.gradient(work, image, result.gradient, camera.height)
         slots = rasterizer.pair_gradients(frame, result.gradient, fields=self.fields)
         probe.pair_gradients(slots)
         for start, stop, part in parts(work, *model, keep=True):
@@ -146,6 +153,8 @@ class GradientStep:
             probe.before_rows(rows)
             self.update(rows)
             probe.after_rows(rows)
+        if appearance is not None:
+            appearance.update(columns, rasterizer.readback)
         return result
 
     def update(self, rows: StepRows) -> None:

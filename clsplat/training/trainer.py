@@ -49,6 +49,7 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.stages.loss import Loss
+from clsplat.training.appearance import Appearance
 from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
 from clsplat.training.density import HALVED, ModelState, RowPlan, Strategy
 from clsplat.training.density.adaptive import Adaptive
@@ -119,6 +120,7 @@ class Trainer:
         initial = self.given
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
+        self.appearance = Appearance(self.config, self.device, len(self.views))
         self.origin, self.near = initial.origin, self.scene.near
         self._cameras: dict[int, Camera] = {}
         self._make_plan(len(initial))
@@ -142,6 +144,7 @@ class Trainer:
                 agreement=needs.agreement,
                 photographs=sum(view.camera.width * view.camera.height for view in self.views),
                 turns=self.pending.turns,
+                further=self.appearance.pixel_bytes,
                 **models,
             )
 
@@ -208,7 +211,9 @@ class Trainer:
         factor, number = self.sizes.factor(self.step), self.step
 
         def run(turn: int, room: Room | None) -> Loss:
-            sample, step = samples[0], replace(exact, turn=turn, room=room)
+            sample = samples[0]
+            appearance = self.appearance.of_view(sample.view, number)
+            step = replace(exact, turn=turn, room=room, appearance=appearance)
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
             return step.run(model, *pixels, probe, reads_loss=reads_loss)
@@ -443,7 +448,7 @@ class Trainer:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
         arrays |= {f"{kind}/{group}": model[group].get() for kind, model in self.models().items() for group in GROUPS}
-        return arrays
+        return arrays | self.appearance.arrays()
 
     def restart(self) -> None:
         """Begin again, at the rates that `watch.patience` allows."""
@@ -483,6 +488,10 @@ class Trainer:
                 raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
         self.statistics.load(statistics)  # what the settings did not ask for before the checkpoint is not known
         self.strategy.load(_named(checkpoint, "strategy/"))
+        try:
+            self.appearance.load(_named(checkpoint, "appearance/"))
+        except ValueError as error:
+            raise unusable(checkpoint, str(error)) from None
 
     def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
         most, degree = (self.config.sh_degree + 1) ** 2, self.config.sh_degree
