@@ -105,6 +105,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
         gaussians=len(gaussians),
         seconds=model_record.get("seconds"),
         space=recorded_space(file),
+        corrected=config.appearance != "none",
     )
     if given_run:
         given_run.write_eval(result)
@@ -134,5 +135,10 @@ def print_summary(result: dict[str, Any]) -> None:
 
 
 def _scores(record: dict[str, Any]) -> str:
-    names = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.4f}", "lpips": "LPIPS {:.4f}"}
+    names = {
+        "psnr": "PSNR {:.2f} dB",
+        "psnr_corrected": "colour-corrected {:.2f} dB",
+        "ssim": "SSIM {:.4f}",
+        "lpips": "LPIPS {:.4f}",
+    }
     return "  ".join(text.format(record[key]) for key, text in names.items() if key in record)

@@ -19,6 +19,7 @@ from clsplat.errors import InputError
 Background = Literal["black", "white", "random"]
 Lenses = Literal["undistort", "native"]
 Growth = Literal["paper", "budget", "mcmc"]
+AppearanceKind = Literal["none", "exposure"]
 
 
 @dataclass(frozen=True)
@@ -245,6 +246,11 @@ class TrainConfig:
     measures none."""
     report: bool = True
     """Write report.html at the end."""
+    appearance: AppearanceKind = "none"
+    """exposure: learn a gain for each colour channel of each photograph, whose exposure and white balance then do not
+    go into the model; it has their mean. none: photographs are taken as they are."""
+    appearance_rate: float = 2e-3
+    """Learning rate of appearance, as logarithms to base 2 of the gains; times the root of the number of photographs."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -253,6 +259,7 @@ class TrainConfig:
         """Raise InputError naming the first setting whose value makes no sense."""
         rules: tuple[Rule, ...] = (
             (("sh_degree",), lambda value: 0 <= value <= 3, "0 to 3"),
+            (("appearance_rate",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
             (("alpha_weight",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
@@ -273,6 +280,12 @@ class TrainConfig:
             )
         if self.invert_masks and self.masks == "none":
             raise InputError("--invert-masks: no masks are used, expected --masks ignore or --masks transparent too")
+        if self.appearance != "none" and self.batch > 1:
+            raise InputError(f"--appearance {self.appearance}: learnt by view, expected --batch 1, got {self.batch}")
+        if self.appearance != "none" and "transparent" in (self.masks, self.alpha):
+            raise InputError(
+                f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
+            )
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
@@ -295,6 +308,8 @@ class TrainConfig:
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
         """The settings for `count` devices: a batch of a view for each, unless it is told. Raises InputError for a
         batch that they cannot share evenly."""
+        if self.appearance != "none" and count > 1:
+            raise InputError(f"--appearance {self.appearance}: learnt by view, expected one --device, got {count}")
         if self.batch == 1 and not explicit:
             return replace(self, batch=count)
         if self.batch % count:

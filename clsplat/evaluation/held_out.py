@@ -30,14 +30,16 @@ def evaluate(
     gaussians: int,
     seconds: float | None,
     space: str = "sRGB",
+    corrected: bool = False,
 ) -> dict[str, Any]:
     """Measure every view; returns the content of eval.json.
 
     render: gives a view's image (H, W, 3), float, over `background` (3,), at the size of `view.load()`; save_dir: the
     renders go there as PNG in sRGB, under the view's name. space: the colour space of renders and photographs, in
-    which they are measured. step, gaussians, seconds are passed through. Without views the
-    mean is empty. Pixels that a mask leaves out count in no score (`metrics.ssim`), and "counted" is the share of those
-    that do. lpips_missing says why there is no LPIPS, where there is none. Raises ClsplatError where a render is
+    which they are measured. corrected: measure PSNR after an affine fit of colours as well. step, gaussians, seconds
+    are passed through. Without views the mean is empty. Pixels that a mask leaves out count in no score
+    (`metrics.ssim`), and "counted" is the share of those that do. lpips_missing says why there is no LPIPS, where there
+    is none. Raises ClsplatError where a render is
     not finite, InputError naming a view that is too small, or a space that is not known.
     """
     records: list[dict[str, Any]] = []
@@ -57,6 +59,8 @@ def evaluate(
                 record["counted"] = float(counts.mean())
         except (InputError, ValueError) as error:
             raise InputError(f"{view.name}: {error}") from None
+        if corrected:
+            record["psnr_corrected"] = metrics.psnr(metrics.corrected(image, truth, counts), truth, counts)
         seen = image if counts is None else np.where(counts[:, :, None], image, 0)
         if (perceptual := metrics.lpips(seen, truth)) is not None:
             record["lpips"] = perceptual
@@ -65,7 +69,7 @@ def evaluate(
             path = save_dir / name
             path.parent.mkdir(parents=True, exist_ok=True)
             write_image(path, displayed(image, space))
-    keys = [key for key in ("psnr", "ssim", "lpips") if records and key in records[0]]
+    keys = [key for key in ("psnr", "psnr_corrected", "ssim", "lpips") if records and key in records[0]]
     mean = {key: float(np.mean([record[key] for record in records])) for key in keys}
     result: dict[str, Any] = {"step": step, "gaussians": gaussians, "seconds": seconds, "mean": mean, "views": records}
     if records and (reason := metrics.lpips_missing()):

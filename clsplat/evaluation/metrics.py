@@ -35,6 +35,17 @@ def psnr(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) ->
     return float(-10 * np.log10(max(float(np.mean(squares)), MIN_SQUARED_ERROR)))
 
 
+def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> Image:
+    """The image (H, W, 3) after the affine map of its colours that brings it nearest to the truth, by least squares.
+    counts (H, W): the pixels that count."""
+    colours, wanted = (np.asarray(each, np.float64).reshape(-1, 3) for each in (image, truth))
+    known = np.hstack([colours, np.ones((len(colours), 1))])
+    rows = slice(None) if counts is None else counts.ravel()
+    fit: NDArray[Any] = np.linalg.lstsq(known[rows], wanted[rows], rcond=None)[0]
+    fitted: Image = (known @ fit).reshape(image.shape)
+    return fitted
+
+
 def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
     """Mean structural similarity: the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5, mean of the channels.
 

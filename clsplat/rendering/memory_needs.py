@@ -57,14 +57,15 @@ def plan_step(
     antialiased: bool = False,
     models: int = _MODELS,
     masks: bool = False,
+    further: int = 0,
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
     photographs: pixels of all that may stay on the device; turns: of `loss`; antialiased: of the model; models: arrays
-    for each parameter, where they are not those of a step of one view; masks: photographs have masks, or an alpha loss.
-    Raises CapacityError."""
+    for each parameter, where they are not those of a step of one view; masks: photographs have masks, or an alpha loss;
+    further: bytes of a pixel in further planes. Raises CapacityError."""
     planes, extra = 0, masks * (target.MASK_BYTES + loss.ALPHA_PIXEL_BYTES + turns)
     for camera in cameras:
-        pixels = _plane_bytes(camera, _pixel_bytes() + target.PIXEL_BYTES + loss.PIXEL_BYTES + extra)
+        pixels = _plane_bytes(camera, _pixel_bytes(planes=further) + target.PIXEL_BYTES + loss.PIXEL_BYTES + extra)
         planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, turns))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
     screen = project.SCREEN_BYTES + 4 * fields.contributions

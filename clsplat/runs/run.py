@@ -47,6 +47,7 @@ class Run:
         self.model_path = path / "model.ply"
         self.metrics_path = path / "metrics.jsonl"
         self.eval_path = path / "eval.json"
+        self.appearance_path = path / "appearance.json"
         self.checkpoints_path = path / "checkpoints"
         self.test_path = path / "test"
 
@@ -111,6 +112,10 @@ class Run:
     def write_eval(self, result: Mapping[str, Any]) -> None:
         """Write eval.json."""
         atomic_write(self.eval_path, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
+
+    def write_appearance(self, record: Mapping[str, Any]) -> None:
+        """Write appearance.json."""
+        atomic_write(self.appearance_path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
 
     def model_record(self) -> dict[str, Any]:
         """`step` and `seconds` of model.ply, where they are known.
@@ -263,14 +268,14 @@ def owned_files(path: Path) -> list[Path]:
     """The files in a run's folder that clsplat wrote, and that --overwrite may therefore remove."""
     patterns = ("checkpoints/step-*.npz", "trouble-step-*.npz", "test/**/*.png", "**/.*" + TEMPORARY_SUFFIX)
     # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
-    names = ("model.ply", "metrics.jsonl", "eval.json", "report.html", "scene.json", "config.toml")
+    names = ("model.ply", "metrics.jsonl", "eval.json", "appearance.json", "report.html", "scene.json", "config.toml")
     files = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
     return [file for file in files if file.is_file() or file.is_symlink()]
 
 
 def check_resumed(earlier: Run, config: TrainConfig) -> None:
     """Raise InputError where `config` changes what a run cannot change on its way."""
-    for name in ("sh_degree", "seed", "test_every", "lenses"):
+    for name in ("sh_degree", "seed", "test_every", "lenses", "appearance", "antialiased"):
         was, now = getattr(earlier.config, name), getattr(config, name)
         if was != now:
             raise InputError(f"{earlier.config_path}: {name} is {was} there, a resumed run cannot change it to {now}")

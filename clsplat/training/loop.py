@@ -225,6 +225,7 @@ class Session:
             step=trainer.step,
             gaussians=trainer.parameters.count,
             seconds=self.seconds,
+            corrected=trainer.config.appearance != "none",
             space=photos_space(view.path for view in trainer.scene.views),
         )
 
@@ -313,6 +314,8 @@ class Session:
         model = trainer.gaussians()
         if run is not None:
             run.save_model(model, photos_space(view.path for view in trainer.scene.views))
+            if (appearance := trainer.appearance.record([view.name for view in trainer.views])) is not None:
+                run.write_appearance(appearance)
             if trainer.scene.test_views:
                 run.write_eval(self.evaluate(keep=True))
         return model

@@ -23,6 +23,7 @@ from clsplat.stages.loss import Loss, loss
 from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen, Slots, project_grad, project_step
 from clsplat.stages.target import target
+from clsplat.training.appearance import ViewAppearance
 from clsplat.training.density import StatisticsNeeds
 
 
@@ -100,7 +101,7 @@ class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in the memory of a rasterizer.
 
     fields: the fields of a slot that the step fills; turn: of `loss`; room: of `Rasterizer.forward`; explore: what the
-    step does beside following the gradient of the loss.
+    step does beside following the gradient of the loss; appearance: of the view's photograph, where it is learnt.
     """
 
     device: Device
@@ -113,6 +114,7 @@ class GradientStep:
     turn: int = 0
     room: Room | None = None
     explore: Exploration | None = None
+    appearance: ViewAppearance | None = None
 
     def run(
         self,
@@ -138,9 +140,10 @@ class GradientStep:
         probe.forward(frame)
         alpha_weight = self.config.alpha_loss if photograph.shape[2] > 3 else 0.0
         planes = target(device, work, photograph, frame.background, frame.blended, alpha=alpha_weight > 0)
-        size, weight = (camera.width, camera.height), self.config.dssim_weight
+        size, weight, appearance = (camera.width, camera.height), self.config.dssim_weight, self.appearance
+        image = frame.blended.image if appearance is None else appearance.apply(work, frame.blended.image)
         result = loss(
-            *(device, work, frame.blended.image, planes),
+            *(device, work, image, planes),
             *size,
             weight,
             self.turn,
@@ -151,6 +154,8 @@ class GradientStep:
         if reads_loss:
             result = result.fetched()
         probe.loss(result)
+        if appearance is not None:
+            columns = appearance.gradient(work, image, result.gradient, camera.height)
         slots = rasterizer.pair_gradients(frame, result.gradient, fields=self.fields)
         probe.pair_gradients(slots)
         for start, stop, part in parts(work, *model, keep=True):
@@ -165,6 +170,8 @@ class GradientStep:
             probe.before_rows(rows)
             self.update(rows)
             probe.after_rows(rows)
+        if appearance is not None:
+            appearance.update(columns, rasterizer.readback)
         return result
 
     def update(self, rows: StepRows) -> None:

@@ -50,6 +50,7 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.stages.loss import Loss
+from clsplat.training.appearance import Appearance
 from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
 from clsplat.training.density import HALVED, ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
@@ -122,6 +123,7 @@ class Trainer:
         initial = self.given
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
+        self.appearance = Appearance(self.config, self.device, len(self.views))
         self.origin, self.near = initial.origin, self.scene.near
         self._cameras: dict[int, Camera] = {}
         self.sampling: SamplingFilter | None = None
@@ -156,6 +158,7 @@ class Trainer:
                 turns=self.pending.turns,
                 antialiased=self.config.antialiased,
                 masks=self.config.mask_use != MaskUse(),
+                further=self.appearance.pixel_bytes,
                 **models,
             )
 
@@ -228,7 +231,9 @@ class Trainer:
         factor, number = self.sizes.factor(self.step), self.step
 
         def run(turn: int, room: Room | None) -> Loss:
-            sample, step = samples[0], replace(exact, turn=turn, room=room)
+            sample = samples[0]
+            appearance = self.appearance.of_view(sample.view, number)
+            step = replace(exact, turn=turn, room=room, appearance=appearance)
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
             result = step.run(model, *pixels, probe, reads_loss=reads_loss, kept=sample.kept)
@@ -480,7 +485,7 @@ class Trainer:
         arrays |= {f"{kind}/{group}": model[group].get() for kind, model in self.models().items() for group in GROUPS}
         if self.sampling is not None and self.sampling.least is not None:
             arrays["sampling/least"] = self.sampling.least.get()
-        return arrays
+        return arrays | self.appearance.arrays()
 
     def restart(self) -> None:
         """Begin again, at the rates that `watch.patience` allows."""
@@ -525,6 +530,10 @@ class Trainer:
             if least is not None and least.shape != (self.parameters.count,):
                 raise unusable(checkpoint, f"sampling/least has shape {least.shape}")
             self.sampling.restore(least)
+        try:
+            self.appearance.load(_named(checkpoint, "appearance/"))
+        except ValueError as error:
+            raise unusable(checkpoint, str(error)) from None
 
     def _loaded(self, checkpoint: Checkpoint, kind: str) -> HostGaussians:
         most, degree = (self.config.sh_degree + 1) ** 2, self.config.sh_degree

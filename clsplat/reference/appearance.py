@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gains of photographs, their gradient and Adam's step: float64 twin of kernels/appearance.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clsplat.arrays import Float64
+
+
+def apply(image: Float64, logs: Float64) -> Float64:
+    """The image (H, W, 3) as a photograph with these logs (3,) to base 2 has it."""
+    seen: Float64 = image * np.exp2(logs)
+    return seen
+
+
+def gradient(image: Float64, logs: Float64, by_seen: Float64) -> tuple[Float64, Float64]:
+    """Gradients by the image (H, W, 3) and by the logs (3,), from that by what is seen."""
+    by_logs: Float64 = np.log(2) * (apply(image, logs) * by_seen).sum(axis=(0, 1))
+    return by_seen * np.exp2(logs), by_logs
+
+
+def step(
+    logs: Float64, first: Float64, second: Float64, by_logs: Float64, number: int, rate: float
+) -> tuple[Float64, Float64, Float64]:
+    """Logs and moments (photographs, 3) after Adam's step along by_logs and the removal of each channel's mean."""
+    first, second = 0.9 * first + 0.1 * by_logs, 0.999 * second + 0.001 * by_logs**2
+    change = rate * (first / (1 - 0.9**number)) / (np.sqrt(second / (1 - 0.999**number)) + 1e-15)
+    moved = logs - change
+    return moved - moved.mean(axis=0), first, second

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches appearance.cl: the gains of a photograph, their gradient and Adam's step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_grid, launch_items
+from clsplat.device.layout import TILE
+from clsplat.device.profile import stage
+
+PIXEL_BYTES = 14
+"""Bytes of each pixel with its padding: three planes, and its share of the partial sums."""
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Gains of all photographs, (photographs, 3) float32 each: logs to base 2, Adam's moments of these, 2^logs; moved:
+    scratch."""
+
+    logs: DeviceArray
+    first: DeviceArray
+    second: DeviceArray
+    gains: DeviceArray
+    moved: DeviceArray
+
+    @classmethod
+    def on(cls, device: Device, logs: NDArray[np.float32]) -> Gains:
+        """Gains with these logs, and moments of zero."""
+        zeros = np.zeros_like(logs)
+        values = (logs, zeros, zeros, np.exp2(logs.astype(np.float64)).astype(np.float32))
+        held, first, second, gains = (upload(device, value) for value in values)
+        return cls(held, first, second, gains, allocate(device, logs.shape, np.float32))
+
+
+@stage("appearance")
+def apply_gains(device: Device, work: Workspace, gains: Gains, photograph: int, image: DeviceArray) -> DeviceArray:
+    """Planes (3, rows, stride) of the image as the photograph has it."""
+    _, rows, stride = image.shape
+    seen = work.array("appearance_seen", image.shape)
+    kernel = device.kernels("appearance").apply_gains
+    launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, image, seen)
+    return seen
+
+
+@stage("appearance")
+def gain_gradient(
+    device: Device,
+    work: Workspace,
+    gains: Gains,
+    photograph: int,
+    seen: DeviceArray,
+    gradient: DeviceArray,
+    height: int,
+) -> DeviceArray:
+    """Make the gradient by what was seen that by the image, in its place. Returns sums (3, stride): ln 2 times their
+    sum over x is the gradient by the photograph's logs."""
+    _, rows, stride = seen.shape
+    down = rows // TILE
+    partials, columns = (
+        work.array("appearance_partials", (3, down, stride)),
+        work.array("appearance_columns", (3, stride)),
+    )
+    kernels = device.kernels("appearance")
+    sizes = (photograph, height, stride, rows * stride, down)
+    launch_grid(device, kernels.gain_sums, (stride, down), *sizes, gains.gains, seen, partials, gradient)
+    launch_grid(device, kernels.column_sums, (stride, 3), stride, down, partials, columns)
+    return columns
+
+
+@stage("appearance")
+def step_gains(
+    device: Device,
+    gains: Gains,
+    photograph: int,
+    columns: DeviceArray,
+    step: int,
+    rate: float,
+    readback: DeviceArray,
+) -> None:
+    """Adam's step number `step` (from 1), and the mean of each channel's logs made 0. A step by capacity that has
+    stopped changes nothing."""
+    kernels, count = device.kernels("appearance"), gains.logs.size
+    constants = (rate / (1 - BETA1**step), (1 - BETA2**step) ** -0.5, BETA1, BETA2, EPSILON)
+    sizes, moments = (count, photograph, columns.shape[1]), (gains.first, gains.second)
+    launch_items(
+        device, kernels.move_gains, count, *sizes, *constants, readback, columns, gains.logs, gains.moved, *moments
+    )
+    launch_items(device, kernels.centre_gains, count, count, readback, gains.moved, gains.logs, gains.gains)

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The appearance of each photograph, learnt with the model: what a step applies, and what a checkpoint holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import only_tried
+from clsplat.stages.appearance import PIXEL_BYTES, Gains, apply_gains, gain_gradient, step_gains
+
+WARM_UP, LEAST = 500, 0.01
+"""Steps over which the learning rate rises, or a tenth of all; the part of itself that it begins and ends with."""
+
+
+def rate_at(config: TrainConfig, step: int, views: int) -> float:
+    """The learning rate of step number `step`. A photograph has a gradient in one of `views` steps, by whose root Adam
+    makes its steps smaller."""
+    rise: float = LEAST ** (1 - min(step / min(WARM_UP, config.iterations / 10), 1.0))
+    fall: float = LEAST ** (step / config.iterations)
+    return config.appearance_rate * views**0.5 * rise * fall
+
+
+@dataclass(frozen=True, eq=False)
+class ViewAppearance:
+    """The appearance of one view in one step."""
+
+    device: Device
+    gains: Gains
+    view: int
+    step: int
+    rate: float
+
+    def apply(self, work: Workspace, image: DeviceArray) -> DeviceArray:
+        """The image as the photograph has it."""
+        return apply_gains(self.device, work, self.gains, self.view, image)
+
+    def gradient(self, work: Workspace, seen: DeviceArray, gradient: DeviceArray, height: int) -> DeviceArray:
+        """Make the gradient that by the image; sums for `update`, which is tried here, before anything changes."""
+        columns = gain_gradient(self.device, work, self.gains, self.view, seen, gradient, height)
+        if self.step == 1:
+            with only_tried(self.device):
+                self.update(columns, columns)
+        return columns
+
+    def update(self, columns: DeviceArray, readback: DeviceArray) -> None:
+        """Adam's step."""
+        step_gains(self.device, self.gains, self.view, columns, self.step, self.rate, readback)
+
+
+class Appearance:
+    """The gains of all training views; nothing where the settings ask for none."""
+
+    def __init__(self, config: TrainConfig, device: Device, views: int) -> None:
+        self._config, self._device = config, device
+        self._gains = Gains.on(device, np.zeros((views, 3), np.float32)) if config.appearance != "none" else None
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes of a pixel on the device."""
+        return PIXEL_BYTES if self._gains is not None else 0
+
+    def of_view(self, view: int, step: int) -> ViewAppearance | None:
+        """The appearance of a view in step number `step`; None where it is the model's."""
+        if self._gains is None:
+            return None
+        return ViewAppearance(
+            self._device, self._gains, view, step, rate_at(self._config, step, self._gains.logs.shape[0])
+        )
+
+    def record(self, names: Sequence[str]) -> dict[str, Any] | None:
+        """The content of appearance.json, by the names of the views; None where there is nothing to write."""
+        if self._gains is None:
+            return None
+        logs = self._gains.logs.get()
+        photographs = {name: {"log2_gains": row} for name, row in zip(names, logs.astype(float).tolist(), strict=True)}
+        return {"kind": self._config.appearance, "photographs": photographs}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of a checkpoint, by name."""
+        gains = self._gains
+        if gains is None:
+            return {}
+        held = {"logs": gains.logs, "first": gains.first, "second": gains.second, "gains": gains.gains}
+        return {f"appearance/{name}": array.get() for name, array in held.items()}
+
+    def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Take the arrays of a checkpoint. Raises ValueError where that is of other photographs."""
+        if self._gains is None:
+            return
+        shape, values = self._gains.logs.shape, {}
+        for name in ("logs", "first", "second", "gains"):
+            value = arrays.get(name)
+            if value is None or value.shape != shape or value.dtype != np.float32 or not np.isfinite(value).all():
+                raise ValueError(f"has no appearance/{name} of shape {shape}")
+            values[name] = upload(self._device, value)
+        self._gains = Gains(**values, moved=self._gains.moved)

@@ -1,0 +1,85 @@
+// Exposure and white balance of photographs: a gain for each channel of the render, its gradient, and Adam's step.
+//
+// Owner: A work-item owns a pixel (apply_gains), sixteen pixels below each other (gain_sums), a column of these
+//   (column_sums), or one gain of one photograph (move_gains, centre_gains). Sums have one order on every device.
+// Launch: Grids of stride x rows, stride x tiles_y and stride x 3; a work-item for each of `count` = 3 photographs'
+// gains. Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, first, second, moved, gains
+// (photographs, 3), logs
+//   to base 2; partials (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are above each.
+// Equations: docs/gradients.md, "Appearance".
+#include "shared/math.h"
+
+#define LN2 0.693147180559945f
+#define MOST_LOG 16.0f
+
+// 2^x for x in [-16, 16], as exp2L of lanes.h has it.
+static inline float exp2_of_log(const float x) {
+  const float t = x + 12582912.0f, f = x + (12582912.0f - t), f2 = f * f;
+  const float low = fma1(f, 6.931469025e-1f, 1.0f);
+  const float middle = fma1(f, 5.550900067e-2f, 2.402225277e-1f);
+  const float high = fma1(f, 1.321160340e-3f, 9.671293494e-3f);
+  return as_float(as_int(fma1(f2, fma1(f2, high, middle), low)) + (as_int(t) << 23));
+}
+
+// gains, image -> seen: the image as the photograph has it.
+__kernel void apply_gains(const int photograph, const int stride, const int plane, __global const float *gains,
+                          __global const float *image, __global float *seen) {
+  const size_t at = (size_t)stride * get_global_id(1) + get_global_id(0);
+  for (int c = 0; c < 3; ++c) seen[(size_t)plane * c + at] = gains[3 * photograph + c] * image[(size_t)plane * c + at];
+}
+
+// gains, seen, gradient by seen -> gradient by image, in its place; partials of the gradient by logs over ln 2.
+__kernel void gain_sums(const int photograph, const int height, const int stride, const int plane, const int tiles_y,
+                        __global const float *gains, __global const float *seen, __global float *partials,
+                        __global float *gradient) {
+  const int x = get_global_id(0), y0 = get_global_id(1) * TILE, y1 = min(y0 + TILE, height);
+  for (int c = 0; c < 3; ++c) {
+    const float gain = gains[3 * photograph + c];
+    float sum = 0.0f;
+    for (int y = y0; y < y1; ++y) {
+      const size_t at = (size_t)plane * c + (size_t)stride * y + x;
+      const float g = gradient[at];
+      sum = fma1(seen[at], g, sum);
+      gradient[at] = gain * g;
+    }
+    partials[((size_t)tiles_y * c + get_global_id(1)) * stride + x] = sum;
+  }
+}
+
+// partials -> columns.
+__kernel void column_sums(const int stride, const int tiles_y, __global const float *partials,
+                          __global float *columns) {
+  const int x = get_global_id(0), c = get_global_id(1);
+  float sum = 0.0f;
+  for (int tile = 0; tile < tiles_y; ++tile) sum += partials[((size_t)tiles_y * c + tile) * stride + x];
+  columns[(size_t)stride * c + x] = sum;
+}
+
+// columns of one photograph, logs -> moved; first and second in place. All photographs move: the others' gradient is 0.
+__kernel void move_gains(const int count, const int photograph, const int stride, const float rate, const float root,
+                         const float beta1, const float beta2, const float epsilon, __global const uint *readback,
+                         __global const float *columns, __global const float *logs, __global float *moved,
+                         __global float *first, __global float *second) {
+  const int i = get_global_id(0);
+  if (i >= count || readback[READBACK_STOPPED]) return;
+  float g = 0.0f;
+  if (i / 3 == photograph)
+    for (int x = 0; x < stride; ++x) g += columns[(size_t)stride * (i % 3) + x];
+  g *= LN2;
+  if (!(g * g < INFINITY)) g = 0.0f; // of a view with something that is not finite nothing is learnt
+  const float m = fma1(beta1, first[i], (1.0f - beta1) * g), v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));
+  first[i] = m, second[i] = v;
+  moved[i] = logs[i] - rate * m / fma1(sqrt(v), root, epsilon);
+}
+
+// moved -> logs, of which each channel has the mean 0; gains.
+__kernel void centre_gains(const int count, __global const uint *readback, __global const float *moved,
+                           __global float *logs, __global float *gains) {
+  const int i = get_global_id(0);
+  if (i >= count || readback[READBACK_STOPPED]) return;
+  float sum = 0.0f;
+  for (int k = i % 3; k < count; k += 3) sum += moved[k];
+  const float x = clamp(moved[i] - 3.0f * sum / (float)count, -MOST_LOG, MOST_LOG);
+  logs[i] = x;
+  gains[i] = exp2_of_log(x);
+}

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""appearance.cl against the float64 twin, and the twin against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from compare import assert_close, assert_close_gradient, assert_same_bits
+
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
+from clsplat.device.layout import READBACK, TILE
+from clsplat.reference import appearance as reference
+from clsplat.stages.appearance import Gains, apply_gains, gain_gradient, step_gains
+
+
+def padded(image: np.ndarray) -> np.ndarray:
+    height, width, _ = image.shape
+    planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
+    planes[:, :height, :width] = image.transpose(2, 0, 1)
+    return planes
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 33), (40, 15)])
+def test_gains_and_their_gradient(shaped_device: Device, width: int, height: int) -> None:
+    rng = np.random.default_rng(width)
+    image = rng.random((height, width, 3)).astype(np.float32)
+    by_seen = rng.normal(0.3, 1, image.shape).astype(np.float32)
+    logs = rng.uniform(-1, 1, (5, 3)).astype(np.float32)
+    work, gains = Workspace(shaped_device), Gains.on(shaped_device, logs)
+    seen = apply_gains(shaped_device, work, gains, 3, upload(shaped_device, padded(image)))
+    wide, row = image.astype(np.float64), logs[3].astype(np.float64)
+    # A product of two floats, one of them rounded.
+    assert_close(seen.get()[:, :height, :width].transpose(1, 2, 0), reference.apply(wide, row), relative=3e-7)
+    below = padded(by_seen)
+    below[:, height:] = np.nan  # the loss leaves it unwritten
+    gradient = upload(shaped_device, below)
+    columns = gain_gradient(shaped_device, work, gains, 3, seen, gradient, height)
+    by_image, by_logs = reference.gradient(wide, row, by_seen.astype(np.float64))
+    assert_close_gradient(gradient.get()[:, :height, :width].transpose(1, 2, 0), by_image, 1e-6)
+    assert_close_gradient(np.log(2) * columns.get().sum(axis=1, dtype=np.float64), by_logs, 1e-5)
+
+
+def test_steps_and_the_mean(shaped_device: Device) -> None:
+    rng = np.random.default_rng(1)
+    logs = np.zeros((4, 3), np.float32)
+    gains = Gains.on(shaped_device, logs)
+    readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
+    state = tuple(np.zeros((4, 3)) for _ in range(3))
+    for number in range(1, 12):
+        columns = rng.normal(0, 1, (3, 16)).astype(np.float32)
+        by_logs = np.zeros((4, 3))
+        by_logs[number % 4] = np.log(2) * columns.astype(np.float64).sum(axis=1)
+        state = reference.step(*state, by_logs, number, 0.05)
+        step_gains(shaped_device, gains, number % 4, upload(shaped_device, columns), number, 0.05, readback)
+    # Eleven steps of 0.05; a sum of 16 floats that nearly cancel is good to 1e-5 of itself.
+    assert_close(gains.logs.get(), state[0], absolute=1e-5)
+    assert_close(gains.gains.get(), np.exp2(state[0]), absolute=1e-5)
+    assert_close(gains.logs.get().mean(axis=0), np.zeros(3), absolute=1e-7)
+
+
+def test_a_step_that_stopped_or_is_not_finite(shaped_device: Device) -> None:
+    gains = Gains.on(shaped_device, np.array([[0.5, 0.25, 0], [-0.5, -0.25, 0]], np.float32))
+    before = gains.logs.get()
+    values = np.zeros(len(READBACK), np.uint32)
+    values[READBACK.index("STOPPED")] = 1
+    columns = upload(shaped_device, np.ones((3, 16), np.float32))
+    step_gains(shaped_device, gains, 1, columns, 1, 0.1, upload(shaped_device, values))
+    assert_same_bits(gains.logs.get(), before)
+    assert not gains.first.get().any()
+    columns.fill(np.nan)
+    step_gains(shaped_device, gains, 1, columns, 1, 0.1, upload(shaped_device, 0 * values))
+    assert_same_bits(gains.logs.get(), before)
+
+
+def test_the_twin_against_finite_differences() -> None:
+    rng = np.random.default_rng(2)
+    image, weights, logs = rng.random((4, 5, 3)), rng.normal(0, 1, (4, 5, 3)), rng.uniform(-1, 1, 3)
+    by_image, by_logs = reference.gradient(image, logs, weights)
+    step = 1e-6 * np.eye(3)
+    numeric = [
+        (weights * (reference.apply(image, logs + d) - reference.apply(image, logs - d))).sum() / 2e-6 for d in step
+    ]
+    assert_close_gradient(by_logs, numeric, 1e-7)
+    direction = rng.normal(0, 1, image.shape)
+    moved = weights * (reference.apply(image + 1e-6 * direction, logs) - reference.apply(image, logs))
+    assert_close(moved.sum() / 1e-6, (by_image * direction).sum(), relative=1e-6)

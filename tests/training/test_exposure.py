@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exposure of photographs, learnt with the model."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compare import assert_same_bits
+from tiny import CONFIG, write_scene
+
+from clsplat.api import train
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.evaluation import metrics
+from clsplat.runs.checkpoints import Checkpoint
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.photographs import Photographs
+from clsplat.training.trainer import Trainer
+
+EXPOSED = replace(CONFIG, appearance="exposure", appearance_rate=0.05)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+def test_a_resumed_training_has_the_same_bytes(default_device: Device, scene: Scene) -> None:
+    whole, first, second = (Trainer(scene, EXPOSED, default_device) for _ in range(3))
+    for _ in range(20):
+        whole.train_step()
+    for _ in range(9):
+        first.train_step()
+    second.restore(Checkpoint(9, *first.checkpoint()))
+    for _ in range(11):
+        second.train_step()
+    wanted, got = whole.checkpoint()[0], second.checkpoint()[0]
+    assert wanted.keys() == got.keys()
+    assert wanted["appearance/logs"].any()
+    for name, array in wanted.items():
+        assert_same_bits(got[name], array, name)
+
+
+def test_gains_of_photographs_are_learnt(
+    default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    truth = np.where(np.arange(len(scene.train_views)) % 2, 1.0, -1.0)
+    plain = Photographs.load
+
+    def exposed(self: Photographs, index: int, factor: float) -> np.ndarray:
+        image = plain(self, index, factor)
+        values = image / np.float32(255) if image.dtype == np.uint8 else image
+        return np.ascontiguousarray(values * np.float32(2.0 ** truth[index]), np.float32)
+
+    monkeypatch.setattr(Photographs, "load", exposed)
+    config = replace(EXPOSED, iterations=400, density=replace(CONFIG.density, every=0), warmup=())
+    run = Run.create(tmp_path / "run", config)
+    train(scene, config, device=default_device, run=run)
+    record = json.loads(run.appearance_path.read_text("utf-8"))
+    logs = np.array([record["photographs"][view.name]["log2_gains"] for view in scene.train_views])
+    assert np.abs(logs.mean(axis=0)).max() < 1e-6
+    assert np.abs(logs - truth[:, None]).max() < 0.3  # of 2; so few steps
+    assert "psnr_corrected" in json.loads(run.eval_path.read_text("utf-8"))["mean"]
+
+
+def test_switched_off_there_is_nothing_of_it(default_device: Device, scene: Scene) -> None:
+    trainer = Trainer(scene, CONFIG, default_device)
+    trainer.train_step()
+    assert not any(name.startswith("appearance") for name in trainer.checkpoint()[0])
+    assert trainer.appearance.record([]) is None
+
+
+def test_a_checkpoint_without_gains_is_refused(default_device: Device, scene: Scene) -> None:
+    trainer = Trainer(scene, CONFIG, default_device)
+    trainer.train_step()
+    with pytest.raises(InputError, match="appearance/logs"):
+        Trainer(scene, EXPOSED, default_device).restore(Checkpoint(1, *trainer.checkpoint()))
+
+
+def test_settings_that_exclude_each_other() -> None:
+    with pytest.raises(InputError, match=r"--appearance exposure: .*--batch 1, got 2"):
+        TrainConfig(appearance="exposure", batch=2).check()
+    with pytest.raises(InputError, match=r"one --device, got 2"):
+        TrainConfig(appearance="exposure").on_devices(2, explicit=False)
+
+
+def test_colours_are_corrected_by_an_affine_map() -> None:
+    rng = np.random.default_rng(3)
+    image = rng.random((9, 8, 3))
+    truth = image @ rng.uniform(0, 0.3, (3, 3)) + 0.05
+    np.testing.assert_allclose(metrics.corrected(image, truth), truth, atol=1e-12)
