@@ -2,17 +2,16 @@
 //
 // Owner: A work-item owns a pixel (apply_gains), sixteen pixels below each other (gain_sums), a column of these
 //   (column_sums), or one gain of one photograph (move_gains, centre_gains). Sums have one order on every device.
-// Launch: Grids of stride x rows, stride x tiles_y and stride x 3; a work-item for each of `count` = 3 photographs'
-// gains. Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, first, second, moved, gains
-// (photographs, 3), logs
-//   to base 2; partials (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are above each.
+// Launch: Grids of stride x rows, stride x tiles_y and stride x 3; a work-item for each of the `count` gains.
+// Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, first, second, moved, gains (photographs, 3),
+//   logs to base 2; partials (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are above each.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 
 #define LN2 0.693147180559945f
 #define MOST_LOG 16.0f
 
-// 2^x for x in [-16, 16], as exp2L of lanes.h has it.
+// 2^x for x in [-16, 16].
 static inline float exp2_of_log(const float x) {
   const float t = x + 12582912.0f, f = x + (12582912.0f - t), f2 = f * f;
   const float low = fma1(f, 6.931469025e-1f, 1.0f);
@@ -21,7 +20,7 @@ static inline float exp2_of_log(const float x) {
   return as_float(as_int(fma1(f2, fma1(f2, high, middle), low)) + (as_int(t) << 23));
 }
 
-// gains, image -> seen: the image as the photograph has it.
+// gains, image -> seen: the image, exposed for the photograph.
 __kernel void apply_gains(const int photograph, const int stride, const int plane, __global const float *gains,
                           __global const float *image, __global float *seen) {
   const size_t at = (size_t)stride * get_global_id(1) + get_global_id(0);

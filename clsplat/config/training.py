@@ -250,7 +250,7 @@ class TrainConfig:
     """exposure: learn a gain for each colour channel of each photograph, whose exposure and white balance then do not
     go into the model; it has their mean. none: photographs are taken as they are."""
     appearance_rate: float = 2e-3
-    """Learning rate of appearance, as logarithms to base 2 of the gains; times the root of the number of photographs."""
+    """Learning rate of appearance, as logarithms to base 2 of the gains; times the root of their number."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)

@@ -41,7 +41,7 @@ class Gains:
 
 @stage("appearance")
 def apply_gains(device: Device, work: Workspace, gains: Gains, photograph: int, image: DeviceArray) -> DeviceArray:
-    """Planes (3, rows, stride) of the image as the photograph has it."""
+    """Planes (3, rows, stride) of the image, exposed for the photograph."""
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
     kernel = device.kernels("appearance").apply_gains

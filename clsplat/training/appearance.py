@@ -17,12 +17,12 @@ from clsplat.device.launch import only_tried
 from clsplat.stages.appearance import PIXEL_BYTES, Gains, apply_gains, gain_gradient, step_gains
 
 WARM_UP, LEAST = 500, 0.01
-"""Steps over which the learning rate rises, or a tenth of all; the part of itself that it begins and ends with."""
+"""Steps over which the rate rises, or a tenth of all; the part of itself that it begins and ends with."""
 
 
 def rate_at(config: TrainConfig, step: int, views: int) -> float:
-    """The learning rate of step number `step`. A photograph has a gradient in one of `views` steps, by whose root Adam
-    makes its steps smaller."""
+    """The learning rate of step number `step`. A photograph has a gradient in one of `views` steps, by the
+    root of which Adam makes its steps smaller."""
     rise: float = LEAST ** (1 - min(step / min(WARM_UP, config.iterations / 10), 1.0))
     fall: float = LEAST ** (step / config.iterations)
     return config.appearance_rate * views**0.5 * rise * fall
@@ -39,7 +39,7 @@ class ViewAppearance:
     rate: float
 
     def apply(self, work: Workspace, image: DeviceArray) -> DeviceArray:
-        """The image as the photograph has it."""
+        """The image, exposed for the photograph."""
         return apply_gains(self.device, work, self.gains, self.view, image)
 
     def gradient(self, work: Workspace, seen: DeviceArray, gradient: DeviceArray, height: int) -> DeviceArray:
@@ -84,7 +84,7 @@ class Appearance:
         return {"kind": self._config.appearance, "photographs": photographs}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of a checkpoint, by name."""
+        """Arrays of a checkpoint, by name."""
         gains = self._gains
         if gains is None:
             return {}
