@@ -203,7 +203,7 @@ def scene_of(view: Camera, pixels: NDArray[np.float32]) -> Scene:
     """One view, its picture in memory at any size."""
 
     class Picture(_Picture):
-        def load(self, width: int | None = None, height: int | None = None) -> NDArray[np.float32]:
+        def load_masked(self, width: int | None = None, height: int | None = None) -> NDArray[np.float32]:
             return self.pixels[: height or view.height, : width or view.width]
 
     lens = Lens("PINHOLE", view.width, view.height, (view.fx, view.fy, view.cx, view.cy))

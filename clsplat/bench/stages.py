@@ -151,7 +151,7 @@ class _Picture(View):
 
     pixels: Float32 = field(kw_only=True)
 
-    def load(self, width: int | None = None, height: int | None = None) -> Float32:  # noqa: ARG002  # of one size
+    def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:  # noqa: ARG002  # of one size
         return self.pixels
 
 

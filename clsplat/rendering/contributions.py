@@ -29,8 +29,8 @@ def largest_contributions(
     """(n,) the most that each adds to one camera's picture: the sum over its pixels of alpha times transmittance, in
     pixels, like `--density.min-contribution`; 0 where no camera sees it.
 
-    It comes from the gradient of blending, and is the same for any gradient of the image. Raises
-    CapacityError where the device is too small.
+    It comes from the gradient of blending, and is the same for any gradient of the image. Raises CapacityError where
+    the device is too small.
     """
     config = config or RasterizerConfig()
     alpha_alone = drop_sh(gaussians, 0)  # colour does not matter

@@ -25,7 +25,7 @@ def rate_at(config: TrainConfig, step: int, views: int) -> float:
     root of which Adam makes its steps smaller."""
     rise: float = LEAST ** (1 - min(step / min(WARM_UP, config.iterations / 10), 1.0))
     fall: float = LEAST ** (step / config.iterations)
-    return config.appearance_rate * views**0.5 * rise * fall
+    return float(config.appearance_rate * views**0.5 * rise * fall)
 
 
 @dataclass(frozen=True, eq=False)
