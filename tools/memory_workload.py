@@ -183,12 +183,27 @@ def training(device: Device) -> None:
         ),
     )
     ahead, rooms = replace(paper, iterations=3, warmup=()), iter((0, 2000, 1))
-    for config, channels in ((paper, 3), (wide, 4), (ahead, 3), (replace(ahead, antialiased=True, iterations=2), 3)):
+    short = replace(ahead, iterations=2)
+    settings: list[tuple[TrainConfig, int, Camera]] = [
+        (paper, 3, view),
+        (wide, 4, view),
+        (ahead, 3, view),
+        (replace(short, antialiased=True), 3, view),
+        (replace(short, density=replace(paper.density, growth="mcmc", max_gaussians=60)), 3, view),
+        (replace(short, appearance="exposure", masks="ignore"), 5, view),
+        (replace(short, masks="transparent"), 5, view),
+        (short, 3, replace(view, fx=9.0, fy=9.0, projection="fisheye", radial=(0.05, 0.01, 0.0, 0.0))),
+        (short, 3, replace(view, fx=20 / (2 * np.pi), fy=20 / (2 * np.pi), projection="equirectangular")),
+        (short, 3, replace(view, fx=9.0, fy=9.0, projection="orthographic")),
+    ]
+    for config, channels, camera_of in settings:
         pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
         if channels == 3:
             pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
         start = cloud(18, view, 5, degree=0)
-        trainer = Trainer(scene_of(view, pixels), config, device, start)
+        if channels == 5:
+            pixels[:, :, 4] = pixels[:, :, 4] > 0.3
+        trainer = Trainer(scene_of(camera_of, pixels), config, device, start)
         trainer.pending.on = config is ahead
         if config is ahead:
             trainer.pending.room = lambda *_: next(rooms)  # type: ignore[method-assign]

@@ -56,7 +56,7 @@ def assert_lists_hold_every_tile(device: Device, name: str) -> None:
 def test_few_tiles_are_listed_in_vain(device: Device, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make(name)
     run = Pipeline.run(device, scene)
-    monkeypatch.setattr("clsplat.rendering.rasterizer.kernel_defines", lambda _config: {"SMALL_BOX": 0})
+    monkeypatch.setattr("clsplat.rendering.rasterizer.kernel_defines", lambda _config, *, antialiased: {"SMALL_BOX": 0})
     exact = Pipeline.run(device, scene)
     projected = reference.forward(*scene).projected
     wanted = sum(len(t) for t in touched_tiles(projected, run.camera.width, run.camera.height))

@@ -37,6 +37,8 @@ class FakeView:
     def load(self, width: int | None = None, height: int | None = None) -> np.ndarray:
         return np.full((height or self.camera.height, width or self.camera.width, 3), 0.5, np.float32)
 
+    load_masked = load
+
 
 @dataclass
 class FakeDevice:
