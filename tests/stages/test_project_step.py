@@ -53,7 +53,6 @@ CASES = {
     "several bands": Case(degree=1, added_up=True),
     "penalties": Case(explore=Exploration(opacity=0.2, scale=0.3)),
     "penalties, all fields of slots, sparse": Case(
-        degree=1,
         optimiser=OptimiserConfig(sparse=True),
         fields=WIDEST_SLOTS,
         explore=Exploration(opacity=0.2),
