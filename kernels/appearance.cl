@@ -2,23 +2,15 @@
 //
 // Owner: A work-item owns a pixel (apply_gains), sixteen pixels below each other (gain_sums), a column of these
 //   (column_sums), or one gain of one photograph (move_gains, centre_gains). Sums have one order on every device.
+//   Built with one lane.
 // Launch: Grids of stride x rows, stride x tiles_y and stride x 3; a work-item for each of the `count` gains.
 // Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, first, second, moved, gains (photographs, 3),
 //   logs to base 2; partials (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are above each.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
+#include "shared/lanes.h"
 
-#define LN2 0.693147180559945f
 #define MOST_LOG 16.0f
-
-// 2^x for x in [-16, 16].
-static inline float exp2_of_log(const float x) {
-  const float t = x + 12582912.0f, f = x + (12582912.0f - t), f2 = f * f;
-  const float low = fma1(f, 6.931469025e-1f, 1.0f);
-  const float middle = fma1(f, 5.550900067e-2f, 2.402225277e-1f);
-  const float high = fma1(f, 1.321160340e-3f, 9.671293494e-3f);
-  return as_float(as_int(fma1(f2, fma1(f2, high, middle), low)) + (as_int(t) << 23));
-}
 
 // gains, image -> seen: the image, exposed for the photograph.
 __kernel void apply_gains(const int photograph, const int stride, const int plane, __global const float *gains,
@@ -80,5 +72,5 @@ __kernel void centre_gains(const int count, __global const uint *readback, __glo
   for (int k = i % 3; k < count; k += 3) sum += moved[k];
   const float x = clamp(moved[i] - 3.0f * sum / (float)count, -MOST_LOG, MOST_LOG);
   logs[i] = x;
-  gains[i] = exp2_of_log(x);
+  gains[i] = exp2L(x);
 }

@@ -76,15 +76,10 @@ static inline Share take_out(Pixels *p, floatL uncapped, float c_red, float c_gr
 // The mean's fields are of the gradient on its tangent plane: it is not linear in (u, v), as the plane turns with the
 // mean, (21) of docs/cameras.md.
 static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, float l12, float l22, floatL *sums) {
-  const floatL gu = g * u, gv = g * v, q = fmaL(u, u, v * v);
+  const floatL q = fmaL(u, u, v * v);
   const floatL y = v / l22, x = fmaL((floatL)(-l12), y, u) / l11;
   const floatL by_x = g * fmaL(q, x, l11 * u), by_y = g * fmaL(q, y, fmaL((floatL)(l12), u, l22 * v));
-  sums[SLOT_G] += g;
-  sums[SLOT_GU] += by_x;
-  sums[SLOT_GV] += by_y;
-  sums[SLOT_GUU] = fmaL(gu, u, sums[SLOT_GUU]);
-  sums[SLOT_GUV] = fmaL(gu, v, sums[SLOT_GUV]);
-  sums[SLOT_GVV] = fmaL(gv, v, sums[SLOT_GVV]);
+  add_moments_by(g, u, v, by_x, by_y, sums);
 #ifdef ABSOLUTE_GRADIENTS
   sums[SLOT_ABSX] += fabs(by_x);
   sums[SLOT_ABSY] += fabs(by_y);
@@ -102,10 +97,10 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
   add_ray_moments(share.g, u, v, l11, l12, l22, sums);
 #else
   add_moments(share.g, u, v, sums);
-#endif
-#if defined(ABSOLUTE_GRADIENTS) && !defined(RAYS)
+#ifdef ABSOLUTE_GRADIENTS
   sums[SLOT_ABSX] += fabs(share.g * (l11 * u));
   sums[SLOT_ABSY] += fabs(share.g * fmaL((floatL)(l12), u, l22 * v));
+#endif
 #endif
 #ifdef CONTRIBUTIONS
   sums[SLOT_WEIGHT] += share.weight;

@@ -9,8 +9,8 @@
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 
-#define UNSEEN -1e30f // the log of no size: as small as one likes
-#define LN2 0.693147180559945f
+#define UNSEEN -1e30f          // the log of no size: as small as one likes
+#define SAMPLING 0.4472135901f // widths of a pixel, the root of 0.2
 
 // The distance from camera to mean that a pixel's width goes with, where a camera sees it: x/z and y/z within the
 // bounds of the Jacobian's, which lie 0.15 of the picture beyond its edges.

@@ -77,7 +77,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
     resolution = config.resolution if verb.resolution is None else verb.resolution
     test_every = config.test_every if verb.test_every is None else verb.test_every
     device = verb.device.open(services)
-    scene = load_scene(services, source, resolution, test_every, config.mask_use.or_none, config.lenses)
+    scene = load_scene(services, source, resolution, test_every, config.mask_use, config.lenses)
     views = [view for view in scene.views if view.split == "test"]
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {test_every}")

@@ -9,11 +9,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.errors import warn
 from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
-    from clsplat.config.masks import MaskUse
     from clsplat.config.training import Lenses
     from clsplat.device.context import Device, DeviceInfo
     from clsplat.gaussians import Gaussians
@@ -52,12 +52,12 @@ def load_scene(
     path: Path,
     resolution: int,
     test_every: int,
-    masks: MaskUse | None = None,
+    masks: MaskUse = NO_MASKS,
     lenses: Lenses = "undistort",
 ) -> Scene:
     """The scene, with its warnings printed."""
-    how = {"lenses": lenses} if masks is None else {"lenses": lenses, "masks": masks}
-    scene = services.load_scene(path, resolution=resolution, test_every=test_every, progress=StageProgress(), **how)
+    how = {"resolution": resolution, "test_every": test_every, "masks": masks, "lenses": lenses}
+    scene = services.load_scene(path, **how, progress=StageProgress())
     for text in scene.warnings:
         warn(text)
     return scene

@@ -117,7 +117,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         raise InputError("SCENE is missing, expected the folder of the scene to train on")
     devices = verb.device.open_all(services)
     config = verb.config
-    scene = load_scene(services, source, config.resolution, config.test_every, config.mask_use.or_none, config.lenses)
+    scene = load_scene(services, source, config.resolution, config.test_every, config.mask_use, config.lenses)
     _check_scene(scene)
     if verb.resume and (done := max((step for step, _ in earlier.checkpoints()), default=0)) > verb.config.iterations:
         raise InputError(

@@ -18,7 +18,6 @@ class MaskUse:
     alpha: AlphaMeaning = "blend"
     invert: bool = False
 
-    @property
-    def or_none(self) -> MaskUse | None:
-        """The same, None where nothing is asked for."""
-        return None if self == MaskUse() else self
+
+NO_MASKS = MaskUse()
+"""The use where none is asked for."""

@@ -39,8 +39,8 @@ def evaluate(
     which they are measured. corrected: measure PSNR after an affine fit of colours as well. step, gaussians, seconds
     are passed through. Without views the mean is empty. Pixels that a mask leaves out count in no score
     (`metrics.ssim`), and "counted" is the share of those that do. lpips_missing says why there is no LPIPS, where there
-    is none. Raises ClsplatError where a render is
-    not finite, InputError naming a view that is too small, or a space that is not known.
+    is none. Raises ClsplatError where a render is not finite, InputError naming a view that is too small, or a space
+    that is not known.
     """
     records: list[dict[str, Any]] = []
     names = picture_names([view.name for view in views])

@@ -90,6 +90,7 @@ class Rasterizer:
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
         self.config = config or RasterizerConfig()
         self._switches, self._bare = self.config.switches(), device
+        self._antialiased: bool | None = None
         self.antialias(on=False)
         self.work = work or Workspace(device)
         self._packs: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
@@ -104,6 +105,9 @@ class Rasterizer:
 
     def antialias(self, *, on: bool) -> None:
         """Draw models that are antialiased from here on, or those that are not (`Gaussians.antialiased`)."""
+        if on == self._antialiased:
+            return
+        self._antialiased = on
         self.device = self._bare.with_switches(kernel_defines(self.config, antialiased=on))
         self._by_kind = {
             id(kind): self.device.with_switches(kind.defines) if kind.defines else self.device

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from clsplat.arrays import Float32
-from clsplat.config.masks import MaskUse
+from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.images.reading import find_images, image_size, read_image
 from clsplat.images.writing import write_image
@@ -106,7 +106,7 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
     Warns of photographs without a mask. Raises InputError where there are no masks, one is missing, of another size, or
     fits no photograph.
     """
-    if use == MaskUse():
+    if use == NO_MASKS:
         return {}
     found: dict[str, Path] = {}
     if use.masks != "none":

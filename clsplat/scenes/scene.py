@@ -17,7 +17,7 @@ import numpy as np
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, NEARS, Camera
 from clsplat.config.checks import misfit
-from clsplat.config.masks import MaskUse
+from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.training import Lenses
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError, examples, plain, warn
@@ -264,7 +264,7 @@ def load_scene(
     lenses: Lenses = "undistort",
     work_dir: Path | None = None,
     progress: Progress | None = None,
-    masks: MaskUse | None = None,
+    masks: MaskUse = NO_MASKS,
 ) -> Scene:
     """Read a scene's cameras, points and picture headers; the pixels are read by `View.load`.
 
@@ -284,7 +284,7 @@ def load_scene(
 
     masks: what masks and alpha channels mean (`clsplat.scenes.masks`); no other folder of pictures stands in then.
     """
-    path, use = Path(path), masks or MaskUse()
+    path = Path(path)
     for name, number in (("resolution", resolution), ("test_every", test_every)):
         if (expected := misfit(int, number)) or number < 0:
             raise InputError(f"{name} {number}: expected {expected or '0 or more'}")
@@ -295,7 +295,7 @@ def load_scene(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if kind in ("blender", "transforms"):
-            data = _read_transforms(path, kind, masks=use.masks != "none")
+            data = _read_transforms(path, kind, masks=masks.masks != "none")
         else:
             folder = path
             if kind == "photos":
@@ -303,9 +303,9 @@ def load_scene(
                 folder = reconstruct(photos, work_dir or photos.with_name(f"{photos.name}_colmap"), progress=progress)
             data, smaller = _read_colmap(folder, images)
         posed = sorted(data.images, key=lambda image: image.name)
-        if use != MaskUse():
+        if masks != NO_MASKS:
             smaller = []
-        of_pictures = masks_of(use, posed, path)
+        of_pictures = masks_of(masks, posed, path)
         own_split = any(image.split for image in posed)
         views = []
         for index, image in enumerate(posed):

@@ -32,9 +32,10 @@ _FEATURES = Features.of(WIDTHS).defines
 BUILT_WITH: dict[str, dict[str, object]] = {
     "features": {**_FEATURES, "LANES": 1},
     "channels": _FEATURES,
+    "appearance": {"LANES": 1},
     "noise": {"LANES": 1},
     "project_rays": {"LANES": 1, "RAYS": 1},
-    "sampling": {"LANES": 1, "SAMPLING": "0.4f"},
+    "sampling": {"LANES": 1},
 }
 """Defines of the kernels that are not built without."""
 

@@ -44,7 +44,7 @@ def apply_gains(device: Device, work: Workspace, gains: Gains, photograph: int, 
     """Planes (3, rows, stride) of the image, exposed for the photograph."""
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
-    kernel = device.kernels("appearance").apply_gains
+    kernel = device.kernels("appearance", LANES=1).apply_gains
     launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, image, seen)
     return seen
 
@@ -67,7 +67,7 @@ def gain_gradient(
         work.array("appearance_partials", (3, down, stride)),
         work.array("appearance_columns", (3, stride)),
     )
-    kernels = device.kernels("appearance")
+    kernels = device.kernels("appearance", LANES=1)
     sizes = (photograph, height, stride, rows * stride, down)
     launch_grid(device, kernels.gain_sums, (stride, down), *sizes, gains.gains, seen, partials, gradient)
     launch_grid(device, kernels.column_sums, (stride, 3), stride, down, partials, columns)
@@ -86,7 +86,7 @@ def step_gains(
 ) -> None:
     """Adam's step number `step` (from 1), and the mean of each channel's logs made 0. A step by capacity that has
     stopped changes nothing."""
-    kernels, count = device.kernels("appearance"), gains.logs.size
+    kernels, count = device.kernels("appearance", LANES=1), gains.logs.size
     constants = (rate / (1 - BETA1**step), (1 - BETA2**step) ** -0.5, BETA1, BETA2, EPSILON)
     sizes, moments = (count, photograph, columns.shape[1]), (gains.first, gains.second)
     launch_items(

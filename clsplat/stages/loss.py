@@ -141,8 +141,5 @@ def loss(
         scale = alpha_weight / (samples / 3)
         kernel = device.kernels("alpha_loss").alpha_loss
         launch_grid(device, kernel, (stride, rows // TILE), stride, rows, own, scale, *planes, sums)
-    return Loss(
-        *(gradient, sums, samples, weight),
-        masked=every - 3 * kept if kept is not None else 0,
-        alpha=(alpha_weight, alphas),
-    )
+    masked = 0 if kept is None else every - 3 * kept
+    return Loss(gradient, sums, samples, weight, masked=masked, alpha=(alpha_weight, alphas))

@@ -15,11 +15,6 @@ from clsplat.device.profile import stage
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import AnyGaussians, parts
 
-SAMPLING = np.float32(np.sqrt(0.2))
-"""Least standard deviation of a Gaussian, in widths of the finest pixel that shows it (Yu et al. 2024, Mip-Splatting,
-section 5.1)."""
-
-
 GAUSSIAN_BYTES = 4
 """Bytes of each Gaussian: its least scale."""
 
@@ -34,8 +29,8 @@ def sampling_limits(
     device: Device, work: Workspace, gaussians: AnyGaussians, cameras: DeviceArray, least: DeviceArray
 ) -> None:
     """Fill least (n,): the natural log of the least standard deviation, in world units, that the pictures of the
-    cameras can show of each Gaussian; -1e30 for one that is in none."""
-    kernel = device.kernels("sampling", LANES=1, SAMPLING=f"{float(SAMPLING):.9e}f").sampling_limits
+    cameras can show of each Gaussian (Yu et al. 2024, Mip-Splatting, section 5.1); -1e30 for one that is in none."""
+    kernel = device.kernels("sampling", LANES=1).sampling_limits
     for start, stop, (part,) in parts(work, gaussians):
         arrays = (cameras, part["means"], least.rows(start, stop))
         launch_items(device, kernel, part.count, part.count, cameras.shape[0], *arrays)
@@ -44,6 +39,6 @@ def sampling_limits(
 @stage("sampling")
 def limit_scales(device: Device, work: Workspace, gaussians: AnyGaussians, least: DeviceArray) -> None:
     """Make the log scales that are less than `least` (n,) that."""
-    kernel = device.kernels("sampling", LANES=1, SAMPLING=f"{float(SAMPLING):.9e}f").limit_scales
+    kernel = device.kernels("sampling", LANES=1).limit_scales
     for start, stop, (part,) in parts(work, gaussians, keep=True):
         launch_items(device, kernel, part.count, part.count, least.rows(start, stop), part["log_scales"])

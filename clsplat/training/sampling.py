@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
+from clsplat.errors import InputError
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.stages.sampling import limit_scales, sampling_limits, upload_cameras
 
@@ -19,31 +22,48 @@ EVERY = 100
 
 
 class SamplingFilter:
-    """The least scales of a model in training, by the cameras of its pictures at their full size.
+    """The least scales of a model in training, by the cameras of its pictures at their full size; nothing where the
+    settings ask for none."""
 
-    least (n,): None where they have to be worked out before the next step.
-    """
-
-    def __init__(self, device: Device, work: Workspace, cameras: Sequence[Camera]) -> None:
-        self._device, self._work = device, work
-        self._cameras = upload_cameras(device, cameras)
-        self.least: DeviceArray | None = None
+    def __init__(self, config: TrainConfig, device: Device, work: Workspace, cameras: Mapping[str, Camera]) -> None:
+        """cameras: by the views' names. Raises InputError for one that is not trained so."""
+        self._device, self._work, self._on = device, work, config.antialiased
+        self._least: DeviceArray | None = None  # (n,), None where they have to be worked out before the next step
+        if not self._on:
+            return
+        if (name := next((name for name, camera in cameras.items() if not camera.kind.flat), None)) is not None:
+            raise InputError(
+                f"--antialiased: {name} is {cameras[name].projection}, expected perspective or orthographic "
+                "photographs; --lenses undistort makes these of a fisheye's"
+            )
+        self._cameras = upload_cameras(device, list(cameras.values()))
 
     def is_due(self, step: int) -> bool:
         """True if the least scales are worked out before this step."""
-        return self.least is None or step % EVERY == 1
+        return self._on and (self._least is None or step % EVERY == 1)
 
     def renew(self, gaussians: AnyGaussians) -> None:
         """Work out the least scales, and apply them."""
-        self.least = allocate(self._device, (gaussians.count,), np.float32)
-        sampling_limits(self._device, self._work, gaussians, self._cameras, self.least)
+        self._least = allocate(self._device, (gaussians.count,), np.float32)
+        sampling_limits(self._device, self._work, gaussians, self._cameras, self._least)
         self.apply(gaussians)
 
     def apply(self, gaussians: AnyGaussians) -> None:
         """Make no scale less than it may be."""
-        assert self.least is not None, "renewed before a step"
-        limit_scales(self._device, self._work, gaussians, self.least)
+        if self._least is not None:
+            limit_scales(self._device, self._work, gaussians, self._least)
 
-    def restore(self, least: NDArray[np.float32] | None) -> None:
-        """Go on from a checkpoint's least scales (n,), or without."""
-        self.least = None if least is None else upload(self._device, np.ascontiguousarray(least, np.float32))
+    def forget(self) -> None:
+        """Forget the least scales: rows have moved."""
+        self._least = None
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        return {} if self._least is None else {"sampling/least": self._least.get()}
+
+    def load(self, arrays: Mapping[str, NDArray[Any]], count: int) -> None:
+        """Take the arrays of a checkpoint of `count` Gaussians. Raises ValueError where they are of others."""
+        least = arrays.get("least") if self._on else None
+        if least is not None and least.shape != (count,):
+            raise ValueError(f"sampling/least has shape {least.shape}")
+        self._least = None if least is None else upload(self._device, np.ascontiguousarray(least, np.float32))

@@ -130,10 +130,9 @@ class GradientStep:
     ) -> Loss:
         """Update the model (parameters, first and second moments) by a photograph (H, W, 3 to 5) of the camera's size.
 
-        kept: pixels that the photograph's mask, its fifth channel, leaves.
-
         gradients: room for those of the rows that are on the device at once, zeros before and after, for a probe that
-        looks at them; the bits of the model are the same without; reads_loss: the loss will be read.
+        looks at them; the bits of the model are the same without; reads_loss: the loss will be read; kept: pixels that
+        the photograph's mask, its fifth channel, leaves.
         """
         device, rasterizer, work = self.device, self.rasterizer, self.rasterizer.work
         frame = rasterizer.forward(model[0], camera, background, room=self.room)
@@ -143,7 +142,10 @@ class GradientStep:
         size, weight, appearance = (camera.width, camera.height), self.config.dssim_weight, self.appearance
         image = frame.blended.image if appearance is None else appearance.apply(work, frame.blended.image)
         result = loss(
-            *(device, work, image, planes),
+            device,
+            work,
+            image,
+            planes,
             *size,
             weight,
             self.turn,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.config.marking import FRESH
-from clsplat.config.masks import MaskUse
+from clsplat.config.masks import NO_MASKS
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
@@ -126,15 +126,8 @@ class Trainer:
         self.appearance = Appearance(self.config, self.device, len(self.views))
         self.origin, self.near = initial.origin, self.scene.near
         self._cameras: dict[int, Camera] = {}
-        self.sampling: SamplingFilter | None = None
-        if self.config.antialiased:
-            cameras = [self.local(view.camera) for view in self.views]
-            if (rays := next((view for view in self.views if not view.camera.kind.flat), None)) is not None:
-                raise InputError(
-                    f"--antialiased: {rays.name} is {rays.camera.projection}, expected perspective or orthographic "
-                    "photographs; --lenses undistort makes these of a fisheye's"
-                )
-            self.sampling = SamplingFilter(self.device, self.rasterizer.work, cameras)
+        cameras = {view.name: self.local(view.camera) for view in self.views}
+        self.sampling = SamplingFilter(self.config, self.device, self.rasterizer.work, cameras)
         self._make_plan(len(initial))
         if self.plan.streamed:
             self._set_parameters(host_gaussians(copy.deepcopy(initial), self.plan.rows))
@@ -157,7 +150,7 @@ class Trainer:
                 photographs=sum(view.camera.width * view.camera.height for view in self.views),
                 turns=self.pending.turns,
                 antialiased=self.config.antialiased,
-                masks=self.config.mask_use != MaskUse(),
+                masks=self.config.mask_use != NO_MASKS,
                 further=self.appearance.pixel_bytes,
                 **models,
             )
@@ -219,7 +212,7 @@ class Trainer:
         views = self.views_ahead
         self.step += views
         self._raise_sh_degree()
-        if self.sampling is not None and self.sampling.is_due(self.step):
+        if self.sampling.is_due(self.step):
             self.settle()
             self.sampling.renew(self.parameters)  # to no other effect if done again
         samples = [self._sample() for _ in range(views)]
@@ -237,7 +230,7 @@ class Trainer:
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
             result = step.run(model, *pixels, probe, reads_loss=reads_loss, kept=sample.kept)
-            self._limit_scales()
+            self.sampling.apply(self.parameters)
             return result
 
         result: Loss | Losses
@@ -246,15 +239,11 @@ class Trainer:
         else:
             model, statistics = (self.parameters, self.first, self.second), needs.gradients
             result = self.batch.run(exact, model, samples, factor, self._watched_in_batch, statistics=statistics)
-            self._limit_scales()
+            self.sampling.apply(self.parameters)
         self.controlled, self.last_views = False, views
         self._note()
         self._rearrange(self.strategy.after_gradient(self._state()))
         return result
-
-    def _limit_scales(self) -> None:
-        if self.sampling is not None:
-            self.sampling.apply(self.parameters)
 
     def _room(self, factor: float) -> int:
         """Pairs to launch the next step for, or 0 for the exact number, as where the strategy looks at each step's
@@ -435,8 +424,7 @@ class Trainer:
         moved = [gather(device, rows, model, renews=index > 0) for index, model in enumerate(models)]
         del models
         self._set_parameters(*(self._placed(model) for model in moved))
-        if self.sampling is not None:
-            self.sampling.least = None
+        self.sampling.forget()
         carry(device, listed, statistics, self.statistics, densified=new_statistics)
         if type(self.strategy).rearranged is not Strategy.rearranged:
             entries = listed.get()
@@ -483,9 +471,7 @@ class Trainer:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
         arrays |= {f"{kind}/{group}": model[group].get() for kind, model in self.models().items() for group in GROUPS}
-        if self.sampling is not None and self.sampling.least is not None:
-            arrays["sampling/least"] = self.sampling.least.get()
-        return arrays | self.appearance.arrays()
+        return arrays | self.sampling.arrays() | self.appearance.arrays()
 
     def restart(self) -> None:
         """Begin again, at the rates that `watch.patience` allows."""
@@ -525,12 +511,8 @@ class Trainer:
                 raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
         self.statistics.load(statistics)  # what the settings did not ask for before the checkpoint is not known
         self.strategy.load(_named(checkpoint, "strategy/"))
-        if self.sampling is not None:
-            least = checkpoint.arrays.get("sampling/least")
-            if least is not None and least.shape != (self.parameters.count,):
-                raise unusable(checkpoint, f"sampling/least has shape {least.shape}")
-            self.sampling.restore(least)
         try:
+            self.sampling.load(_named(checkpoint, "sampling/"), self.parameters.count)
             self.appearance.load(_named(checkpoint, "appearance/"))
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None

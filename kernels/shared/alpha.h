@@ -13,15 +13,19 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
   return fmaL((floatL)(l12), dy, l11 * dx);
 }
 
-// Adds the moments of g in pixels to the first fields of a slot.
-static inline void add_moments(floatL g, floatL u, floatL v, floatL *sums) {
+// Adds g and its moments in pixels to the first fields of a slot; by_u, by_v: to those of the first order.
+static inline void add_moments_by(floatL g, floatL u, floatL v, floatL by_u, floatL by_v, floatL *sums) {
   const floatL gu = g * u, gv = g * v;
   sums[SLOT_G] += g;
-  sums[SLOT_GU] += gu;
-  sums[SLOT_GV] += gv;
+  sums[SLOT_GU] += by_u;
+  sums[SLOT_GV] += by_v;
   sums[SLOT_GUU] = fmaL(gu, u, sums[SLOT_GUU]);
   sums[SLOT_GUV] = fmaL(gu, v, sums[SLOT_GUV]);
   sums[SLOT_GVV] = fmaL(gv, v, sums[SLOT_GVV]);
+}
+
+static inline void add_moments(floatL g, floatL u, floatL v, floatL *sums) {
+  add_moments_by(g, u, v, g * u, g * v, sums);
 }
 
 // A Gaussian's values for a loop over cells, and log2 of its alpha before the cap in cell `cell`.

@@ -3,6 +3,7 @@
 #pragma OPENCL FP_CONTRACT OFF
 
 #define LOG2E 1.44269504088896341f
+#define LN2 0.693147180559945f
 #define ALPHA_MAX 0.99f
 #ifndef ALPHA_MIN // these two can be set by RasterizerConfig
 #define ALPHA_MIN (1.0f / 255.0f)

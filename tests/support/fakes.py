@@ -13,6 +13,7 @@ from models import random_gaussians
 from clsplat.camera import Camera
 from clsplat.cli import main as command_line
 from clsplat.cli.session import Services
+from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.errors import DeviceError, InputError
@@ -121,9 +122,9 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             return Result(np.full((*size, 3), 0.25, np.float32), np.full(size, 0.5, np.float32))
 
     def load_scene(
-        path: Path, *, resolution: int, test_every: int, lenses: str, progress: Callable[..., None]
+        path: Path, *, resolution: int, test_every: int, masks: MaskUse, lenses: str, progress: Callable[..., None]
     ) -> Scene:
-        assert lenses == "undistort"
+        assert (masks, lenses) == (NO_MASKS, "undistort")
         if not Path(path).is_dir():
             raise InputError(f"{path}: no such folder")
         pipe.calls.append(("load_scene", str(path), resolution, test_every))
