@@ -9,6 +9,7 @@ import signal
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,13 +44,19 @@ def pytest_configure() -> None:
     check_some_are_kept()
 
 
+def _driver_and_shape(parameters: dict[str, Any]) -> tuple[Any, Any]:
+    """Those that a test is for; None where it is for none, or no driver is there."""
+    shaped = parameters.get("shaped_device", (parameters.get("device"), None))
+    return shaped if isinstance(shaped, tuple) else (None, None)
+
+
 @pytest.hookimpl(tryfirst=True)  # before the slow ones are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """With `-n 2 --dist loadgroup`: a driver's tests in one process, so that its kernels are built once, which is what
     most of the time goes to; else a file's. The quick run has two shapes, as building is slow."""
     for item in items:
         parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
-        driver, shape = parameters.get("shaped_device", (parameters.get("device"), None))
+        driver, shape = _driver_and_shape(parameters)
         if shape is not None and shape not in QUICK_SHAPES:
             item.add_marker(pytest.mark.slow)
         item.add_marker(pytest.mark.xdist_group(item.path.stem if driver is None else f"driver {driver}"))

@@ -28,6 +28,15 @@
 // A sum of 64 bits in 32, 0xffffffff where it does not fit. So a sum of many is the same in every order of addition.
 #define CAPPED(sum) ((sum) > 0xffffffff ? 0xffffffff : (uint)(sum))
 
+// Intel's runtime for CPUs unrolls five rounds, and one of its compiler's passes
+// (sycl-kernel-reduce-cross-barrier-values) reads memory that it has freed where a kernel with barriers has some 50
+// basic blocks.
+#if ITEMS < 64
+#define ROUNDS _Pragma("unroll 1")
+#else
+#define ROUNDS
+#endif
+
 // The sum of the values of the items before this one; *total gets the sum of all. Sums stop at 0xffffffff. scratch
 // holds ITEMS elements.
 static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint *total) {
@@ -38,7 +47,7 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
   const uint item = get_local_id(0);
   scratch[item] = value;
   barrier(CLK_LOCAL_MEM_FENCE);
-  for (uint step = 1; step < ITEMS; step *= 2) {
+  ROUNDS for (uint step = 1; step < ITEMS; step *= 2) {
     const uint add = item >= step ? scratch[item - step] : 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     scratch[item] = CAPPED((ulong)scratch[item] + add);
