@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of docs/quality.md: finished rows are kept, others are gone on with, and half of the better's Gaussians."""
+"""The tables of docs/quality.md: finished rows are kept, others go on; half of the better one's Gaussians."""
 
 from __future__ import annotations
 
