@@ -233,9 +233,13 @@ OWN_SHAPE = "not 8x1-rusticl and not 1x1-rusticl"
 output as it was. It gets 1x64, and the self-test refuses what is wrong where another is asked for."""
 
 
-def smoke() -> Step:
+def smoke(*, stages: bool = True) -> Step:
+    """The smoke tests, from the files that have any: collecting all tests takes 10 s more. stages: also those of single
+    kernels; where only the user or the paths are other, the self-test has run the same kernels on the same driver."""
     pytest = (PYTHON, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=short")
-    command = (*pytest, "-m", "smoke", "-k", OWN_SHAPE)
+    files = sorted(path for path in (ROOT / "tests").rglob("test_*.py") if "mark.smoke" in path.read_text("utf-8"))
+    names = [str(path.relative_to(ROOT)) for path in files if stages or path.parent.name != "stages"]
+    command = (*pytest, "-m", "smoke", "-k", OWN_SHAPE, *names)
     return Step("smoke tests", command, SMOKE_LIMIT, without="no tests ran")
 
 
@@ -298,14 +302,14 @@ def look() -> Found:
 
 def machines(found: Found) -> list[Machine]:
     """Every row."""
-    usual = (short_test(), smoke())
+    usual, elsewhere = (short_test(), smoke()), smoke(stages=False)
     no_pypi = "" if found.pypi else "pyopencl brings no PoCL here"
     no_debian = "" if found.debian else "the distribution's PoCL is missing"
     no_intel = "" if found.intel else "intel-opencl-rt is not installed"
     no_rusticl = "" if found.rusticl else "CLSPLAT_RUSTICL names no library"
     debian, intel, rusticl = ((("debian", found.debian),), (("intel", found.intel),), (("rusticl", found.rusticl),))
     no_avx512 = "" if found.avx512 else "this processor has no AVX-512"
-    home_alone = Machine("", "", usual, pypi=True, missing=no_pypi)
+    home_alone = Machine("", "", (short_test(), elsewhere), pypi=True, missing=no_pypi)
     every = tuple(
         (name, path) for name, path in (*debian, *intel, *rusticl) if path
     )  # what is missing here has a row of its own that says so
@@ -315,6 +319,7 @@ def machines(found: Found) -> list[Machine]:
             home_alone,
             name="pypi-pocl-1-thread",
             purpose="the same, with one thread",
+            steps=usual,
             variables=(("POCL_MAX_PTHREAD_COUNT", "1"),),
         ),
         emulated(found, no_pypi),
@@ -365,7 +370,7 @@ def machines(found: Found) -> list[Machine]:
             home_alone,
             name="odd-paths",
             purpose="spaces and letters beyond ASCII in home, TMPDIR and the scene's path",
-            steps=(short_test(), *ten_steps("{folder}/a hôme/スプラット"), smoke()),
+            steps=(short_test(), *ten_steps("{folder}/a hôme/スプラット"), elsewhere),
             home="a hôme",
             temporary="a hôme/tmp é",
         ),
@@ -374,14 +379,14 @@ def machines(found: Found) -> list[Machine]:
             home_alone,
             name="lang-c",
             purpose="LANG=C, and a scene with letters beyond ASCII in its path",
-            steps=(short_test(), *ten_steps("{folder}/made/é"), smoke()),
+            steps=(short_test(), *ten_steps("{folder}/made/é"), elsewhere),
             variables=(("LANG", "C"),),
         ),
         replace(
             home_alone,
             name="ascii",
             purpose="LC_ALL=C with Python kept from making UTF-8 of it",
-            steps=(short_test(), *ten_steps("{folder}/made"), smoke()),
+            steps=(short_test(), *ten_steps("{folder}/made"), elsewhere),
             variables=(("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")),
         ),
     ]
