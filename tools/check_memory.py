@@ -26,6 +26,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from memory_workload import PARTS
+
 from clsplat.device.layout import header
 from clsplat.device.source import _INCLUDE, kernel_root
 
@@ -140,12 +142,12 @@ class Result:
     seconds: float
 
 
-def run(shape: str, check: str, driver: Path, folder: Path) -> Result:
-    """The workload in a child whose only device is Oclgrind's."""
+def run(shape: str, check: str, part: str, driver: Path, folder: Path) -> Result:
+    """A part of the workload in a child whose only device is Oclgrind's."""
     vendors = folder / "vendors"
     vendors.mkdir(exist_ok=True)
     (vendors / "oclgrind.icd").write_text(f"{driver}\n")
-    name = f"{shape} {check}"
+    name = f"{shape} {check} {part}".rstrip()
     log = folder / f"{name.replace(' ', '-')}.log"
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("OCLGRIND_", "CLSPLAT_"))}
     environment |= CHECKS[check]
@@ -160,7 +162,7 @@ def run(shape: str, check: str, driver: Path, folder: Path) -> Result:
         "PYOPENCL_NO_CACHE": "1",  # else the optimised build of one check would be found by the other
         "PYTHONPATH": os.pathsep.join(filter(None, (str(WORKLOAD.parents[1]), os.environ.get("PYTHONPATH", "")))),
     }
-    command = [sys.executable, str(WORKLOAD), shape, *(["plain"] if check == "uninitialised" else [])]
+    command = [sys.executable, str(WORKLOAD), shape, part, *(["plain"] if check == "uninitialised" else [])]
     start = time.monotonic()
     done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
     logged = log.read_text(errors="replace") if log.exists() else ""
@@ -208,14 +210,15 @@ def main(arguments: list[str]) -> int:
         return 2
     stems = kernels()
     shapes = options.shapes.split(",")
-    asked = [(shape, check) for shape in (*shapes, "planted") for check in reversed(CHECKS)]  # the longest first
+    asked = [(shape, check, part) for shape in shapes for check in reversed(CHECKS) for part in PARTS]
+    asked += [("planted", check, "") for check in CHECKS]  # the longest are first
     with tempfile.TemporaryDirectory(prefix="clsplat-memory-") as scratch:
         folder = options.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor(max(options.jobs, 1)) as pool:
             results = list(pool.map(lambda each: run(*each, driver, folder), asked))
     clean, missing = True, {check: set(stems) for check in CHECKS}
-    for (shape, check), result in zip(asked, results, strict=True):
+    for (shape, check, _), result in zip(asked, results, strict=True):
         if shape == "planted":
             clean &= report_planted(result, check)
             continue

@@ -193,7 +193,7 @@ def every(shape: Shape) -> list[dict[str, Any]]:
     device = Device(all_devices()[0], shape)
     device.kind = "gpu"
     work = memory_workload
-    for part in (work.training, work.frames, work.sorts, work.limits, work.rendering, work.pictures):
+    for part in (work.training, work.methods, work.frames, work.sorts, work.limits, work.rendering, work.pictures):
         part(device)
     return list(variants.values())
 

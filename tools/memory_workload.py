@@ -154,64 +154,67 @@ def pictures(device: Device) -> None:
             raise SystemExit(f"nothing is in the picture of the {view.projection} camera")
 
 
+PAPER = TrainConfig(
+    iterations=6,
+    sh_degree=2,
+    sh_degree_every=2,
+    warmup=(1,),
+    density=DensityConfig(every=2, start=1, stop=6, gradient_threshold=1e-7, opacity_reset_every=3),
+)
+AHEAD = replace(PAPER, iterations=3, warmup=())
+VIEW = camera(20, 17)
+
+
 def training(device: Device) -> None:
     """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset. Some
     by capacity, of which one has too little."""
-    view = camera(20, 17)
-    paper = TrainConfig(
-        iterations=6,
-        sh_degree=2,
-        sh_degree_every=2,
-        warmup=(1,),
-        density=DensityConfig(every=2, start=1, stop=6, gradient_threshold=1e-7, opacity_reset_every=3),
+    density = replace(
+        PAPER.density, absolute_gradients=True, views_agree=2, min_contribution=1e-3, prune_every=3, max_gaussians=60
     )
     wide = replace(
-        paper,
+        PAPER,
         iterations=4,
         warmup=(),
         sh_degree=1,
         sh_degree_every=1,
         background="random",
         optimiser=OptimiserConfig(sparse=True),
-        density=replace(
-            paper.density,
-            absolute_gradients=True,
-            views_agree=2,
-            min_contribution=1e-3,
-            prune_every=3,
-            max_gaussians=60,
-        ),
+        density=density,
     )
-    ahead, rooms = replace(paper, iterations=3, warmup=()), iter((0, 2000, 1))
-    short = replace(ahead, iterations=2)
-    settings: list[tuple[TrainConfig, int, Camera]] = [
-        (paper, 3, view),
-        (wide, 4, view),
-        (ahead, 3, view),
-        (replace(short, antialiased=True), 3, view),
-        (replace(short, density=replace(paper.density, growth="mcmc", max_gaussians=60)), 3, view),
-        (replace(short, appearance="exposure", masks="ignore"), 5, view),
-        (replace(short, masks="transparent"), 5, view),
-        (short, 3, replace(view, fx=9.0, fy=9.0, projection="fisheye", radial=(0.05, 0.01, 0.0, 0.0))),
-        (short, 3, replace(view, fx=20 / (2 * np.pi), fy=20 / (2 * np.pi), projection="equirectangular")),
-        (short, 3, replace(view, fx=9.0, fy=9.0, projection="orthographic")),
-    ]
-    for config, channels, camera_of in settings:
-        pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
-        if channels == 3:
-            pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
-        start = cloud(18, view, 5, degree=0)
-        if channels == 5:
-            pixels[:, :, 4] = pixels[:, :, 4] > 0.3
-        trainer = Trainer(scene_of(camera_of, pixels), config, device, start)
-        trainer.pending.on = config is ahead
-        if config is ahead:
-            trainer.pending.room = lambda *_: next(rooms)  # type: ignore[method-assign]
-        losses = [trainer.train_step().read()[0] for _ in range(config.iterations)]
-        if trainer.pending.redone != (config is ahead):
-            raise SystemExit(f"{trainer.pending.redone} steps were made again")
-        if not np.isfinite(losses).all():
-            raise SystemExit(f"the training went wrong: losses {losses}")
+    for config, channels in ((PAPER, 3), (wide, 4), (AHEAD, 3)):
+        _train(device, config, channels, VIEW)
+
+
+def methods(device: Device) -> None:
+    """Two steps of each of training's methods, and by each kind of camera."""
+    short = replace(AHEAD, iterations=2)
+    _train(device, replace(short, antialiased=True), 3, VIEW)
+    _train(device, replace(short, density=replace(PAPER.density, growth="mcmc", max_gaussians=60)), 3, VIEW)
+    _train(device, replace(short, appearance="exposure", masks="ignore"), 5, VIEW)
+    _train(device, replace(short, masks="transparent"), 5, VIEW)
+    fisheye = replace(VIEW, fx=9.0, fy=9.0, projection="fisheye", radial=(0.05, 0.01, 0.0, 0.0))
+    around = 20 / (2 * np.pi)
+    panorama = replace(VIEW, fx=around, fy=around, projection="equirectangular")
+    for view in (fisheye, panorama, replace(VIEW, fx=9.0, fy=9.0, projection="orthographic")):
+        _train(device, short, 3, view)
+
+
+def _train(device: Device, config: TrainConfig, channels: int, view: Camera) -> None:
+    pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
+    if channels == 3:
+        pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
+    if channels == 5:
+        pixels[:, :, 4] = pixels[:, :, 4] > 0.3
+    trainer = Trainer(scene_of(view, pixels), config, device, cloud(18, VIEW, 5, degree=0))
+    trainer.pending.on = config is AHEAD
+    if config is AHEAD:
+        rooms = iter((0, 2000, 1))
+        trainer.pending.room = lambda *_: next(rooms)  # type: ignore[method-assign]
+    losses = [trainer.train_step().read()[0] for _ in range(config.iterations)]
+    if trainer.pending.redone != (config is AHEAD):
+        raise SystemExit(f"{trainer.pending.redone} steps were made again")
+    if not np.isfinite(losses).all():
+        raise SystemExit(f"the training went wrong: losses {losses}")
 
 
 def scene_of(view: Camera, pixels: NDArray[np.float32]) -> Scene:
@@ -353,6 +356,14 @@ def by_elements(source: str, lanes: int) -> str:
     return source.replace(loads, f"((type##8)({', '.join(each)}))")
 
 
+PARTS = {
+    "training": (training,),
+    "methods": (methods,),
+    "passes": (sorts, limits, frames, by_two_launches, rendering, pictures, density),
+}
+"""The workload in parts that take a child each, by name."""
+
+
 def note_kernels() -> None:
     """Print the name of each kernel when it is put on the queue, and wait for it: a crash is then the last one's."""
     real = launch._enqueue  # noqa: SLF001
@@ -381,8 +392,9 @@ def main(arguments: list[str]) -> int:
     print("probe_fma", flush=True)  # which a device runs before its first kernel, where it has lanes
     if shape.items == 1:
         opened.kind = "cpu"  # the launches too are then those of a CPU
-    for part in (sorts, limits, frames, by_two_launches, rendering, pictures, density, training):
-        part(opened)
+    for name in arguments[1:]:
+        for part in PARTS.get(name, ()):
+            part(opened)
     return 0
 
 

@@ -101,4 +101,4 @@ def test_vectors_are_made_of_elements() -> None:
 def test_planted_faults_are_found(check: str, tmp_path: Path) -> None:
     driver = check_memory.library()
     assert driver is not None
-    assert report_planted(check_memory.run("planted", check, driver, tmp_path), check)
+    assert report_planted(check_memory.run("planted", check, "", driver, tmp_path), check)
