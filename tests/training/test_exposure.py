@@ -95,3 +95,15 @@ def test_colours_are_corrected_by_an_affine_map() -> None:
     image = rng.random((9, 8, 3))
     truth = image @ rng.uniform(0, 0.3, (3, 3)) + 0.05
     np.testing.assert_allclose(metrics.corrected(image, truth), truth, atol=1e-12)
+
+
+def test_corrected_psnr_knows_values_over_one() -> None:
+    rng = np.random.default_rng(4)
+    image, noise = rng.random((9, 8, 3)), rng.normal(0, 0.01, (9, 8, 3))
+    bright = 3 * image + 0.5
+    assert metrics.psnr_corrected(image, bright) > 100
+    assert metrics.psnr_corrected(image + noise, bright) < 32  # of 3 times 0.01, 30.5 dB, where most of it is over 1
+    counts = np.zeros((9, 8), bool)
+    counts[:4] = True
+    spoiled = np.where(counts[:, :, None], bright, 1e6)
+    assert metrics.psnr_corrected(image, spoiled, counts) > 100
