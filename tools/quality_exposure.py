@@ -6,8 +6,9 @@
 
 Writes the scene's photographs at that size as float EXR into FOLDER, once as they are and once times 2^U(-1, 1), so
 that nothing clips, and trains on each of them with and without. All models are measured against the held-out
-photographs as they are, after the affine map of colours that fits them best. Gains are compared with those put on, but
-for a factor common to all photographs. A row that FOLDER has already, of the same settings, is printed again.
+photographs as they are, after the affine map of colours that fits them best. Gains that were learnt are compared with
+those put on, but for a common factor: largest and mean error; then but for those learnt of the photographs as they
+are too, whose exposure may change as well. A row that FOLDER has already, of the same settings, is printed again.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
 
-ROWS = {"clean": (False, False), "clean, learnt": (False, True), "gains": (True, False), "gains, learnt": (True, True)}
+ROWS = {"clean": (False, False), "gains": (True, False), "clean, learnt": (False, True), "gains, learnt": (True, True)}
 """Rows of the table: whether gains are on the photographs, and whether appearance is learnt."""
 
 
@@ -55,14 +56,11 @@ def with_gains(scene: Scene, folder: Path, gains: Float64) -> Scene:
     return replace(scene, views=views)
 
 
-def recovered(record: dict[str, Any], scene: Scene, gains: Float64) -> dict[str, float]:
-    """Largest and mean relative error of the gains that were learnt, but for their common factor."""
-    wanted = {view.name: np.log2(gain) for view, gain in zip(scene.views, gains, strict=True)}
-    photographs = record["photographs"]
-    learnt = {name: row.get("log2_gains", row.get("log2_exposure")) for name, row in photographs.items()}
-    errors = np.array([np.atleast_1d(learnt[name]) - wanted[name] for name in photographs])
-    wrong = np.abs(2.0 ** (errors - errors.mean(axis=0)) - 1)
-    return {"largest": float(wrong.max()), "mean": float(wrong.mean())}
+def errors(learnt: dict[str, list[float]], wanted: dict[str, list[float]]) -> str:
+    """Largest and mean relative error of the gains that were learnt, both as logs, but for a common factor."""
+    apart = np.array([np.subtract(learnt[name], wanted[name]) for name in learnt])
+    wrong = np.abs(2.0 ** (apart - apart.mean(axis=0)) - 1)
+    return f"{wrong.max():.1%} / {wrong.mean():.1%}"
 
 
 def row(name: str, clean: Scene, folder: Path, gains: Float64, config: TrainConfig, device: Device) -> dict[str, Any]:
@@ -81,7 +79,8 @@ def row(name: str, clean: Scene, folder: Path, gains: Float64, config: TrainConf
     psnr, corrected = np.mean(scores, axis=0)
     result = {"psnr": psnr, "corrected": corrected, "gaussians": len(model), "seconds": seconds}
     if learns:
-        result["wrong"] = recovered(json.loads(run.appearance_path.read_text("utf-8")), clean, factors)
+        photographs = json.loads(run.appearance_path.read_text("utf-8"))["photographs"]
+        result["logs"] = {name: logs.get("log2_gains", logs.get("log2_exposure")) for name, logs in photographs.items()}
     return result
 
 
@@ -108,20 +107,24 @@ def main() -> None:
     config.check()
     known = options.folder / "rows.json"
     rows = json.loads(known.read_text("utf-8")) if known.exists() else {}
-    print(
-        "| photographs | PSNR | corrected | Gaussians | CPU s | gains wrong by, at most | mean |\n|---|---|---|---|---|---|---|"
-    )
+    put_on = {view.name: [np.log2(gain)] for view, gain in zip(clean.views, gains, strict=True)}
+    print("| photographs | PSNR | corrected | Gaussians | CPU s | gains wrong by | and but for those of clean |")
+    print("|---|---|---|---|---|---|---|")
+    keys: dict[str, str] = {}
     for name in options.only:
         learns = (options.appearance, options.rate) if ROWS[name][1] else ()
-        key = " ".join(map(str, (name, options.size, options.iterations, options.seed, *learns)))
+        key = keys[name] = " ".join(map(str, (name, options.size, options.iterations, options.seed, *learns)))
         if key not in rows:
             rows[key] = row(name, clean, options.folder, gains, config, device)
-            atomic_write(known, json.dumps(rows, indent=1).encode())
-        found = rows[key]
-        wrong = found.get("wrong")
-        errors = f"{wrong['largest']:.2%} | {wrong['mean']:.2%}" if wrong else "|"
+            atomic_write(known, json.dumps(rows).encode())
+        found, cells = rows[key], ["", ""]
+        if name == "gains, learnt":
+            cells[0] = errors(found["logs"], put_on)
+            if "clean, learnt" in keys:
+                own = rows[keys["clean, learnt"]]["logs"]
+                cells[1] = errors(found["logs"], {name: np.add(own[name], put_on[name]).tolist() for name in own})
         scores = f"{found['psnr']:.2f} | {found['corrected']:.2f} | {found['gaussians']:,} | {found['seconds']:.0f}"
-        print(f"| {name} | {scores} | {errors} |", flush=True)
+        print(f"| {name} | {scores} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

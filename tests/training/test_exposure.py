@@ -13,10 +13,12 @@ from compare import assert_same_bits
 from tiny import CONFIG, write_scene
 
 from clsplat.api import train
+from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.evaluation import metrics
+from clsplat.images.reading import read_image
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
@@ -67,6 +69,17 @@ def test_gains_of_photographs_are_learnt(
     assert np.abs(logs.mean(axis=0)).max() < 1e-6
     assert np.abs(logs - truth[:, None]).max() < 0.3  # of 2; so few steps
     assert "psnr_corrected" in json.loads(run.eval_path.read_text("utf-8"))["mean"]
+    name, cameras = scene.train_views[1].name, str(scene.train_views[1].path.parents[1])
+    flags: dict[str, list[str]] = {"plain": [], "exposed": ["--appearance", name]}
+    frames = {}
+    for kind, more in flags.items():
+        pattern = f"{tmp_path}/{kind}/{{name}}.exr"
+        assert main(["render", str(run.path), "--cameras", cameras, "-o", pattern, "--exr", "float", *more]) == 0
+        frames[kind] = read_image(next((tmp_path / kind).rglob("*.exr")))
+    gains = 2.0 ** np.array(record["photographs"][name]["log2_gains"])
+    assert frames["plain"].max() > 0.2
+    # Coefficients and colours of up to 4, rounded.
+    np.testing.assert_allclose(frames["exposed"], frames["plain"] * gains, atol=2e-5)
 
 
 def test_switched_off_there_is_nothing_of_it(default_device: Device, scene: Scene) -> None:
