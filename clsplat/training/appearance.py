@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,25 +18,34 @@ from clsplat.stages.appearance import PIXEL_BYTES, Gains, apply_gains, gain_grad
 
 WARM_UP, LEAST = 500, 0.01
 """Steps over which the rate rises, or a tenth of all; the part of itself that it begins and ends with."""
+FULL = 10_000
+"""Steps under which a training is short: with the rate of the settings a gain can come 4 octaves far in so many."""
 
 
 def rate_at(config: TrainConfig, step: int, views: int) -> float:
     """The learning rate of step number `step`. A photograph has a gradient in one of `views` steps, by the
-    root of which Adam makes its steps smaller."""
+    root of which Adam makes its steps smaller. In a short training gains have to come as far."""
     rise: float = LEAST ** (1 - min(step / min(WARM_UP, config.iterations / 10), 1.0))
     fall: float = LEAST ** (step / config.iterations)
-    return float(config.appearance_rate * views**0.5 * rise * fall)
+    short = max(FULL / config.iterations, 1.0)
+    return float(config.appearance_rate * short * views**0.5 * rise * fall)
 
 
 @dataclass(frozen=True, eq=False)
 class ViewAppearance:
-    """The appearance of one view in one step."""
+    """The appearance of one view in one step. place: the view's in a batch."""
 
     device: Device
     gains: Gains
     view: int
     step: int
     rate: float
+    place: int = 0
+
+    def on(self, device: Device, values: NDArray[np.float32]) -> ViewAppearance:
+        """The same on another device, by the values of `Gains.gains`, to apply and to find its gradient."""
+        gains = upload(device, values)
+        return replace(self, device=device, gains=Gains(gains, gains, gains, gains, gains))
 
     def apply(self, work: Workspace, image: DeviceArray) -> DeviceArray:
         """The image, exposed for the photograph."""
@@ -44,7 +53,7 @@ class ViewAppearance:
 
     def gradient(self, work: Workspace, seen: DeviceArray, gradient: DeviceArray, height: int) -> DeviceArray:
         """Make the gradient that by the image; sums for `update`, which is tried here, before anything changes."""
-        columns = gain_gradient(self.device, work, self.gains, self.view, seen, gradient, height)
+        columns = gain_gradient(self.device, work, self.gains, self.view, seen, gradient, height, self.place)
         if self.step == 1:
             with only_tried(self.device):
                 self.update(columns, columns)
@@ -67,13 +76,16 @@ class Appearance:
         """Bytes of a pixel on the device."""
         return PIXEL_BYTES if self._gains is not None else 0
 
-    def of_view(self, view: int, step: int) -> ViewAppearance | None:
-        """The appearance of a view in step number `step`; None where it is the model's."""
-        if self._gains is None:
-            return None
-        return ViewAppearance(
-            self._device, self._gains, view, step, rate_at(self._config, step, self._gains.logs.shape[0])
-        )
+    def of_views(self, views: Sequence[int], step: int) -> list[ViewAppearance]:
+        """The appearances of the views of a step, the last of which is number `step`; none where they are the
+        model's."""
+        device, gains = self._device, self._gains
+        if gains is None:
+            return []
+        numbers, count = range(step - len(views) + 1, step + 1), gains.logs.shape[0]
+        rates = [rate_at(self._config, number, count) for number in numbers]
+        each = enumerate(zip(views, numbers, rates, strict=True))
+        return [ViewAppearance(device, gains, *values, place) for place, values in each]
 
     def record(self, names: Sequence[str]) -> dict[str, Any] | None:
         """The content of appearance.json, by the names of the views; None where there is nothing to write."""
