@@ -4,16 +4,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from clsplat.arrays import Float32
 from clsplat.errors import InputError, examples
 from clsplat.files import parse_json, read_document
-from clsplat.runs.run import run_of
+from clsplat.runs.run import Run, run_of
 
 MAX_BYTES = 1 << 28
 MOST_LOG = 16.0
+ONES = (1.0, 1.0, 1.0)
 EXPECTED = "what clsplat train --appearance exposure writes"
 
 
@@ -28,11 +33,7 @@ def gains_of(model: Path, photograph: str) -> tuple[float, float, float]:
             f"--appearance {photograph}: {model} has learnt no appearances (no appearance.json), expected a run of "
             "clsplat train --appearance exposure"
         )
-    try:
-        photographs = parse_json(read_document(path, EXPECTED, MAX_BYTES))["photographs"]
-        gains = {str(name): _gains(row["log2_gains"]) for name, row in photographs.items()}
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path}: {type(error).__name__}: {error}; expected {EXPECTED}") from None
+    gains = _read(path, "photographs")
     found = [name for name in gains if photograph in (name, *_ends(name))]
     if len(found) > 1 and photograph not in found:
         raise InputError(f"--appearance {photograph}: is {len(found)} photographs, {examples(found)}; name one of them")
@@ -43,6 +44,29 @@ def gains_of(model: Path, photograph: str) -> tuple[float, float, float]:
             f"such as {examples(near)}"
         )
     return gains[photograph if photograph in found else found[0]]
+
+
+def gains_of_run(run: Run | None) -> Callable[[str], Float32]:
+    """The gains (3,) of a run's held-out photographs by name, 1 where none are known. Raises InputError."""
+    known = _read(run.appearance_path, "held_out") if run is not None and run.appearance_path.exists() else {}
+    return lambda name: np.array(known.get(name, ONES), np.float32)
+
+
+def held_out_gains(record: Mapping[str, Any] | None) -> Callable[[str], Float32]:
+    """The same of the content of an appearance.json."""
+    known = _gains_in(record, "held_out") if record is not None else {}
+    return lambda name: np.array(known.get(name, ONES), np.float32)
+
+
+def _read(path: Path, key: str) -> dict[str, tuple[float, float, float]]:
+    try:
+        return _gains_in(parse_json(read_document(path, EXPECTED, MAX_BYTES)), key)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InputError(f"{path}: {type(error).__name__}: {error}; expected {EXPECTED}") from None
+
+
+def _gains_in(record: Any, key: str) -> dict[str, tuple[float, float, float]]:
+    return {str(name): _gains(row["log2_gains"]) for name, row in record[key].items()}
 
 
 def _ends(name: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,16 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
+from clsplat.images.colour import SRGB, photos_space
+from clsplat.images.exif import exposure_of
 from clsplat.stages.appearance import PIXEL_BYTES, Gains, apply_gains, gain_gradient, step_gains
 
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene
+
+CODED = 1 / 2.2
+"""Octaves of a coded value for one of light, about: where gains begin that EXIF tells of photographs that are not
+linear."""
 WARM_UP, LEAST = 500, 0.01
 """Steps over which the rate rises, or a tenth of all; the part of itself that it begins and ends with."""
 FULL = 10_000
@@ -64,12 +72,27 @@ class ViewAppearance:
         step_gains(self.device, self.gains, self.view, columns, self.step, self.rate, readback)
 
 
+def _from_mean(told: Sequence[float | None], of: Sequence[float | None]) -> NDArray[np.float64]:
+    """Exposures from the mean of those that are told `of` photographs, NaN where none is."""
+    known = [value for value in of if value is not None]
+    return np.array([np.nan if value is None or not known else value - np.mean(known) for value in told], np.float64)
+
+
+def _rows(names: Sequence[str], logs: NDArray[np.float64]) -> dict[str, Any]:
+    return {name: {"log2_gains": row} for name, row in zip(names, logs.tolist(), strict=True)}
+
+
 class Appearance:
     """The gains of all training views; nothing where the settings ask for none."""
 
-    def __init__(self, config: TrainConfig, device: Device, views: int) -> None:
-        self._config, self._device = config, device
-        self._gains = Gains.on(device, np.zeros((views, 3), np.float32)) if config.appearance != "none" else None
+    def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
+        self._config, self._device, self._scene = config, device, scene
+        self._gains: Gains | None = None
+        if config.appearance != "none":
+            self._told = [exposure_of(view.path) for view in scene.train_views]
+            curve = CODED if photos_space(view.path for view in scene.views) == SRGB else 1.0
+            start = curve * np.nan_to_num(_from_mean(self._told, self._told))
+            self._gains = Gains.on(device, np.repeat(start[:, None], 3, axis=1).astype(np.float32))
 
     @property
     def pixel_bytes(self) -> int:
@@ -87,13 +110,26 @@ class Appearance:
         each = enumerate(zip(views, numbers, rates, strict=True))
         return [ViewAppearance(device, gains, *values, place) for place, values in each]
 
-    def record(self, names: Sequence[str]) -> dict[str, Any] | None:
-        """The content of appearance.json, by the names of the views; None where there is nothing to write."""
+    def record(self) -> dict[str, Any] | None:
+        """The content of appearance.json, by the names of the views; None where there is nothing to write.
+
+        Nothing is learnt of held-out photographs. Where EXIF tells their exposure, they get the gains that go with it
+        on average over the training's.
+        """
         if self._gains is None:
             return None
-        logs = self._gains.logs.get()
-        photographs = {name: {"log2_gains": row} for name, row in zip(names, logs.astype(float).tolist(), strict=True)}
-        return {"kind": self._config.appearance, "photographs": photographs}
+        logs, scene = self._gains.logs.get().astype(np.float64), self._scene
+        told = _from_mean(self._told, self._told)
+        known = ~np.isnan(told)
+        spread = np.square(told[known]).sum()
+        slopes = told[known] @ logs[known] / spread if spread > 0 else np.zeros(3)
+        held_out = _from_mean([exposure_of(view.path) for view in scene.test_views], self._told)
+        expected = np.nan_to_num(held_out)[:, None] * slopes
+        return {
+            "kind": self._config.appearance,
+            "photographs": _rows([view.name for view in scene.train_views], logs),
+            "held_out": _rows([view.name for view in scene.test_views], expected),
+        }
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name."""

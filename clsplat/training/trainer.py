@@ -123,7 +123,7 @@ class Trainer:
         initial = self.given
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
-        self.appearance = Appearance(self.config, self.device, len(self.views))
+        self.appearance = Appearance(self.config, self.device, self.scene)
         self.origin, self.near = initial.origin, self.scene.near
         self._cameras: dict[int, Camera] = {}
         cameras = {view.name: self.local(view.camera) for view in self.views}

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from compare import assert_same_bits
 from tiny import CONFIG, write_scene
@@ -18,10 +19,13 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_devices
 from clsplat.errors import DeviceError, InputError
 from clsplat.evaluation import metrics
+from clsplat.images.exif import exposure_of
 from clsplat.images.reading import read_image
+from clsplat.runs.appearance import held_out_gains
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.training.appearance import Appearance
 from clsplat.training.photographs import Photographs
 from clsplat.training.trainer import Trainer
 
@@ -133,11 +137,48 @@ def test_gains_of_photographs_are_learnt(
     np.testing.assert_allclose(frames["exposed"], frames["plain"] * gains, atol=2e-5)
 
 
+def test_exposures_that_exif_tells(default_device: Device, scene: Scene, tmp_path: Path) -> None:
+    """Gains begin there; held-out photographs get what goes with theirs."""
+
+    def told(index: int, view: View) -> View:
+        path = tmp_path / f"{index}.png"
+        pixels = np.rint(255 * view.load()[:, :, :3]).astype(np.uint8)
+        spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.UINT8)
+        time, stop, speed = [(1 / 60, 2.0, 100), (1 / 30, 2.0, 100), (1 / 60, 2.0, 400), (1 / 60, 4.0, 100)][index % 4]
+        spec.attribute("ExposureTime", time)
+        spec.attribute("FNumber", stop)
+        if index != 3:
+            spec.attribute("Exif:PhotographicSensitivity", speed)
+        file = oiio.ImageOutput.create(str(path))
+        assert file.open(str(path), spec)
+        assert file.write_image(pixels)
+        file.close()
+        return replace(view, path=path)
+
+    scene = replace(scene, views=[told(index, view) for index, view in enumerate(scene.views)])
+    exposures = {view.name: exposure_of(view.path) for view in scene.views}
+    assert [value is None for value in exposures.values()] == [index == 3 for index in range(len(exposures))]
+    appearance = Appearance(EXPOSED, default_device, scene)
+    record = appearance.record()
+    assert record is not None
+    known = [value for view in scene.train_views if (value := exposures[view.name]) is not None]
+    for view in scene.views:
+        exposure = exposures[view.name]
+        wanted = 0.0 if exposure is None else (exposure - np.mean(known)) / 2.2
+        got = record["photographs" if view.split == "train" else "held_out"][view.name]["log2_gains"]
+        np.testing.assert_allclose(got, 3 * [wanted], atol=1e-6)  # of 32 bits
+    assert sum(view.split == "test" and exposures[view.name] is not None for view in scene.views)
+    gains = held_out_gains(record)
+    name = scene.test_views[0].name
+    np.testing.assert_allclose(gains(name), 2.0 ** np.array(record["held_out"][name]["log2_gains"]), rtol=1e-6)
+    assert (gains("elsewhere") == 1).all()
+
+
 def test_switched_off_there_is_nothing_of_it(default_device: Device, scene: Scene) -> None:
     trainer = Trainer(scene, CONFIG, default_device)
     trainer.train_step()
     assert not any(name.startswith("appearance") for name in trainer.checkpoint()[0])
-    assert trainer.appearance.record([]) is None
+    assert trainer.appearance.record() is None
 
 
 def test_a_checkpoint_without_gains_is_refused(default_device: Device, scene: Scene) -> None:
