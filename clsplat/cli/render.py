@@ -84,6 +84,9 @@ class Render(Verb):
     and id (of Gaussians). docs/render.md has each."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
+    appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
+    """Expose the model as this photograph of its training is, by the run's appearance.json; if not given, as all are on
+    average. The background is taken as it is."""
     alpha: Flag = False
     """Write alpha too, as --channels rgb,alpha does, and no background: premultiplied in EXR and TIFF, straight in
     PNG."""
@@ -184,6 +187,7 @@ def _read_job(verb: Render) -> Job:
     from clsplat.gaussians import Gaussians
     from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
     from clsplat.images.frame_files import VIDEO
+    from clsplat.runs.appearance import gains_of
     from clsplat.runs.run import model_file
     from clsplat.sequence import existing
     from clsplat.sequence.task import digest_of, make_tasks
@@ -207,6 +211,7 @@ def _read_job(verb: Render) -> Job:
     for text in chosen.warnings:
         warn(text)
     model = model_file(verb.model)
+    gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else ()
     gaussians = Gaussians.load(model)
     tasks = [task.seen_from(gaussians.near) for task in tasks]
     recorded = recorded_space(model)
@@ -217,7 +222,7 @@ def _read_job(verb: Render) -> Job:
         warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
     attributes["clsplat:colorspace"] = colours.output
-    options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer))
+    options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer), gains=gains)
     spaces = (colours.model, colours.output)
     video = _video(verb, whole)
     on_farm = verb.workers is not None or verb.scheduler is not None

@@ -100,6 +100,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
+    from clsplat.selftest.result import APPEARANCE, TRAINING
 
     verb.device.check()
     verb.config.check()
@@ -128,7 +129,8 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     changed = verb.resume and scene_record.check(
         earlier, scene, source, verb.config.resolution, accept=verb.accept_changes
     )
-    devices = [services.require(device) for device in devices]
+    stages = () if config.appearance == "none" else ((*TRAINING, *APPEARANCE),)
+    devices = [services.require(device, *stages) for device in devices]
     verb.output.mkdir(parents=True, exist_ok=True)
     locks.enter_context(locked(verb.output, "train"))
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)

@@ -42,6 +42,9 @@ class View(Verb):
     """Folder with the scene, for its cameras and photos; the one the run was trained on if not given."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians. If not given: the run's setting, else black."""
+    appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
+    """Expose the model as this photograph of its training is, by the run's appearance.json; if not given, as all are on
+    average."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
 
@@ -52,6 +55,8 @@ def run(verb: View, services: Services) -> int:
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
     from clsplat.images.colour import recorded_space
+    from clsplat.models.edit import exposed
+    from clsplat.runs.appearance import gains_of
     from clsplat.runs.run import model_file, run_of
     from clsplat.selftest.result import FORWARD
     from clsplat.viewer.appearance import Look
@@ -67,7 +72,8 @@ def run(verb: View, services: Services) -> int:
     file = model_file(verb.model)
     run = run_of(verb.model)
     address.check()
-    gaussians = Gaussians.load(file)
+    gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else None
+    gaussians = Gaussians.load(file) if gains is None else exposed(Gaussians.load(file), gains)
     if not len(gaussians):
         raise InputError(f"{file}: has no Gaussians, expected some to look at")
     config = run.config if run else TrainConfig()

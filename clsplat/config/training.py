@@ -250,7 +250,8 @@ class TrainConfig:
     """exposure: learn a gain for each colour channel of each photograph, whose exposure and white balance then do not
     go into the model; it has their mean. none: photographs are taken as they are."""
     appearance_rate: float = 2e-3
-    """Learning rate of appearance, as logarithms to base 2 of the gains; times the root of their number."""
+    """Learning rate of appearance, as logarithms to base 2 of the gains; times the root of their
+    number, and in trainings of fewer than 10,000 steps by as much more as they are shorter."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -280,8 +281,6 @@ class TrainConfig:
             )
         if self.invert_masks and self.masks == "none":
             raise InputError("--invert-masks: no masks are used, expected --masks ignore or --masks transparent too")
-        if self.appearance != "none" and self.batch > 1:
-            raise InputError(f"--appearance {self.appearance}: learnt by view, expected --batch 1, got {self.batch}")
         if self.appearance != "none" and "transparent" in (self.masks, self.alpha):
             raise InputError(
                 f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
@@ -308,8 +307,6 @@ class TrainConfig:
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
         """The settings for `count` devices: a batch of a view for each, unless it is told. Raises InputError for a
         batch that they cannot share evenly."""
-        if self.appearance != "none" and count > 1:
-            raise InputError(f"--appearance {self.appearance}: learnt by view, expected one --device, got {count}")
         if self.batch == 1 and not explicit:
             return replace(self, batch=count)
         if self.batch % count:

@@ -60,7 +60,7 @@ def evaluate(
         except (InputError, ValueError) as error:
             raise InputError(f"{view.name}: {error}") from None
         if corrected:
-            record["psnr_corrected"] = metrics.psnr(metrics.corrected(image, truth, counts), truth, counts)
+            record["psnr_corrected"] = metrics.psnr_corrected(image, truth, counts)
         seen = image if counts is None else np.where(counts[:, :, None], image, 0)
         if (perceptual := metrics.lpips(seen, truth)) is not None:
             record["lpips"] = perceptual

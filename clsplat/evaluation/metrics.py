@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Closeness of a render to its photograph: PSNR, SSIM, and LPIPS where the optional extra is installed.
 
-Images are (H, W, 3), clamped to [0, 1] and compared in float64.
+Images are (H, W, 3), clamped to [0, 1] and compared in float64; corrected ones up to the photograph's brightest value.
 """
 
 from __future__ import annotations
@@ -32,6 +32,16 @@ def psnr(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) ->
     of different shapes."""
     a, b = _pair(image, truth)
     squares = np.square(a - b) if counts is None else np.square(a - b)[counts]
+    return float(-10 * np.log10(max(float(np.mean(squares)), MIN_SQUARED_ERROR)))
+
+
+def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
+    """PSNR of the image after its correction. The peak is 1; values over 1 are compared as they are where the truth has
+    such, and clamped to 1 elsewhere, those under 0 to 0. counts (H, W): the pixels that count."""
+    most = max(1.0, float(truth.max() if counts is None else truth[counts].max(initial=1.0)))
+    fitted = corrected(image, truth, counts)
+    squares = np.square(np.clip(fitted, 0, most) - np.clip(truth.astype(np.float64), 0, most))
+    squares = squares if counts is None else squares[counts]
     return float(-10 * np.log10(max(float(np.mean(squares)), MIN_SQUARED_ERROR)))
 
 

@@ -18,7 +18,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.spherical_harmonics import sh_basis
+from clsplat.spherical_harmonics import C0, sh_basis
 
 FAR = 64.0
 """Distance from the origin, in a model's own sizes, beyond which a model that is moved counts from there (decision
@@ -57,6 +57,14 @@ def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
 def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
     """The model without SH beyond the degree; the same where there are none."""
     return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
+
+
+def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
+    """The model with each channel of its colours times a gain, (3,), at least 0."""
+    factors = np.asarray(gains, np.float64)
+    sh = gaussians.sh * factors
+    sh[:, 0] += 0.5 * (factors - 1) / C0  # colours are SH plus a half
+    return replace(gaussians, sh=np.ascontiguousarray(sh, np.float32))
 
 
 def merge(models: Sequence[Gaussians]) -> Gaussians:

@@ -25,6 +25,7 @@ from clsplat.reference import loss as reference_loss
 from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters
 from clsplat.reference.tiles import touched_tiles
+from clsplat.selftest.appearance_stage import of_appearance
 from clsplat.selftest.harness import WHITEN, Array, Bench, Outcome, cropped, joined
 from clsplat.selftest.picture_stages import PICTURES
 from clsplat.selftest.scenes import evenly, keys, padded
@@ -447,4 +448,5 @@ RUN: dict[str, Callable[[Bench], Outcome]] = {
     "project_grad": _project_grad,
     "adam": _adam,
     "statistics": _statistics,
+    "appearance": of_appearance,
 }

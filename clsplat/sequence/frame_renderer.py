@@ -18,6 +18,7 @@ from clsplat.frame.draw import Planes
 from clsplat.frame.pipeline import FramePipeline
 from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
 from clsplat.gaussians import Gaussians
+from clsplat.models.edit import exposed
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, RAYS
 from clsplat.selftest.trust import require
@@ -48,6 +49,7 @@ class FrameRenderer:
     def __init__(self, renderer: Any, gaussians: Gaussians, options: RenderOptions) -> None:
         """renderer: a `Renderer`. Raises InputError for settings and colour spaces that make no sense."""
         self.options = options
+        gaussians = exposed(gaussians, options.gains) if options.gains else gaussians
         self._renderer, self._gaussians = renderer, gaussians
         self._rays_tested = False
         self._pipeline = FramePipeline(

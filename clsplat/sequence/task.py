@@ -120,7 +120,8 @@ def make_tasks(
 class RenderOptions:
     """Options that all frames of a job share. channels: of the table, `config.channels`; attributes: of the file's
     header; pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a
-    deep picture, or None; drawn: digest of the rasterizer's settings."""
+    deep picture, or None; drawn: digest of the rasterizer's settings; gains: of the
+    model's colours, none where they are taken as they are."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -130,6 +131,7 @@ class RenderOptions:
     recorded: str = "sRGB"
     deep: DeepConfig | None = None
     drawn: str = ""
+    gains: tuple[float, ...] = ()
 
 
 def picture_camera(task: Task, options: RenderOptions) -> Camera:
@@ -182,7 +184,8 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
         opens, closes = pictures.sampling.shutter
         cameras += [task.at(opens + (closes - opens) * part / 4) for part in range(5)]
     sampling = pictures.sampling if pictures.sampling.on else None
-    made = (options.channels, options.background, options.recorded, options.deep, options.drawn)
+    made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
+    made += (options.gains,) if options.gains else ()
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
     return digest_of(cameras, made, encoding, colour, pictures.framing, sampling)
 

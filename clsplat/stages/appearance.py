@@ -58,14 +58,16 @@ def gain_gradient(
     seen: DeviceArray,
     gradient: DeviceArray,
     height: int,
+    place: int = 0,
 ) -> DeviceArray:
-    """Make the gradient by what was seen that by the image, in its place. Returns sums (3, stride): ln 2 times their
-    sum over x is the gradient by the photograph's logs."""
+    """Make the gradient by what was seen that by the image, in its place. Returns sums (3, stride), those of each
+    `place` in a batch in an array of their own: ln 2 times their sum over x is the gradient by the photograph's
+    logs."""
     _, rows, stride = seen.shape
     down = rows // TILE
     partials, columns = (
         work.array("appearance_partials", (3, down, stride)),
-        work.array("appearance_columns", (3, stride)),
+        work.array(f"appearance_columns_{place}", (3, stride)),
     )
     kernels = device.kernels("appearance", LANES=1)
     sizes = (photograph, height, stride, rows * stride, down)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config.training import OptimiserConfig, TrainConfig
-from clsplat.device.buffers import DeviceArray, Workspace, shared
+from clsplat.device.buffers import DeviceArray, Workspace, shared, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
 from clsplat.gaussians import GROUPS, group_shapes
@@ -36,6 +36,7 @@ from clsplat.stages.device_gaussians import (
 from clsplat.stages.loss import Loss
 from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen
+from clsplat.training.appearance import ViewAppearance
 from clsplat.training.photographs import Photographs
 from clsplat.training.step import GradientStep, Sample, StepProbe, StepRows, ViewRows
 
@@ -78,9 +79,14 @@ class Losses:
 @dataclass(frozen=True, eq=False)
 class _AddedView(GradientStep):
     """A view whose gradients are added to the sums, which are second in the model that it is given. shown (n,): the
-    Gaussians that any view shows, where Adam wants to know."""
+    Gaussians that any view shows, where Adam wants to know; columns: gradients of appearances, by the views' places."""
 
     shown: DeviceArray | None
+    columns: dict[int, DeviceArray]
+
+    def learn(self, appearance: ViewAppearance, columns: DeviceArray) -> None:
+        """Keep the gradient: all views of the batch see the appearances as they were before it."""
+        self.columns[appearance.place] = columns
 
     def update(self, rows: StepRows) -> None:
         """Add the rows' gradients; while kernels are only tried, try Adam's too."""
@@ -99,11 +105,12 @@ class _AddedView(GradientStep):
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """Results of a view on another device, on the host until the next step: by name the arrays of its rows, and its
-    gradients by group; the loss."""
+    gradients by group; the loss; the gradient of its appearance, if that is learnt."""
 
     arrays: dict[str, NDArray[Any]]
     gradients: dict[str, NDArray[np.float32]]
     loss: Loss
+    columns: NDArray[Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +119,11 @@ class _RemoteView(GradientStep):
 
     arrays: dict[str, NDArray[Any]]
     outcome: dict[str, NDArray[np.float32]]
+    columns: list[NDArray[Any]]
+
+    def learn(self, appearance: ViewAppearance, columns: DeviceArray) -> None:  # noqa: ARG002  # the owner does
+        """Copy the gradient to the host."""
+        self.columns.append(columns.get())
 
     def update(self, rows: StepRows) -> None:
         """Copy the rows' results to the host."""
@@ -163,9 +175,18 @@ class Replica:
         for group, array in values.items():
             self.parameters[group].set(array)
 
-    def view(self, place: int, sample: Sample, factor: float, step: GradientStep, *, splats: bool) -> Outcome:
+    def view(
+        self,
+        place: int,
+        sample: Sample,
+        factor: float,
+        step: GradientStep,
+        gains: NDArray[np.float32] | None,
+        *,
+        splats: bool,
+    ) -> Outcome:
         """Forward, loss and backward of a view; place: its number among this device's; factor: of its resolution;
-        splats: True if density control goes by its gradients."""
+        gains: of all photographs, where they are learnt; splats: True if density control goes by its gradients."""
         parameters, photograph = self.parameters, self.photographs.bring(sample.view, factor)
         assert parameters is not None, "taken before the view"
         n, sh_rest = parameters.count, updates_sh_rest(step.config.optimiser, step.step)
@@ -180,10 +201,11 @@ class Replica:
         settings = (self.device, self.rasterizer, step.config, step.step, step.rates, step.fields)
         room = _gradients(self.rasterizer.work, parameters)
         pixels = (photograph, sample.camera, sample.background)
-        result = _RemoteView(*settings, arrays, gradients, explore=step.explore).run(
-            (parameters,), *pixels, StepProbe(), room, reads_loss=True, kept=sample.kept
-        )
-        return Outcome(arrays, gradients, result)
+        appearance = step.appearance.on(self.device, gains) if step.appearance and gains is not None else None
+        columns: list[NDArray[Any]] = []
+        view = _RemoteView(*settings, arrays, gradients, columns, explore=step.explore, appearance=appearance)
+        result = view.run((parameters,), *pixels, StepProbe(), room, reads_loss=True, kept=sample.kept)
+        return Outcome(arrays, gradients, result, next(iter(columns), None))
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
         """Room on the host, the same from step to step: fresh pages would cost as much as the copy."""
@@ -231,36 +253,43 @@ class Batch:
         samples: Sequence[Sample],
         factor: float,
         probes: Callable[[Sample, GradientStep], StepProbe],
+        appearances: Sequence[ViewAppearance] = (),
         *,
         statistics: bool,
     ) -> Losses:
         """Update the model (parameters, first and second moments) by the samples.
 
         step: one of a single view, from which this one follows; its number counts views; factor: of the photographs'
-        resolution; probes: makes one for a view; statistics: density control goes by the views' gradients.
+        resolution; probes: makes one for a view; appearances: of the samples, where they are learnt; statistics:
+        density control goes by the views' gradients.
         """
         batch, work, device = self.config.batch, self.rasterizer.work, step.device
         optimiser, number = scaled(self.config.optimiser, batch), -(-step.step // batch)
         config, rates = replace(self.config, optimiser=optimiser), scaled_rates(step.rates, batch)
         sums, shown = self._room_for(device, model[0])
         explore = step.explore
-        step_of_view = _AddedView(
-            device, self.rasterizer, config, number, rates, step.fields, shown, explore=explore and explore.of_view()
-        )
+        columns: dict[int, DeviceArray] = {}
+        settings = (device, self.rasterizer, config, number, rates, step.fields, shown, columns)
+        step_of_view = _AddedView(*settings, explore=explore and explore.of_view())
+        steps = [replace(step_of_view, appearance=appearance) for appearance in appearances]
+        steps = steps or [step_of_view] * len(samples)
+        gains = appearances[0].gains.gains.get() if appearances and self.replicas else None
         first, *others = shares(len(samples), 1 + len(self.replicas))
         transfers = self._send(model[0])
         pending: list[tuple[int, Future[Outcome]]] = []
         try:
             for replica, share in zip(self.replicas, others, strict=True):
                 for place, index in enumerate(share):
-                    view = partial(replica.view, place, samples[index], factor, step_of_view, splats=statistics)
+                    view = partial(replica.view, place, samples[index], factor, steps[index], gains, splats=statistics)
                     pending.append((index, replica.thread.submit(view)))
-            losses = [self._view((model[0], sums), samples[index], factor, step_of_view, probes) for index in first]
+            losses = [self._view((model[0], sums), samples[index], factor, steps[index], probes) for index in first]
             for transfer in transfers:
                 transfer.result()
             for index, future in pending:
                 outcome = future.result()
                 losses.append(self._take(sums, outcome, step_of_view, probes(samples[index], step_of_view)))
+                if outcome.columns is not None:
+                    columns[index] = upload(device, outcome.columns)
         finally:  # what an error has ended goes on in no thread
             under_way: list[Future[Any]] = [*transfers, *(future for _, future in pending)]
             wait([future for future in under_way if not future.cancel()])
@@ -270,6 +299,8 @@ class Batch:
             adam(device, number, rates, optimiser, *models, counts, self.rasterizer.readback)
             if explore is not None:
                 noise(device, explore.scaled(sqrt(batch)), parameters, start, self.rasterizer.readback)
+        for appearance in appearances:
+            appearance.update(columns[appearance.place], self.rasterizer.readback)
         self._sent = None if updates_sh_rest(optimiser, number) else model[0]
         return Losses(tuple(losses))
 

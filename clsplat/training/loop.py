@@ -30,6 +30,7 @@ from clsplat.process import Interrupted, endings, handled
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs import scene_record
+from clsplat.runs.appearance import held_out_gains
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
 from clsplat.scenes.initialise import is_colourless, photographed
@@ -217,8 +218,10 @@ class Session:
     def evaluate(self, *, keep: bool) -> dict[str, Any]:
         """The held-out views; their renders are kept in the run's test/ if asked for."""
         trainer = self.trainer
+        trainer.settle()
+        gains = held_out_gains(trainer.appearance.record())
         return evaluate(
-            lambda view: self.draw(view.camera)[0],
+            lambda view: self.draw(view.camera)[0] * gains(view.name),
             trainer.scene.test_views,
             background_colour(trainer.config.background),
             self.run.test_path if keep and self.run is not None else None,
@@ -314,7 +317,7 @@ class Session:
         model = trainer.gaussians()
         if run is not None:
             run.save_model(model, photos_space(view.path for view in trainer.scene.views))
-            if (appearance := trainer.appearance.record([view.name for view in trainer.views])) is not None:
+            if (appearance := trainer.appearance.record()) is not None:
                 run.write_appearance(appearance)
             if trainer.scene.test_views:
                 run.write_eval(self.evaluate(keep=True))

@@ -173,8 +173,12 @@ class GradientStep:
             self.update(rows)
             probe.after_rows(rows)
         if appearance is not None:
-            appearance.update(columns, rasterizer.readback)
+            self.learn(appearance, columns)
         return result
+
+    def learn(self, appearance: ViewAppearance, columns: DeviceArray) -> None:
+        """Adam's step of the view's appearance."""
+        appearance.update(columns, self.rasterizer.readback)
 
     def update(self, rows: StepRows) -> None:
         """Adam's step of some rows, with the gradient of projection where that is not known yet."""

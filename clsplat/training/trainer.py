@@ -123,7 +123,7 @@ class Trainer:
         initial = self.given
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
-        self.appearance = Appearance(self.config, self.device, len(self.views))
+        self.appearance = Appearance(self.config, self.device, self.scene)
         self.origin, self.near = initial.origin, self.scene.near
         self._cameras: dict[int, Camera] = {}
         cameras = {view.name: self.local(view.camera) for view in self.views}
@@ -222,11 +222,11 @@ class Trainer:
         settings = (self.device, self.rasterizer, self.config)
         exact = GradientStep(*settings, self.step, rates, slot_fields(needs), explore=explore)
         factor, number = self.sizes.factor(self.step), self.step
+        appearances = self.appearance.of_views([sample.view for sample in samples], self.step)
 
         def run(turn: int, room: Room | None) -> Loss:
             sample = samples[0]
-            appearance = self.appearance.of_view(sample.view, number)
-            step = replace(exact, turn=turn, room=room, appearance=appearance)
+            step = replace(exact, turn=turn, room=room, appearance=appearances[0] if appearances else None)
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
             result = step.run(model, *pixels, probe, reads_loss=reads_loss, kept=sample.kept)
@@ -237,8 +237,8 @@ class Trainer:
         if self.batch is None:
             result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
         else:
-            model, statistics = (self.parameters, self.first, self.second), needs.gradients
-            result = self.batch.run(exact, model, samples, factor, self._watched_in_batch, statistics=statistics)
+            model, look = (self.parameters, self.first, self.second), self._watched_in_batch
+            result = self.batch.run(exact, model, samples, factor, look, appearances, statistics=needs.gradients)
             self.sampling.apply(self.parameters)
         self.controlled, self.last_views = False, views
         self._note()

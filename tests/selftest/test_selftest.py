@@ -25,7 +25,18 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.selftest import trust
 from clsplat.selftest.child import run
 from clsplat.selftest.harness import error_of
-from clsplat.selftest.result import BACKWARD, BOUNDS, CHANNELS, DEEP, FORWARD, RAYS, STAGES, TRAINING, Result
+from clsplat.selftest.result import (
+    APPEARANCE,
+    BACKWARD,
+    BOUNDS,
+    CHANNELS,
+    DEEP,
+    FORWARD,
+    RAYS,
+    STAGES,
+    TRAINING,
+    Result,
+)
 from clsplat.selftest.scenes import keys, scenes
 from clsplat.selftest.trust import Report, examine
 
@@ -60,6 +71,8 @@ BROKEN = {
     "project_grad: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
     "density: fma1(gx, gx, gy * gy)": ("fma1(gx, gx, gx * gy)", "statistics"),
     "density: stays && wanted && !large": ("stays && wanted && large", "statistics"),
+    "appearance: fma1(seen[at], g, sum)": ("fma1(seen[at], g, g)", "appearance"),
+    "appearance: moved[i] - 3.0f * sum": ("moved[i] + 3.0f * sum", "appearance"),
 }
 """What is miscompiled: kernel and words, the words that stand there then, and the stage that is to notice."""
 
@@ -67,7 +80,7 @@ BROKEN = {
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
     monkeypatch.setenv(BREAK, change)
-    group = next(stages for stages in (FORWARD, CHANNELS, DEEP, RAYS, BACKWARD) if last in stages)
+    group = next(stages for stages in (FORWARD, CHANNELS, DEEP, RAYS, BACKWARD, APPEARANCE) if last in stages)
     before = () if group is FORWARD else FORWARD
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
 

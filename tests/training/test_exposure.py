@@ -8,22 +8,28 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from compare import assert_same_bits
 from tiny import CONFIG, write_scene
 
 from clsplat.api import train
+from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
-from clsplat.device.context import Device
-from clsplat.errors import InputError
+from clsplat.device.context import Device, open_devices
+from clsplat.errors import DeviceError, InputError
 from clsplat.evaluation import metrics
+from clsplat.images.exif import exposure_of
+from clsplat.images.reading import read_image
+from clsplat.runs.appearance import held_out_gains
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.training.appearance import Appearance
 from clsplat.training.photographs import Photographs
 from clsplat.training.trainer import Trainer
 
-EXPOSED = replace(CONFIG, appearance="exposure", appearance_rate=0.05)
+EXPOSED = replace(CONFIG, appearance="exposure")
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +53,57 @@ def test_a_resumed_training_has_the_same_bytes(default_device: Device, scene: Sc
         assert_same_bits(got[name], array, name)
 
 
+def state(trainer: Trainer, steps: int = 24) -> dict[str, np.ndarray]:
+    """All that a training has after so many steps."""
+    for _ in range(steps):
+        trainer.train_step()
+    arrays = trainer.checkpoint()[0]
+    trainer.close()
+    return arrays
+
+
+def assert_same_state(got: dict[str, np.ndarray], wanted: dict[str, np.ndarray]) -> None:
+    assert got.keys() == wanted.keys()
+    assert wanted["appearance/logs"].any()
+    for name, array in wanted.items():
+        assert_same_bits(got[name], array, name)
+
+
+def test_by_capacity_the_bytes_are_the_same(
+    default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", "0")
+    wanted = state(Trainer(scene, EXPOSED, default_device))
+    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", "1")
+    for stopped in (False, True):
+        trainer = Trainer(scene, EXPOSED, default_device)
+        if stopped:  # each time when the room is too small: such a step is made again
+            room = trainer.pending.room
+            monkeypatch.setattr(trainer.pending, "room", lambda *a, room=room: min(room(*a), 1024))
+        assert_same_state(state(trainer), wanted)
+
+
+@pytest.mark.parametrize("batch", [2, 3])
+def test_the_number_of_devices_changes_no_byte(default_device: Device, scene: Scene, batch: int) -> None:
+    config = replace(EXPOSED, batch=batch)
+    wanted = state(Trainer(scene, config, default_device), 10)
+    try:
+        devices = open_devices(",".join(f"{default_device.index}/{half}" for half in range(2)))
+    except DeviceError as error:
+        pytest.skip(str(error))
+    assert_same_state(state(Trainer(scene, config, devices[0], further=devices[1:]), 10), wanted)
+
+
+def test_a_batch_learns_from_all_of_its_views(default_device: Device, scene: Scene) -> None:
+    batch = len(scene.train_views)
+    trainer = Trainer(scene, replace(EXPOSED, batch=batch), default_device)
+    trainer.train_step()
+    trainer.train_step()
+    logs = trainer.checkpoint()[0]["appearance/logs"]
+    assert logs.any(axis=1).all()
+    assert trainer.step == 2 * batch
+
+
 def test_gains_of_photographs_are_learnt(
     default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -67,13 +124,61 @@ def test_gains_of_photographs_are_learnt(
     assert np.abs(logs.mean(axis=0)).max() < 1e-6
     assert np.abs(logs - truth[:, None]).max() < 0.3  # of 2; so few steps
     assert "psnr_corrected" in json.loads(run.eval_path.read_text("utf-8"))["mean"]
+    name, cameras = scene.train_views[1].name, str(scene.train_views[1].path.parents[1])
+    flags: dict[str, list[str]] = {"plain": [], "exposed": ["--appearance", name]}
+    frames = {}
+    for kind, more in flags.items():
+        pattern = f"{tmp_path}/{kind}/{{name}}.exr"
+        assert main(["render", str(run.path), "--cameras", cameras, "-o", pattern, "--exr", "float", *more]) == 0
+        frames[kind] = read_image(next((tmp_path / kind).rglob("*.exr")))
+    gains = 2.0 ** np.array(record["photographs"][name]["log2_gains"])
+    assert frames["plain"].max() > 0.2
+    # Coefficients and colours of up to 4, rounded.
+    np.testing.assert_allclose(frames["exposed"], frames["plain"] * gains, atol=2e-5)
+
+
+def test_exposures_that_exif_tells(default_device: Device, scene: Scene, tmp_path: Path) -> None:
+    """Gains begin there; held-out photographs get what goes with theirs."""
+
+    def told(index: int, view: View) -> View:
+        path = tmp_path / f"{index}.png"
+        pixels = np.rint(255 * view.load()[:, :, :3]).astype(np.uint8)
+        spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.UINT8)
+        time, stop, speed = [(1 / 60, 2.0, 100), (1 / 30, 2.0, 100), (1 / 60, 2.0, 400), (1 / 60, 4.0, 100)][index % 4]
+        spec.attribute("ExposureTime", time)
+        spec.attribute("FNumber", stop)
+        if index != 3:
+            spec.attribute("Exif:PhotographicSensitivity", speed)
+        file = oiio.ImageOutput.create(str(path))
+        assert file.open(str(path), spec)
+        assert file.write_image(pixels)
+        file.close()
+        return replace(view, path=path)
+
+    scene = replace(scene, views=[told(index, view) for index, view in enumerate(scene.views)])
+    exposures = {view.name: exposure_of(view.path) for view in scene.views}
+    assert [value is None for value in exposures.values()] == [index == 3 for index in range(len(exposures))]
+    appearance = Appearance(EXPOSED, default_device, scene)
+    record = appearance.record()
+    assert record is not None
+    known = [value for view in scene.train_views if (value := exposures[view.name]) is not None]
+    for view in scene.views:
+        exposure = exposures[view.name]
+        wanted = 0.0 if exposure is None else (exposure - np.mean(known)) / 2.2
+        got = record["photographs" if view.split == "train" else "held_out"][view.name]["log2_gains"]
+        np.testing.assert_allclose(got, 3 * [wanted], atol=1e-6)  # of 32 bits
+    assert sum(view.split == "test" and exposures[view.name] is not None for view in scene.views)
+    gains = held_out_gains(record)
+    name = scene.test_views[0].name
+    np.testing.assert_allclose(gains(name), 2.0 ** np.array(record["held_out"][name]["log2_gains"]), rtol=1e-6)
+    assert (gains("elsewhere") == 1).all()
 
 
 def test_switched_off_there_is_nothing_of_it(default_device: Device, scene: Scene) -> None:
     trainer = Trainer(scene, CONFIG, default_device)
     trainer.train_step()
     assert not any(name.startswith("appearance") for name in trainer.checkpoint()[0])
-    assert trainer.appearance.record([]) is None
+    assert trainer.appearance.record() is None
 
 
 def test_a_checkpoint_without_gains_is_refused(default_device: Device, scene: Scene) -> None:
@@ -84,10 +189,8 @@ def test_a_checkpoint_without_gains_is_refused(default_device: Device, scene: Sc
 
 
 def test_settings_that_exclude_each_other() -> None:
-    with pytest.raises(InputError, match=r"--appearance exposure: .*--batch 1, got 2"):
-        TrainConfig(appearance="exposure", batch=2).check()
-    with pytest.raises(InputError, match=r"one --device, got 2"):
-        TrainConfig(appearance="exposure").on_devices(2, explicit=False)
+    with pytest.raises(InputError, match=r"--appearance exposure: not with --masks transparent"):
+        TrainConfig(appearance="exposure", masks="transparent").check()
 
 
 def test_colours_are_corrected_by_an_affine_map() -> None:
@@ -95,3 +198,15 @@ def test_colours_are_corrected_by_an_affine_map() -> None:
     image = rng.random((9, 8, 3))
     truth = image @ rng.uniform(0, 0.3, (3, 3)) + 0.05
     np.testing.assert_allclose(metrics.corrected(image, truth), truth, atol=1e-12)
+
+
+def test_corrected_psnr_knows_values_over_one() -> None:
+    rng = np.random.default_rng(4)
+    image, noise = rng.random((9, 8, 3)), rng.normal(0, 0.01, (9, 8, 3))
+    bright = 3 * image + 0.5
+    assert metrics.psnr_corrected(image, bright) > 100
+    assert metrics.psnr_corrected(image + noise, bright) < 32  # of 3 times 0.01, 30.5 dB, where most of it is over 1
+    counts = np.zeros((9, 8), bool)
+    counts[:4] = True
+    spoiled = np.where(counts[:, :, None], bright, 1e6)
+    assert metrics.psnr_corrected(image, spoiled, counts) > 100

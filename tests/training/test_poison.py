@@ -91,6 +91,8 @@ EXPLORING = short(
 )
 """Moves, growth, penalties and noise."""
 
+EXPOSED = short(iterations=16, warmup=(2, 4), appearance="exposure")
+
 MANY = short(
     iterations=32,
     random_points=400,
@@ -100,13 +102,15 @@ MANY = short(
 
 
 @pytest.mark.parametrize("word", quick(["NaN", "garbage"], "NaN"))
-@pytest.mark.parametrize("how", quick(["at once", "mcmc", "in pieces", "in vectors of 1"], "at once", "mcmc"))
+@pytest.mark.parametrize(
+    "how", quick(["at once", "mcmc", "exposure", "in pieces", "in vectors of 1"], "at once", "mcmc", "exposure")
+)
 def test_training_in_poisoned_memory(
     scene: Scene, many_points: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, word: str, how: str
 ) -> None:
     device = shaped(default_device, 1, 64) if how == "in vectors of 1" else default_device
     pieces = how == "in pieces"
-    config = MANY if pieces else EXPLORING if how == "mcmc" else EVERYTHING
+    config = {"in pieces": MANY, "mcmc": EXPLORING, "exposure": EXPOSED}.get(how, EVERYTHING)
     found = []
     for value in ("", WORDS[word]):
         monkeypatch.setenv("CLSPLAT_POISON", value)

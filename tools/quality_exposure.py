@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs whose exposure changes against the same photographs as they were, with and without --appearance.
+
+    .venv/bin/python tools/quality_exposure.py SCENE FOLDER [--size 200] [--iterations 2000] [--seed 0]
+        [--appearance exposure] [--rate 2e-3] [--only NAME ...]
+
+Writes the scene's photographs at that size as float EXR into FOLDER, once as they are and once times 2^U(-1, 1), so
+that nothing clips, and trains on each of them with and without. All models are measured against the held-out
+photographs as they are, after the affine map of colours that fits them best. Gains that were learnt are compared with
+those put on, but for a common factor: largest and mean error; then but for those learnt of the photographs as they
+are too, whose exposure may change as well. A row that FOLDER has already, of the same settings, is printed again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.api import train
+from clsplat.arrays import Float64
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device, open_device
+from clsplat.errors import InputError
+from clsplat.evaluation import metrics
+from clsplat.files import atomic_write
+from clsplat.images.alpha import composite
+from clsplat.images.writing import write_image
+from clsplat.rendering.renderer import Renderer
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+
+ROWS = {"clean": (False, False), "gains": (True, False), "clean, learnt": (False, True), "gains, learnt": (True, True)}
+"""Rows of the table: whether gains are on the photographs, and whether appearance is learnt."""
+
+
+def with_gains(scene: Scene, folder: Path, gains: Float64) -> Scene:
+    """The scene with a gain on each photograph, which are EXR files of their working size."""
+    folder.mkdir(parents=True, exist_ok=True)
+    views = []
+    for view, gain in zip(scene.views, gains, strict=True):
+        if not view.lens.is_pinhole:
+            raise InputError(f"{view.name}: taken through a lens that distorts, expected a scene of pinhole cameras")
+        path = folder / f"{len(views):04d}.exr"
+        if not path.exists():
+            write_image(path, composite(view.load(), (0, 0, 0)) * np.float32(gain))
+        lens = replace(
+            view.lens, width=view.camera.width, height=view.camera.height
+        )  # of the file, which is read as it is
+        views.append(replace(view, path=path, lens=lens))
+    return replace(scene, views=views)
+
+
+def errors(learnt: dict[str, list[float]], wanted: dict[str, list[float]]) -> str:
+    """Largest and mean relative error of the gains that were learnt, both as logs, but for a common factor."""
+    apart = np.array([np.subtract(learnt[name], wanted[name]) for name in learnt])
+    wrong = np.abs(2.0 ** (apart - apart.mean(axis=0)) - 1)
+    return f"{wrong.max():.1%} / {wrong.mean():.1%}"
+
+
+def row(name: str, clean: Scene, folder: Path, gains: Float64, config: TrainConfig, device: Device) -> dict[str, Any]:
+    """Train and measure one row."""
+    changes, learns = ROWS[name]
+    factors = gains if changes else np.ones_like(gains)
+    scene = with_gains(clean, folder / ("gains" if changes else "clean"), factors)
+    config = config if learns else replace(config, appearance="none")
+    run, start = Run.create(folder / "runs" / name.replace(", ", "-"), config, overwrite=True), time.process_time()
+    model = train(scene, config, device=device, run=run)
+    seconds, renderer = time.process_time() - start, Renderer(device)
+    scores = []
+    for view in clean.test_views:
+        truth, image = composite(view.load(), (0, 0, 0)), renderer.render(model, view.camera).image[:, :, :3]
+        scores.append((metrics.psnr(image, truth), metrics.psnr_corrected(image, truth)))
+    psnr, corrected = np.mean(scores, axis=0)
+    result = {"psnr": psnr, "corrected": corrected, "gaussians": len(model), "seconds": seconds}
+    if learns:
+        photographs = json.loads(run.appearance_path.read_text("utf-8"))["photographs"]
+        result["logs"] = {name: logs.get("log2_gains", logs.get("log2_exposure")) for name, logs in photographs.items()}
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--size", type=int, default=200, help="longest side of the photographs, in pixels")
+    parser.add_argument("--iterations", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--appearance", default="exposure")
+    parser.add_argument("--rate", type=float, default=TrainConfig.appearance_rate)
+    parser.add_argument("--only", nargs="*", choices=ROWS, default=list(ROWS))
+    options = parser.parse_args()
+    device, clean = open_device(), load_scene(options.scene, resolution=options.size)
+    gains = 2.0 ** np.random.default_rng(options.seed).uniform(-1, 1, len(clean.views))
+    config = TrainConfig(
+        iterations=options.iterations,
+        seed=options.seed,
+        appearance=options.appearance,
+        appearance_rate=options.rate,
+        report=False,
+    )
+    config.check()
+    known = options.folder / "rows.json"
+    rows = json.loads(known.read_text("utf-8")) if known.exists() else {}
+    put_on = {view.name: [np.log2(gain)] for view, gain in zip(clean.views, gains, strict=True)}
+    print("| photographs | PSNR | corrected | Gaussians | CPU s | gains wrong by | and but for those of clean |")
+    print("|---|---|---|---|---|---|---|")
+    keys: dict[str, str] = {}
+    for name in options.only:
+        learns = (options.appearance, options.rate) if ROWS[name][1] else ()
+        key = keys[name] = " ".join(map(str, (name, options.size, options.iterations, options.seed, *learns)))
+        if key not in rows:
+            rows[key] = row(name, clean, options.folder, gains, config, device)
+            atomic_write(known, json.dumps(rows).encode())
+        found, cells = rows[key], ["", ""]
+        if name == "gains, learnt":
+            cells[0] = errors(found["logs"], put_on)
+            if "clean, learnt" in keys:
+                own = rows[keys["clean, learnt"]]["logs"]
+                cells[1] = errors(found["logs"], {name: np.add(own[name], put_on[name]).tolist() for name in own})
+        scores = f"{found['psnr']:.2f} | {found['corrected']:.2f} | {found['gaussians']:,} | {found['seconds']:.0f}"
+        print(f"| {name} | {scores} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
