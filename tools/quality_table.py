@@ -78,15 +78,19 @@ def antialiasing_rows() -> list[Row]:
 
 
 TRAININGS: dict[str, Callable[[], list[Row]]] = {"growth": growth_rows, "antialiasing": antialiasing_rows}
-TOOLS: dict[str, tuple[str, ...]] = {"fisheye": ("quality_fisheye.py",)}
-"""Tables that a tool of their own prints; {scenes} stands for the folder of scenes."""
+TOOLS: dict[str, tuple[str, ...]] = {
+    "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", "--iterations", "{iterations}"),
+    "fisheye": ("quality_fisheye.py", "{work}", "--iterations", "{iterations}"),
+}
+"""Tables that tools of their own print: the commands, with the folder of scenes, one to work in, and the steps."""
 
 
 class Book:
     """Finished rows of a commit, in a folder."""
 
-    def __init__(self, scenes: Path, folder: Path, seeds: int, settings: Sequence[str]) -> None:
-        self.scenes, self.folder, self.seeds, self.settings = scenes, folder, seeds, tuple(settings)
+    def __init__(self, scenes: Path, folder: Path, seeds: int, iterations: int, resolution: int) -> None:
+        self.scenes, self.folder, self.seeds, self.iterations = scenes, folder, seeds, iterations
+        self.settings = ("--iterations", str(iterations), "--resolution", str(resolution))
         folder.mkdir(parents=True, exist_ok=True)
 
     def results(self, table: str, row: Row, rows: Sequence[Row]) -> list[Result]:
@@ -132,7 +136,8 @@ class Book:
         done = self.folder / f"{table}.md"
         if not done.exists():
             print(f"{table}: {TOOLS[table][0]}", file=sys.stderr, flush=True)
-            name, *more = (word.replace("{scenes}", str(self.scenes)) for word in TOOLS[table])
+            known = {"scenes": self.scenes, "work": self.folder / table, "iterations": self.iterations}
+            name, *more = (word.format(**known) for word in TOOLS[table])
             words = _run([sys.executable, str(ROOT / "tools" / name), *more])
             atomic_write(done, words.encode())
         return done.read_text("utf-8")
@@ -199,10 +204,9 @@ def main(arguments: list[str]) -> int:
         known = ", ".join(names)
         print(f"quality_table: --only {unknown[0]}: no such table, expected some of {known}", file=sys.stderr)
         return 2
-    settings = ["--iterations", str(given.iterations), "--resolution", str(given.resolution)]
     text = ""
     folder = given.output / f"{commit()}-{given.iterations}-{given.resolution or 'full'}"
-    book = None if given.list else Book(given.scenes, folder, given.seeds, settings)
+    book = None if given.list else Book(given.scenes, folder, given.seeds, given.iterations, given.resolution)
     for table in wanted:
         lines = []
         rows = TRAININGS[table]() if table in TRAININGS else []

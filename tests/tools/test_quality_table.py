@@ -42,14 +42,14 @@ def test_a_finished_row_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     fake = FakeClsplat()
     monkeypatch.setattr(quality_table, "_clsplat", fake)
     for _ in range(2):
-        Book(tmp_path, tmp_path / "work", 2, []).results("growth", ENDS[0], ENDS)
+        Book(tmp_path, tmp_path / "work", 2, 40, 0).results("growth", ENDS[0], ENDS)
         assert [call[0] for call in fake.calls] == ["train", "train"]
 
 
 def test_an_interrupted_row_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakeClsplat(ends=1)
     monkeypatch.setattr(quality_table, "_clsplat", fake)
-    book = Book(tmp_path, tmp_path / "work", 1, [])
+    book = Book(tmp_path, tmp_path / "work", 1, 40, 0)
     with pytest.raises(SystemExit):
         book.results("growth", ENDS[0], ENDS)
     book.results("growth", ENDS[0], ENDS)
@@ -59,7 +59,7 @@ def test_an_interrupted_row_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_half_of_the_better_ones_gaussians(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakeClsplat()
     monkeypatch.setattr(quality_table, "_clsplat", fake)
-    Book(tmp_path, tmp_path / "work", 1, []).results("growth", HALF, [*ENDS, HALF])
+    Book(tmp_path, tmp_path / "work", 1, 40, 0).results("growth", HALF, [*ENDS, HALF])
     last = fake.calls[-1]
     assert last[last.index("--density.max-gaussians") + 1] == "500"
 
@@ -67,7 +67,7 @@ def test_half_of_the_better_ones_gaussians(tmp_path: Path, monkeypatch: pytest.M
 def test_sizes_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality_table, "_clsplat", FakeClsplat())
     row = Row("lego", "lego", sizes=(4, 2))
-    found = Book(tmp_path, tmp_path / "work", 1, []).results("antialiasing", row, [row])
+    found = Book(tmp_path, tmp_path / "work", 1, 40, 0).results("antialiasing", row, [row])
     assert quality_table.line(row, found) == "| lego | 30.00 | 0.00 | 0.9000 | 500 | 7 | 24.00 | 22.00 | 23.00 |"
     assert quality_table.header([row]).splitlines()[0].endswith("| seconds | 4 | 2 | mean |")
 
