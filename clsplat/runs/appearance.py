@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run has learnt of its photographs' appearance: appearance.json, by a photograph's name."""
+"""Appearances that a run has learnt of its photographs: appearance.json, by a photograph's name."""
 
 from __future__ import annotations
 
