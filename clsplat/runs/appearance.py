@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appearances that a run has learnt of its photographs: appearance.json, by a photograph's name."""
+"""Appearance of a run's photographs as it was learnt: appearance.json, by a photograph's name."""
 
 from __future__ import annotations
 

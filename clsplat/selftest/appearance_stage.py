@@ -20,7 +20,7 @@ def of_appearance(bench: Bench) -> Outcome:
     device, camera, image = bench.device, bench.camera, bench.blended.image
     logs = evenly(41, (3, 3), -1.0, 1.0).astype(np.float32)
     by_seen = evenly(42, tuple(image.shape), -0.25, 1.0).astype(np.float32)
-    by_seen[:, :, camera.width :] = 0  # the loss leaves zeros there
+    by_seen[:, :, camera.width :] = 0  # like the gradient of the loss
     readback = upload(device, np.zeros(len(READBACK), np.uint32))
 
     def launch() -> tuple[Gains, DeviceArray, DeviceArray, DeviceArray]:
