@@ -14,6 +14,7 @@ from typing import Any
 from markupsafe import Markup
 
 import clsplat
+from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.errors import amount
 from clsplat.files import atomic_write
@@ -29,6 +30,7 @@ from clsplat.report.figures import (
     settings_of,
     smooth,
 )
+from clsplat.report.photographs import exposure_chart, masked_photographs
 from clsplat.report.svg import Series, chart, short, templates
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
@@ -78,8 +80,13 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
     listed = evaluation["views"] if evaluation else []
     shown: list[thumbnails.Shown] = []
     notes = list(figures.notes)
-    if listed and views > 0:
+    use = figures.run.config.mask_use
+    if views > 0 and (listed or use != NO_MASKS):
         scene = scene if scene is not None else thumbnails.scene_of(figures.run)
+    masks, masked_count = [], 0
+    if views > 0 and use != NO_MASKS and isinstance(scene, Scene):
+        masks, masked_count = masked_photographs(scene, only_files=use.alpha == "blend")
+    if listed and views > 0:
         if isinstance(scene, str):
             notes.append(f"There are renders without photographs: {scene}.")
         names = [view["name"] for view in listed]
@@ -96,7 +103,10 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         figures=figures,
         notes=notes,
         titles=TITLES,
-        charts=list(filter(None, charts(figures))),
+        charts=list(filter(None, [*charts(figures), exposure_chart(figures.run)])),
+        masks=masks,
+        masked_count=masked_count,
+        mask_words=_mask_words(use),
         histograms=list(filter(None, histograms(figures))),
         stages=stage_rows(figures),
         shown=[(place, view, scores[view.name]) for place, view in enumerate(shown, 1)],
@@ -223,6 +233,12 @@ def duration(seconds: float | None) -> str:
 def score(value: float, name: str) -> str:
     """A score with the digits that mean something."""
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
+
+
+def _mask_words(use: MaskUse) -> list[str]:
+    """Meanings of the colours that are drawn over photographs with masks."""
+    words = {"ignore": "red is ignored", "transparent": "blue is transparent"}
+    return [text for meaning, text in words.items() if meaning in (use.masks, use.alpha)]
 
 
 def _data(figures: Figures) -> dict[str, Any]:

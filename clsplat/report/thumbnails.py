@@ -24,6 +24,7 @@ from clsplat.images.colour import displayed, photos_space
 from clsplat.images.reading import downscale, read_image
 from clsplat.images.writing import write_spec
 from clsplat.runs.run import Run
+from clsplat.scenes.masks import after_sfm
 from clsplat.scenes.scene import Scene, View, detect, load_scene
 
 MAX_SIDE = 640
@@ -62,17 +63,20 @@ def scene_of(run: Run) -> Scene | str:
     source = run.scene
     if source is None:
         return "config.toml does not name the scene"
+    masks = run.config.mask_use
     try:
         if detect(source) == "photos":
             source = source.resolve()
             source = source.with_name(f"{source.name}_colmap")
             if not source.is_dir():
                 return "the scene is a folder of photos, and what was reconstructed of it is gone"
+            masks = after_sfm(masks, source)
         return load_scene(
             source,
             resolution=run.config.resolution,
             test_every=run.config.test_every,
-            masks=run.config.mask_use,
+            masks=masks,
+            lenses=run.config.lenses,
         )
     except (InputError, OSError) as error:
         return f"the scene cannot be read ({str(error).replace(str(source), source.name)})"

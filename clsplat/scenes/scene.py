@@ -26,7 +26,7 @@ from clsplat.images.reading import companions, downscale, find_images, image_siz
 from clsplat.progress import Progress
 from clsplat.scenes import colmap, transforms
 from clsplat.scenes.data_set import DataSet, Lens, PosedImage, undistort
-from clsplat.scenes.masks import HALF, Mask, masks_of
+from clsplat.scenes.masks import HALF, Mask, after_sfm, for_sfm, masks_of
 from clsplat.scenes.sfm import reconstruct
 
 Kind = Literal["colmap", "blender", "transforms", "photos"]
@@ -282,7 +282,8 @@ def load_scene(
     whose header does not decode. Pictures that are there and not listed are named in the scene's warnings, but for
     masks, depths and the like (`reading.companions`), and so are those on both sides of the split.
 
-    masks: what masks and alpha channels mean (`clsplat.scenes.masks`); no other folder of pictures stands in then.
+    masks: what masks and alpha channels mean (`clsplat.scenes.masks`); no other folder of pictures stands in then, and
+    photos that go through sfm have no features where they leave something out.
     """
     path = Path(path)
     for name, number in (("resolution", resolution), ("test_every", test_every)):
@@ -300,7 +301,9 @@ def load_scene(
             folder = path
             if kind == "photos":
                 photos = path.resolve()
-                folder = reconstruct(photos, work_dir or photos.with_name(f"{photos.name}_colmap"), progress=progress)
+                folder = work_dir or photos.with_name(f"{photos.name}_colmap")
+                folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
+                masks = after_sfm(masks, folder)
             data, smaller = _read_colmap(folder, images)
         posed = sorted(data.images, key=lambda image: image.name)
         if masks != NO_MASKS:
