@@ -65,8 +65,14 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
             return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
         config = run.config
         masks = config.mask_use
-        how = {"resolution": config.resolution, "test_every": config.test_every, "lenses": config.lenses}
-        scene = load_scene(run.scene, masks=masks, progress=progress, **how)
+        scene = load_scene(
+            run.scene,
+            resolution=config.resolution,
+            test_every=config.test_every,
+            lenses=config.lenses,
+            masks=masks,
+            progress=progress,
+        )
     else:
         scene, masks = load_scene(path, progress=progress), NO_MASKS
         gaussians = from_scene(scene, TrainConfig().random_points, np.random.default_rng(0))

@@ -30,7 +30,7 @@ from clsplat.report.figures import (
     settings_of,
     smooth,
 )
-from clsplat.report.photographs import exposure_chart, masked_photographs
+from clsplat.report.photographs import MaskedPhotograph, exposure_chart, masked_photographs
 from clsplat.report.svg import Series, chart, short, templates
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
@@ -83,7 +83,8 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
     use = figures.run.config.mask_use
     if views > 0 and (listed or use != NO_MASKS):
         scene = scene if scene is not None else thumbnails.scene_of(figures.run)
-    masks, masked_count = [], 0
+    masks: list[MaskedPhotograph] = []
+    masked_count = 0
     if views > 0 and use != NO_MASKS and isinstance(scene, Scene):
         masks, masked_count = masked_photographs(scene, only_files=use.alpha == "blend")
     if listed and views > 0:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Protocol
 
 import numpy as np
 
@@ -64,6 +65,16 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
     return counts
 
 
+class Named(Protocol):
+    """A photograph of a scene: its name there, and its file."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def path(self) -> Path: ...
+
+
 def folder_of(images: Path) -> Path | None:
     """The folder of masks of a folder of photographs."""
     return next((at for parent in (images.parent, images) for name in FOLDERS if (at := parent / name).is_dir()), None)
@@ -110,7 +121,7 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
         return {}
     found: dict[str, Path] = {}
     if use.masks != "none":
-        found = {**_beside(images), **{image.name: image.mask for image in images if image.mask is not None}}
+        found = {**masks_beside(images), **{image.name: image.mask for image in images if image.mask is not None}}
         if not found:
             raise InputError(
                 f"{where}: --masks {use.masks}, and there are none; expected masks/IMAGE.png beside images/, or "
@@ -126,8 +137,9 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
     return {image.name: Mask(use, found.get(image.name)) for image in images}
 
 
-def _beside(images: Sequence[PosedImage]) -> dict[str, Path]:
-    """The masks in the folder beside the photographs, or in theirs, by the photographs' names."""
+def masks_beside(images: Sequence[Named]) -> dict[str, Path]:
+    """The masks in the folder beside the photographs, or in theirs, by the photographs' names. Raises InputError as
+    `find_masks`."""
     top = images[0].path
     for _ in PurePosixPath(images[0].name).parts:
         top = top.parent

@@ -111,10 +111,10 @@ def reconstruct(
         for photo in photos:
             cut = photo.transparent and masks is not None and masks.alpha != "blend"
             if cut or photo.name in shapes:
+                shape, target = shapes.get(photo.name), work / "masks" / f"{photo.name}.png"
                 inner = work / "photos" / photo.name if cut else None
-                how = {"invert": masks is not None and masks.invert, "photo": inner}
-                target, size = work / "masks" / f"{photo.name}.png", (photo.width, photo.height)
-                stage_mask(shapes.get(photo.name), target, size, **how)
+                invert = masks is not None and masks.invert
+                stage_mask(shape, target, (photo.width, photo.height), invert=invert, photo=inner)
                 masked.append(photo.name)
         task = {
             "masks": masked,
