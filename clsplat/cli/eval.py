@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from clsplat.camera import Camera
+    from clsplat.scenes.scene import View
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ def run(verb: Eval, services: Services) -> int:
 
 
 def _evaluate(verb: Eval, services: Services) -> int:
+    from clsplat.evaluation.depths import keep_depths
     from clsplat.evaluation.held_out import evaluate
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
@@ -90,6 +92,10 @@ def _evaluate(verb: Eval, services: Services) -> int:
         result = renderer.render(gaussians, camera, background)
         return result.image, result.alpha
 
+    def depth(view: View) -> tuple[NDArray[Any], NDArray[Any]]:
+        result, channels = renderer.render_channels(gaussians, view.camera)
+        return channels["median"], result.alpha
+
     warnings = scene_record.of_evaluation(trained, views) if trained else []
     with suppress(CapacityError):
         warnings.append(doubts.of_pictures(draw, views, "held-out"))
@@ -110,6 +116,8 @@ def _evaluate(verb: Eval, services: Services) -> int:
     if given_run:
         given_run.write_eval(result)
         if (given_run.path / NAME).exists():
+            with suppress(CapacityError):
+                keep_depths(depth, views, result["views"], given_run.depth_path)
             write_last(given_run, scene, gaussians)
     if verb.json:
         print(json.dumps(result, indent=2))

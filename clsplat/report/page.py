@@ -17,6 +17,7 @@ import clsplat
 from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.errors import amount
+from clsplat.evaluation import depths
 from clsplat.files import atomic_write
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
@@ -30,7 +31,7 @@ from clsplat.report.figures import (
     settings_of,
     smooth,
 )
-from clsplat.report.photographs import MaskedPhotograph, exposure_chart, masked_photographs
+from clsplat.report.photographs import SIDE, MaskedPhotograph, exposure_chart, masked_photographs
 from clsplat.report.svg import Series, chart, short, templates
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
@@ -79,6 +80,7 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
     evaluation = figures.evaluation
     listed = evaluation["views"] if evaluation else []
     shown: list[thumbnails.Shown] = []
+    low: list[thumbnails.Shown] = []
     notes = list(figures.notes)
     use = figures.run.config.mask_use
     if views > 0 and (listed or use != NO_MASKS):
@@ -93,7 +95,10 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         names = [view["name"] for view in listed]
         wanted = thumbnails.chosen([view.get("psnr") for view in listed], views)
         background = background_colour(figures.run.config.background)
-        shown = thumbnails.show(figures.run, names, wanted, None if isinstance(scene, str) else scene, background)
+        known = None if isinstance(scene, str) else scene
+        shown = thumbnails.show(figures.run, names, wanted, known, background)
+        worst = depths.worst(listed) if isinstance(scene, Scene) else []
+        low = [view for view in thumbnails.show(figures.run, names, worst, known, background, SIDE) if view.depth]
         if len(shown) < len(wanted):
             notes.append(f"{len(wanted) - len(shown)} renders of held-out views are not in test/, or cannot be read.")
     scores = {view["name"]: view for view in listed}
@@ -112,6 +117,7 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         stages=stage_rows(figures),
         shown=[(place, view, scores[view.name]) for place, view in enumerate(shown, 1)],
         places=places,
+        low=[(view, scores[view.name]) for view in low],
         left_out=len(listed) - len(shown),
         white_error=thumbnails.WHITE_ERROR,
         columns=[(name, TITLES[name]) for name in SCORES if any(name in view for view in listed)],

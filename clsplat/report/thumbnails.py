@@ -8,7 +8,8 @@ import os
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ RAMP = np.array(
 
 @dataclass(frozen=True)
 class Shown:
-    """A view's pictures as data URIs; photo and error None where there is no photograph."""
+    """A view's pictures as data URIs; photo and error None where there is no photograph, depth where none was kept."""
 
     name: str
     width: int
@@ -51,6 +52,7 @@ class Shown:
     photo: str | None = None
     error: str | None = None
     trouble: str | None = None
+    depth: str | None = None
 
     @property
     def small(self) -> bool:
@@ -92,9 +94,15 @@ def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
 
 
 def show(
-    run: Run, names: Sequence[str], wanted: Sequence[int], scene: Scene | None, background: ArrayLike
+    run: Run,
+    names: Sequence[str],
+    wanted: Sequence[int],
+    scene: Scene | None,
+    background: ArrayLike,
+    side: int = MAX_SIDE,
 ) -> list[Shown]:
-    """The pictures of the views `names[index]`, for each index wanted, whose render is in the run's test/."""
+    """The pictures of the views `names[index]`, for each index wanted, whose render is in the run's test/. side: pixels
+    of the longer side, at most."""
     try:
         paths = picture_names(names)
     except ValueError:  # a name that no file has, such as ""
@@ -103,13 +111,18 @@ def show(
     space = photos_space(view.path for view in views.values())
 
     def one(index: int) -> Shown | None:
-        path = run.test_path / paths[index]
+        path, depth = run.test_path / paths[index], run.depth_path / paths[index]
         if not _is_within(path, run.test_path):
             return None
         try:
-            return _shown(names[index], path, views.get(names[index]), background, space)
+            shown = _shown(names[index], path, views.get(names[index]), background, space, side)
         except InputError:
             return None
+        if depth.is_file() and _is_within(depth, run.depth_path):
+            with suppress(InputError):
+                picture = read_image(depth, orient=False)[:, :, :3]
+                shown = replace(shown, depth=data_uri(downscale(picture, shown.width, shown.height)))
+        return shown
 
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
         return [shown for shown in pool.map(one, wanted) if shown is not None]
@@ -148,10 +161,10 @@ def _is_within(path: Path, folder: Path) -> bool:
         return False
 
 
-def _shown(name: str, path: Path, view: View | None, background: ArrayLike, space: str) -> Shown:
+def _shown(name: str, path: Path, view: View | None, background: ArrayLike, space: str, side: int) -> Shown:
     render = read_image(path, orient=False)[:, :, :3]
     height, width = render.shape[:2]
-    scale = min(1.0, MAX_SIDE / max(width, height))
+    scale = min(1.0, side / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = downscale(render, *size)
     if view is None:

@@ -83,7 +83,7 @@ def answered(
 
 
 def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool) -> str:
-    """The findings and their answers, for people. looked: number of photographs; auto: whether the answers are taken."""
+    """The findings with their answers, for people. looked: number of photographs; auto: whether they are taken."""
     if not answers:
         return f"looked at {looked:,} photographs: nothing found that a setting would answer"
     text = "; ".join(answer.words for answer in answers)

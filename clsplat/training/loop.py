@@ -22,6 +22,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.child import TrialInterrupted
 from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
+from clsplat.evaluation.depths import keep_depths
 from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
@@ -33,7 +34,7 @@ from clsplat.runs import scene_record
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
 from clsplat.scenes.initialise import is_colourless, photographed
-from clsplat.scenes.scene import Scene
+from clsplat.scenes.scene import Scene, View
 from clsplat.stages.loss import Loss
 from clsplat.training import telemetry
 from clsplat.training.batch import Losses
@@ -214,6 +215,13 @@ class Session:
         result = self.renderer.render(trainer.parameters, trainer.local(camera), background)
         return result.image, result.alpha
 
+    def depth(self, view: View) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Median depth and alpha of the model as it is."""
+        trainer = self.trainer
+        trainer.settle()
+        result, channels = self.renderer.render_channels(trainer.parameters, trainer.local(view.camera))
+        return channels["median"], result.alpha
+
     def evaluate(self, *, keep: bool) -> dict[str, Any]:
         """The held-out views; their renders are kept in the run's test/ if asked for."""
         trainer = self.trainer
@@ -317,7 +325,11 @@ class Session:
             if (appearance := trainer.appearance.record([view.name for view in trainer.views])) is not None:
                 run.write_appearance(appearance)
             if trainer.scene.test_views:
-                run.write_eval(self.evaluate(keep=True))
+                result = self.evaluate(keep=True)
+                run.write_eval(result)
+                if trainer.config.report and trainer.device.memory.limit is None:
+                    with suppress(CapacityError, DriverError):  # a picture less is no failed training
+                        keep_depths(self.depth, trainer.scene.test_views, result["views"], run.depth_path)
         return model
 
     def make_steps(self, between: Between | None) -> None:

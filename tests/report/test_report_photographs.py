@@ -15,8 +15,10 @@ from tiny import HEIGHT, VIEWS, WIDTH, short, write_scene
 
 from clsplat.cli.main import main
 from clsplat.config.masks import MaskUse
+from clsplat.evaluation.depths import DARKEST, WORST, depth_picture, keep_depths
 from clsplat.images.writing import write_image
 from clsplat.report.photographs import SHOWN, masked_photographs
+from clsplat.runs.run import owned_files
 from clsplat.scenes.marked import CLEAR, IGNORED, STRENGTH, masked
 from clsplat.scenes.scene import load_scene
 
@@ -76,3 +78,28 @@ def test_exposures_are_a_chart(reported: Path, tmp_path: Path) -> None:
         (run / "appearance.json").write_text(text)
         assert main(["report", str(run)]) == 0
         assert "Exposure of the photographs" not in charts_of(parse((run / "report.html").read_text("utf-8")))
+
+
+def test_depth_is_light_where_it_is_near() -> None:
+    depth = np.array([[1.0, 2.0, 3.0, 9.0]])
+    picture = depth_picture(depth, np.array([[1.0, 1.0, 1.0, 0.2]]))[0, :, 0]
+    assert picture[0] == 1
+    assert 1 > picture[1] > picture[2] >= DARKEST
+    assert picture[3] == 0
+    assert not depth_picture(depth, np.zeros((1, 4))).any()
+
+
+def test_the_worst_views_have_photograph_render_and_depth(reported: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(reported, tmp_path / "run"))
+    records = json.loads((run / "eval.json").read_text())["views"]
+    assert len(list((run / "depth").glob("*.png"))) == min(WORST, len(records))
+    figures = parse((run / "report.html").read_text("utf-8")).one("div", id="worst").all("figure")
+    assert [len(figure.all("img")) for figure in figures] == [3] * min(WORST, len(records))
+    least = min(records, key=lambda record: record["psnr"])["name"]
+    assert figures[0].words.strip().startswith(least)
+    keep_depths(lambda _: (np.ones((2, 2)), np.ones((2, 2))), [], [], run / "depth")
+    assert not list((run / "depth").glob("*.png"))
+    assert main(["report", str(run)]) == 0
+    assert not parse((run / "report.html").read_text("utf-8")).all("div", id="worst")
+    assert run / "depth" not in owned_files(reported)
+    assert set((reported / "depth").glob("*.png")) <= set(owned_files(reported))
