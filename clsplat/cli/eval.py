@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from clsplat.camera import Camera
-    from clsplat.scenes.scene import View
 
 
 @dataclass(frozen=True)
@@ -92,9 +91,9 @@ def _evaluate(verb: Eval, services: Services) -> int:
         result = renderer.render(gaussians, camera, background)
         return result.image, result.alpha
 
-    def depth(view: View) -> tuple[NDArray[Any], NDArray[Any]]:
-        result, channels = renderer.render_channels(gaussians, view.camera)
-        return channels["median"], result.alpha
+    def render(model: Gaussians, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+        result = renderer.render(model, camera)
+        return result.image, result.alpha
 
     warnings = scene_record.of_evaluation(trained, views) if trained else []
     with suppress(CapacityError):
@@ -117,7 +116,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
         given_run.write_eval(result)
         if (given_run.path / NAME).exists():
             with suppress(CapacityError):
-                keep_depths(depth, views, result["views"], given_run.depth_path)
+                keep_depths(render, gaussians, views, result["views"], given_run.depth_path)
             write_last(given_run, scene, gaussians)
     if verb.json:
         print(json.dumps(result, indent=2))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.camera import Camera
 from clsplat.evaluation.held_out import picture_names
 from clsplat.files import remove
+from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.scenes.scene import View
+from clsplat.spherical_harmonics import C0
 
 WORST = 3
 """Views that have one."""
@@ -43,18 +47,32 @@ def depth_picture(depth: NDArray[Any], alpha: NDArray[Any]) -> Float32:
     return np.repeat(grey[:, :, None], 3, axis=2)
 
 
+def coloured(gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """The model with a grey for each Gaussian by its distance along the camera's axis: 0 to 1 between the ENDS of those
+    ahead. A frame of it has depth for colour, by no other kernel than a frame's."""
+    depths = (gaussians.means + gaussians.origin - camera.position) @ camera.rotation[2]
+    ahead = depths[depths > gaussians.near]
+    near, far = np.quantile(ahead, ENDS) if len(ahead) else (0.0, 1.0)
+    sh = np.zeros_like(gaussians.sh)
+    sh[:, 0] = ((np.clip((depths - near) / ((far - near) or 1.0), 0, 1) - 0.5) / C0)[:, None]
+    return replace(gaussians, sh=sh)
+
+
 def keep_depths(
-    draw: Callable[[View], tuple[NDArray[Any], NDArray[Any]]],
+    render: Callable[[Gaussians, Camera], tuple[NDArray[Any], NDArray[Any]]],
+    gaussians: Gaussians,
     views: Sequence[View],
     records: Sequence[Mapping[str, Any]],
     folder: Path,
 ) -> None:
-    """Write them as PNG under the views' names, in place of those that are there. draw: a view's depth and alpha
-    (H, W); records: of eval.json, in the views' order."""
+    """Write them as PNG under the views' names, in place of those that are there. render: image (H, W, 3) over black
+    and alpha (H, W) of a model; records: of eval.json, in the views' order."""
     for earlier in folder.glob("**/*.png"):
         remove(earlier)
     names = picture_names([view.name for view in views])
     for place in worst(records):
         path = folder / names[place]
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, depth_picture(*draw(views[place])))
+        camera = views[place].camera
+        image, alpha = render(coloured(gaussians, camera), camera)
+        write_image(path, depth_picture(image[:, :, 0] / np.maximum(alpha, SEEN), alpha))

@@ -34,7 +34,7 @@ from clsplat.runs import scene_record
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
 from clsplat.scenes.initialise import is_colourless, photographed
-from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.scene import Scene
 from clsplat.stages.loss import Loss
 from clsplat.training import telemetry
 from clsplat.training.batch import Losses
@@ -215,12 +215,10 @@ class Session:
         result = self.renderer.render(trainer.parameters, trainer.local(camera), background)
         return result.image, result.alpha
 
-    def depth(self, view: View) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Median depth and alpha of the model as it is."""
-        trainer = self.trainer
-        trainer.settle()
-        result, channels = self.renderer.render_channels(trainer.parameters, trainer.local(view.camera))
-        return channels["median"], result.alpha
+    def render(self, model: Gaussians, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Image over black and alpha of a model on the host."""
+        result = Renderer(self.trainer.device, config=self.trainer.config.rasterizer).render(model, camera)
+        return result.image, result.alpha
 
     def evaluate(self, *, keep: bool) -> dict[str, Any]:
         """The held-out views; their renders are kept in the run's test/ if asked for."""
@@ -329,7 +327,8 @@ class Session:
                 run.write_eval(result)
                 if trainer.config.report and trainer.device.memory.limit is None:
                     with suppress(CapacityError, DriverError):  # a picture less is no failed training
-                        keep_depths(self.depth, trainer.scene.test_views, result["views"], run.depth_path)
+                        views = trainer.scene.test_views
+                        keep_depths(self.render, model, views, result["views"], run.depth_path)
         return model
 
     def make_steps(self, between: Between | None) -> None:

@@ -15,10 +15,11 @@ from tiny import HEIGHT, VIEWS, WIDTH, short, write_scene
 
 from clsplat.cli.main import main
 from clsplat.config.masks import MaskUse
-from clsplat.evaluation.depths import DARKEST, WORST, depth_picture, keep_depths
+from clsplat.evaluation.depths import DARKEST, WORST, coloured, depth_picture, keep_depths
+from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.report.photographs import SHOWN, masked_photographs
-from clsplat.runs.run import owned_files
+from clsplat.runs.run import Run, owned_files
 from clsplat.scenes.marked import CLEAR, IGNORED, STRENGTH, masked
 from clsplat.scenes.scene import load_scene
 
@@ -97,7 +98,12 @@ def test_the_worst_views_have_photograph_render_and_depth(reported: Path, tmp_pa
     assert [len(figure.all("img")) for figure in figures] == [3] * min(WORST, len(records))
     least = min(records, key=lambda record: record["psnr"])["name"]
     assert figures[0].words.strip().startswith(least)
-    keep_depths(lambda _: (np.ones((2, 2)), np.ones((2, 2))), [], [], run / "depth")
+    model = Gaussians.load(run / "model.ply")
+    camera = load_scene(Run.open(reported).scene or Path()).test_views[0].camera
+    greys = coloured(model, camera).sh[:, 0, 0]
+    depths = (model.means + model.origin - camera.position) @ camera.rotation[2]
+    assert (np.diff(greys[np.argsort(depths)]) >= 0).all()
+    keep_depths(lambda *_: (np.ones((2, 2, 3)), np.ones((2, 2))), model, [], [], run / "depth")
     assert not list((run / "depth").glob("*.png"))
     assert main(["report", str(run)]) == 0
     assert not parse((run / "report.html").read_text("utf-8")).all("div", id="worst")
