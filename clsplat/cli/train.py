@@ -16,6 +16,7 @@ from tyro.conf import Positional, Suppress, arg
 from clsplat.cli.eval import print_summary, tell_of_lpips
 from clsplat.cli.options import Flag, Output, PageOptions, SeveralDevices, Verb, with_given
 from clsplat.cli.session import Services, load_scene
+from clsplat.config.masks import NO_MASKS
 from clsplat.config.presets import Preset, Schedule, bundled
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
@@ -106,6 +107,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
+    from clsplat.selftest.result import MASKS, TRAINING
 
     verb.device.check()
     verb.config.check()
@@ -135,7 +137,8 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     changed = verb.resume and scene_record.check(
         earlier, scene, source, verb.config.resolution, accept=verb.accept_changes
     )
-    devices = [services.require(device) for device in devices]
+    stages = TRAINING if config.mask_use == NO_MASKS else (*TRAINING, *MASKS)
+    devices = [services.require(device, stages) for device in devices]
     verb.output.mkdir(parents=True, exist_ok=True)
     locks.enter_context(locked(verb.output, "train"))
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)

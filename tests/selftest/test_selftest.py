@@ -25,7 +25,7 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.selftest import trust
 from clsplat.selftest.child import run
 from clsplat.selftest.harness import error_of
-from clsplat.selftest.result import BACKWARD, BOUNDS, CHANNELS, DEEP, FORWARD, RAYS, STAGES, TRAINING, Result
+from clsplat.selftest.result import BACKWARD, BOUNDS, CHANNELS, DEEP, FORWARD, MASKS, RAYS, STAGES, TRAINING, Result
 from clsplat.selftest.scenes import keys, scenes
 from clsplat.selftest.trust import Report, examine
 
@@ -41,6 +41,8 @@ BROKEN = {
     "ranges: = i + 1;": ("= i;", "ranges"),
     "blend: before * alpha": ("before + alpha", "blend"),
     "blend: fmaL(-before, alpha, before)": ("fmaL(-before, before, before)", "blend"),
+    "target: pixel[4] > 0": ("pixel[4] >= 0", "masks"),
+    "alpha_loss: -scale : (": ("scale : (", "masks"),
     "loss: 2.0f * (mu1 * mu2) + C1": ("2.0f * (mu1 * mu2) - C1", "loss"),
     "blend_grad: fmaL(weight, shade, p->behind)": ("fmaL(weight, shade, -p->behind)", "blend_grad"),
     "project_grad: sums[field] += slot[field]": ("sums[field] -= slot[field]", "project_grad"),
@@ -67,7 +69,7 @@ BROKEN = {
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
     monkeypatch.setenv(BREAK, change)
-    group = next(stages for stages in (FORWARD, CHANNELS, DEEP, RAYS, BACKWARD) if last in stages)
+    group = next(stages for stages in (FORWARD, CHANNELS, DEEP, RAYS, MASKS, BACKWARD) if last in stages)
     before = () if group is FORWARD else FORWARD
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
 
