@@ -18,12 +18,15 @@ from clsplat.device.launch import launch_grid
 from clsplat.device.layout import READBACK, TILE
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference.adam import adam as exact_adam
-from clsplat.reference.loss import l1_dssim
+from clsplat.reference.loss import alpha_loss, l1_dssim, masked_l1_dssim
 from clsplat.reference.noise import displacements
 from clsplat.stages.adam import adam
+from clsplat.stages.blend import Blended
+from clsplat.stages.device_camera import padded_size
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.stages.loss import loss
 from clsplat.stages.noise import noise
+from clsplat.stages.target import target
 
 Array = NDArray[Any]
 
@@ -34,14 +37,18 @@ BOUNDS = {
     "exp2": 2.1e-7,
     "loss": 1e-6,
     "loss gradient": 1e-5,
+    "masked loss": 1e-6,
+    "masked gradient": 1e-5,
+    "alpha gradient": 1e-6,
     "adam": 1e-4,
     "noise": 5e-6,
 }
 """exp, sigmoid: 2 and 3 ulp; exp2: 0.8e-7 of its polynomial and rounding. log2: absolute under 1. loss: relative to at
 least 1, a sum of partial sums. loss gradient: in norm; differences of pixels are exact to 1e-7 of the brightness, up to
-1.5, and of the ripple of flat pictures that is more. adam: of a step, as beta2 in float32 is 1e-8 off in
-1 - beta2 = 1e-3, 1e-5 of a step, and a few roundings. noise: in norm; of 100 (o - dead), up to 16, a digit of o is
-1e-6 of the weight."""
+1.5, and of the ripple of flat pictures that is more; with masks likewise, the loss relative to at least all
+pixels over those that count too, as windows under the mask cancel. alpha gradient: one rounding. adam: of a step, as
+beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3, 1e-5 of a step, and a few roundings. noise: in norm; of
+100 (o - dead), up to 16, a digit of o is 1e-6 of the weight."""
 
 
 def elementary(device: Device, rng: np.random.Generator, count: int) -> Result:
@@ -102,6 +109,50 @@ def losses(device: Device, rng: np.random.Generator, many: int) -> Result:
     return worst
 
 
+def masked_losses(device: Device, rng: np.random.Generator, many: int) -> Result:
+    """Largest errors of the loss with masks and alpha, of any part that counts, by pixel and by transmittance."""
+    worst = {"masked loss": 0.0, "masked gradient": 0.0, "alpha gradient": 0.0}
+    work, weight, behind = Workspace(device), 0.5, np.array([0.1, 0.5, 0.9], np.float32)
+    background = upload(device, behind)
+    for _ in range(many):
+        x, y = _pictures(rng)
+        height, width, _ = x.shape
+        rows, stride = padded_size(width, height)
+        counts = (rng.random((height, width, 1)) < rng.choice([0.0, 0.1, 0.5, 1.0])).astype(np.float32)
+        counts[0, 0] = 1
+        alpha = (rng.random((height, width, 1)) ** rng.choice([0.0, 1.0, 8.0])).astype(np.float32)
+        left = np.zeros((rows, stride), np.float32)
+        left[:height, :width] = rng.random((height, width)) ** rng.choice([0.0, 1.0, 8.0])
+        image = np.zeros((3, rows, stride), np.float32)
+        image[:, :height, :width] = x.transpose(2, 0, 1)
+        stops = np.full((rows, stride), -1, np.int32)
+        stops[:height, :width] = 0
+        made = Blended(upload(device, image), upload(device, left), upload(device, stops), None)
+        photograph = np.concatenate([y, alpha, counts], axis=2)
+        planes = target(device, work, photograph, background, made, alpha=True)
+        how = {"kept": int(counts.sum()), "blended": made, "alpha_weight": weight}
+        result = loss(device, work, made.image, planes, width, height, 0.2, **how)  # type: ignore[arg-type]
+        got, mask = result.gradient.get()[:, :height, :width].transpose(1, 2, 0), counts[:, :, 0].astype(float)
+        truth = alpha.astype(float) * y + (1 - alpha.astype(float)) * behind.astype(float)
+        own, gradient = masked_l1_dssim(x.astype(float), truth, mask, 0.2)
+        apart = 1 - left[:height, :width].astype(float) - alpha[:, :, 0]
+        of_alpha, by_left = alpha_loss(left[:height, :width].astype(float), alpha[:, :, 0].astype(float), mask, weight)
+        wanted = own + of_alpha
+        size = max(1.0, wanted, height * width / float(counts.sum()))
+        worst["masked loss"] = max(worst["masked loss"], abs(result.read()[0] - wanted) / size)
+        close = np.abs(x - truth).min(axis=2) < 1e-6  # a rounding decides the sign there
+        for name, part, exact in (
+            ("masked gradient", got[:, :, :3][(mask > 0) & ~close], gradient[(mask > 0) & ~close]),
+            ("alpha gradient", got[:, :, 3][np.abs(apart) > 1e-6], by_left[np.abs(apart) > 1e-6]),
+        ):
+            size = float(np.linalg.norm(exact))
+            if size > 0:
+                worst[name] = max(worst[name], float(np.linalg.norm(part - exact)) / size)
+            elif part.any():
+                worst[name] = float("inf")
+    return worst
+
+
 def steps(device: Device, rng: np.random.Generator, many: int) -> Result:
     """Largest error, in steps, over steps of Adam with gradients of 1e-20 to 1e6, from moments of any size."""
     worst, count, rate = 0.0, 200, 1e-2
@@ -155,6 +206,7 @@ def stages(device: Device, seed: int, many: int) -> Result:
     found = {
         **elementary(device, rng, 1000 * many),
         **losses(device, rng, many),
+        **masked_losses(device, rng, many),
         **steps(device, rng, many),
         **exploration(device, rng, many),
     }

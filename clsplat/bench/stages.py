@@ -173,6 +173,8 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
         optimiser=OptimiserConfig(means_rate_end=0.0, **still),  # type: ignore[arg-type]  # all of them are floats
         density=DensityConfig(every=0),
         rasterizer=config,
+        masks=subject.masks.masks,
+        alpha=subject.masks.alpha,
     )
     return Trainer(scene, settings, device, subject.gaussians)
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
+from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.gaussians import Gaussians
 from clsplat.models.formats import is_model_name
@@ -23,12 +24,14 @@ from clsplat.scenes.scene import load_scene
 @dataclass(frozen=True, eq=False)
 class Subject:
     """The subject of a measurement: a model, a view of it, and the photograph (H, W, 3) uint8 that a training step
-    compares with, or None for one made up from the frame itself."""
+    compares with, or None for one made up from the frame itself. masks: what they mean, with a photograph (H, W, 5), as
+    `View.load_masked` has it."""
 
     name: str
     gaussians: Gaussians
     camera: Camera
     photograph: NDArray[np.uint8] | None = None
+    masks: MaskUse = NO_MASKS
 
 
 def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Subject:
@@ -61,15 +64,25 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
         if run is None or run.scene is None or not run.scene.exists():
             return Subject(str(path), *facing(gaussians, *(size or (1024, 768))))
         config = run.config
-        scene = load_scene(run.scene, resolution=config.resolution, test_every=config.test_every, progress=progress)
+        masks = config.mask_use
+        scene = load_scene(
+            run.scene,
+            resolution=config.resolution,
+            test_every=config.test_every,
+            lenses=config.lenses,
+            masks=masks,
+            progress=progress,
+        )
     else:
-        scene = load_scene(path, progress=progress)
+        scene, masks = load_scene(path, progress=progress), NO_MASKS
         gaussians = from_scene(scene, TrainConfig().random_points, np.random.default_rng(0))
     view = (scene.train_views or scene.views)[0]
     camera = view.camera.resized(*size) if size else view.camera
-    pixels = view.load(camera.width, camera.height)[:, :, :3]
+    pixels = view.load_masked(camera.width, camera.height)
+    if masks == NO_MASKS:
+        pixels = pixels[:, :, :3]
     camera, gaussians = gaussians.local(camera), replace(gaussians, origin=np.zeros(3))
-    return Subject(str(path), gaussians, camera, np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
+    return Subject(str(path), gaussians, camera, np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), masks)
 
 
 def facing(gaussians: Gaussians, width: int, height: int) -> tuple[Gaussians, Camera]:

@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 from clsplat.cli.options import DeviceOptions, Flag, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.checks import Rule, check_rules
+from clsplat.config.masks import NO_MASKS
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError, warn
 from clsplat.files import check_new, is_file, read_document
@@ -72,7 +73,8 @@ class Convert(Verb):
     drop_sh: Annotated[int | None, arg(metavar="DEGREE")] = None
     """Leave out the spherical harmonics (colour by direction) beyond this degree, 0 to 3."""
     scene: ScenePath = None
-    """Measure PSNR on this scene's held-out views before and after, and of the two renders against each other."""
+    """Measure PSNR on this scene's held-out views before and after, and of the two renders against each other. Of the
+    scene of a run, pixels that its masks leave out do not count."""
     test_every: int = TEST_EVERY
     """Every n-th view of --scene by name is held out; 0: all its views are measured."""
     resolution: int = 0
@@ -273,13 +275,18 @@ def _measured(
     other: of each view, and the means. The cameras of the written model move along with it."""
     import numpy as np
 
+    from clsplat.evaluation.held_out import photograph_of
     from clsplat.evaluation.metrics import psnr
     from clsplat.images.alpha import background_colour, composite
     from clsplat.models import edit
+    from clsplat.runs.run import run_of
 
     device = verb.device.open(services)
     assert verb.scene is not None
-    scene = load_scene(services, verb.scene, verb.resolution, verb.test_every)
+    run = run_of(verb.source)
+    own = run is not None and run.scene is not None and run.scene.resolve() == verb.scene.resolve()
+    masks = run.config.mask_use if run is not None and own else NO_MASKS
+    scene = load_scene(services, verb.scene, verb.resolution, verb.test_every, masks)
     renderer = services.renderer(services.require(device, FORWARD))
     background = background_colour(verb.background)
 
@@ -291,8 +298,10 @@ def _measured(
     moved = cameras if matrix is None else [edit.transform_camera(camera, matrix) for camera in cameras]
     records: list[dict[str, Any]] = []
     for view, before, after in zip(views, images(original, cameras), images(read, moved), strict=True):
-        photograph = composite(view.load(), background)
-        scores = {"before": psnr(before, photograph), "after": psnr(after, photograph), "between": psnr(before, after)}
+        pixels, counts = photograph_of(view)
+        truth = composite(pixels, background)
+        pairs = {"before": (before, truth), "after": (after, truth), "between": (before, after)}
+        scores = {key: psnr(*pair, counts) for key, pair in pairs.items()}
         records.append({"name": view.name, **scores})
     mean = {key: float(np.mean([record[key] for record in records])) for key in ("before", "after", "between")}
     return {**mean, "least_between": min(record["between"] for record in records), "views": records}

@@ -54,6 +54,7 @@ def run(verb: Eval, services: Services) -> int:
 
 
 def _evaluate(verb: Eval, services: Services) -> int:
+    from clsplat.evaluation.depths import keep_depths
     from clsplat.evaluation.held_out import evaluate
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
@@ -91,6 +92,10 @@ def _evaluate(verb: Eval, services: Services) -> int:
         result = renderer.render(gaussians, camera, background)
         return result.image, result.alpha
 
+    def render(model: Gaussians, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+        result = renderer.render(model, camera)
+        return result.image, result.alpha
+
     warnings = scene_record.of_evaluation(trained, views) if trained else []
     with suppress(CapacityError):
         warnings.append(doubts.of_pictures(draw, views, "held-out"))
@@ -112,6 +117,8 @@ def _evaluate(verb: Eval, services: Services) -> int:
     if given_run:
         given_run.write_eval(result)
         if (given_run.path / NAME).exists():
+            with suppress(CapacityError):
+                keep_depths(render, gaussians, views, result["views"], given_run.depth_path)
             write_last(given_run, scene, gaussians)
     if verb.json:
         print(json.dumps(result, indent=2))

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from clsplat.device.context import Device, DeviceInfo
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
+    from clsplat.scenes.findings import Finding
     from clsplat.scenes.scene import Scene
 
 
@@ -37,6 +38,7 @@ class Services:
     """The functions of the package that compute for the verbs. Tests hand in others."""
 
     load_scene: Callable[..., Scene] = imported("clsplat.scenes.scene.load_scene")
+    findings: Callable[..., list[Finding]] = imported("clsplat.scenes.findings.findings")
     open_device: Callable[..., Device] = imported("clsplat.device.context.open_device")
     open_devices: Callable[..., list[Device]] = imported("clsplat.device.context.open_devices")
     require: Callable[..., Device] = imported("clsplat.selftest.trust.require")

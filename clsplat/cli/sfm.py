@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from clsplat.cli.options import Flag, OptionalInt, Output, Verb
 from clsplat.cli.session import Services
-from clsplat.config.masks import MaskUse
+from clsplat.config.masks import MaskMeaning, MaskUse
 from clsplat.errors import InputError
 from clsplat.progress import StageProgress
 
@@ -40,6 +40,8 @@ class Sfm(Verb):
     and put the masks, undistorted, beside the scene's images."""
     invert_masks: Flag = False
     """Take the masks' black parts for those that count, and their white ones for those that do not."""
+    alpha: Flag = False
+    """Look for no features where the photos are transparent, and put that as masks beside the scene's images."""
     overwrite: Flag = False
     """Replace a scene in the output folder that was made of other photos or with other settings."""
     json: Flag = False
@@ -56,8 +58,9 @@ def run(verb: Sfm, services: Services) -> int:
     settings = {name: getattr(verb, name) for name in names}
     if verb.invert_masks and not verb.masks:
         raise InputError("--invert-masks: no masks are used, expected --masks too")
-    if verb.masks:
-        settings["masks"] = MaskUse("ignore", invert=verb.invert_masks)
+    if verb.masks or verb.alpha:
+        of_masks: MaskMeaning = "ignore" if verb.masks else "none"
+        settings["masks"] = MaskUse(of_masks, "ignore" if verb.alpha else "blend", verb.invert_masks)
     services.reconstruct(verb.photos, verb.output, **settings, progress=StageProgress())
     if verb.json:
         from clsplat.scenes.sfm import RECORD

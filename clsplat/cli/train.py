@@ -11,11 +11,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, Suppress, arg
 
 from clsplat.cli.eval import print_summary, tell_of_lpips
 from clsplat.cli.options import Flag, Output, PageOptions, SeveralDevices, Verb, with_given
 from clsplat.cli.session import Services, load_scene
+from clsplat.config.masks import NO_MASKS
 from clsplat.config.presets import Preset, Schedule, bundled
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
@@ -48,6 +49,9 @@ class Train(Verb):
     view: Flag = False
     """Show the model as it grows on a page in the browser, where training can be paused too (see clsplat view)."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
+    auto: Flag = False
+    """Take the settings that answer what is found in the scene, such as --appearance exposure where the photographs'
+    exposures differ. Settings that are given stay. What is found is said without it too."""
     json: Flag = False
     """Print the final evaluation as JSON on standard output."""
     preset: Preset = "default"
@@ -57,12 +61,15 @@ class Train(Verb):
     """Bundle of learning rates and of the steps at which things happen: paper, made for 30,000 steps; short, for
     --iterations of about 7000. Flags that are given override it. If not given: paper, but short with --preset fast."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+    given: Annotated[frozenset[str], Suppress] = field(default=frozenset(), compare=False)
+    """Names of the settings on the command line."""
 
     def completed(self, given: Collection[str]) -> Train:
         """The settings are those of the run that is resumed, or of the preset and the schedule, for these devices."""
         verb = self._with_settings(given)
         explicit = self.resume or "batch" in given
-        return replace(verb, config=verb.config.on_devices(self.device.count, explicit=explicit))
+        config = verb.config.on_devices(self.device.count, explicit=explicit)
+        return replace(verb, config=config, given=frozenset(given))
 
     def _with_settings(self, given: Collection[str]) -> Train:
         if not self.resume and (self.preset, self.schedule) == ("default", None):
@@ -100,7 +107,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
-    from clsplat.selftest.result import APPEARANCE, TRAINING
+    from clsplat.selftest.result import APPEARANCE, MASKS, TRAINING
 
     verb.device.check()
     verb.config.check()
@@ -116,10 +123,11 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         source = source or earlier.scene
     if source is None:
         raise InputError("SCENE is missing, expected the folder of the scene to train on")
+    if verb.resume and verb.auto:
+        raise InputError("--auto and --resume exclude each other: the run has its settings")
     devices = verb.device.open_all(services)
-    config = verb.config
-    scene = load_scene(services, source, config.resolution, config.test_every, config.mask_use, config.lenses)
-    _check_scene(scene)
+    scene, config = _looked_at(verb, services, source)
+    verb = replace(verb, config=config)
     if verb.resume and (done := max((step for step, _ in earlier.checkpoints()), default=0)) > verb.config.iterations:
         raise InputError(
             f"--iterations {verb.config.iterations}: {verb.output} is at step {done} already, expected more"
@@ -129,8 +137,12 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     changed = verb.resume and scene_record.check(
         earlier, scene, source, verb.config.resolution, accept=verb.accept_changes
     )
-    stages = () if config.appearance == "none" else ((*TRAINING, *APPEARANCE),)
-    devices = [services.require(device, *stages) for device in devices]
+    stages = (
+        *TRAINING,
+        *(() if config.mask_use == NO_MASKS else MASKS),
+        *(() if config.appearance == "none" else APPEARANCE),
+    )
+    devices = [services.require(device, stages) for device in devices]
     verb.output.mkdir(parents=True, exist_ok=True)
     locks.enter_context(locked(verb.output, "train"))
     run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
@@ -165,6 +177,28 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         print_summary(result)
     print(f"model in {run.model_path}", file=sys.stderr)
     return 0
+
+
+def _looked_at(verb: Train, services: Services, source: Path) -> tuple[Scene, TrainConfig]:
+    """The scene, checked, and the settings, with --auto those that answer what is found in it. Prints that."""
+    from clsplat.scenes.answers import answered, paragraph
+
+    def load(config: TrainConfig) -> Scene:
+        scene = load_scene(services, source, config.resolution, config.test_every, config.mask_use, config.lenses)
+        _check_scene(scene)
+        return scene
+
+    config = verb.config
+    scene = load(config)
+    if verb.resume:
+        return scene, config
+    answers, better = answered(services.findings(scene, config.mask_use), config, verb.given)
+    print(paragraph(answers, len(scene.views), auto=verb.auto), file=sys.stderr)
+    if not verb.auto:
+        return scene, config
+    if (better.mask_use, better.lenses) != (config.mask_use, config.lenses):
+        scene = load(better)
+    return scene, better
 
 
 def _check_scene(scene: Scene) -> None:

@@ -132,7 +132,7 @@ def _scene(services: Services, path: Path | None, config: TrainConfig, *, given:
         return None
     try:
         how = {"resolution": config.resolution, "test_every": config.test_every, "lenses": config.lenses}
-        return services.load_scene(path, **how)
+        return services.load_scene(path, masks=config.mask_use, **how)
     except (InputError, OSError) as error:
         if given:
             raise

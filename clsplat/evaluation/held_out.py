@@ -45,7 +45,7 @@ def evaluate(
     records: list[dict[str, Any]] = []
     names = picture_names([view.name for view in views])
     for view, name in zip(views, names, strict=True):
-        pixels, counts = _split(view)
+        pixels, counts = photograph_of(view)
         truth, image = composite(pixels, background), np.asarray(render(view))
         if not np.isfinite(image).all():
             raise ClsplatError(f"the render of {view.name} has values that are not finite")
@@ -77,7 +77,7 @@ def evaluate(
     return result
 
 
-def _split(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
+def photograph_of(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
     """A view's pixels, and those of them that count, (H, W), where it has a mask. Raises InputError where none does."""
     image = view.load_masked()
     if image.shape[2] < 5:

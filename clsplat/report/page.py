@@ -14,8 +14,10 @@ from typing import Any
 from markupsafe import Markup
 
 import clsplat
+from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.errors import amount
+from clsplat.evaluation import depths
 from clsplat.files import atomic_write
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
@@ -29,6 +31,7 @@ from clsplat.report.figures import (
     settings_of,
     smooth,
 )
+from clsplat.report.photographs import SIDE, MaskedPhotograph, exposure_chart, masked_photographs
 from clsplat.report.svg import Series, chart, short, templates
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
@@ -77,15 +80,25 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
     evaluation = figures.evaluation
     listed = evaluation["views"] if evaluation else []
     shown: list[thumbnails.Shown] = []
+    low: list[thumbnails.Shown] = []
     notes = list(figures.notes)
-    if listed and views > 0:
+    use = figures.run.config.mask_use
+    if views > 0 and (listed or use != NO_MASKS):
         scene = scene if scene is not None else thumbnails.scene_of(figures.run)
+    masks: list[MaskedPhotograph] = []
+    masked_count = 0
+    if views > 0 and use != NO_MASKS and isinstance(scene, Scene):
+        masks, masked_count = masked_photographs(scene, only_files=use.alpha == "blend")
+    if listed and views > 0:
         if isinstance(scene, str):
             notes.append(f"There are renders without photographs: {scene}.")
         names = [view["name"] for view in listed]
         wanted = thumbnails.chosen([view.get("psnr") for view in listed], views)
         background = background_colour(figures.run.config.background)
-        shown = thumbnails.show(figures.run, names, wanted, None if isinstance(scene, str) else scene, background)
+        known = None if isinstance(scene, str) else scene
+        shown = thumbnails.show(figures.run, names, wanted, known, background)
+        worst = depths.worst(listed) if isinstance(scene, Scene) else []
+        low = [view for view in thumbnails.show(figures.run, names, worst, known, background, SIDE) if view.depth]
         if len(shown) < len(wanted):
             notes.append(f"{len(wanted) - len(shown)} renders of held-out views are not in test/, or cannot be read.")
     scores = {view["name"]: view for view in listed}
@@ -96,11 +109,15 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         figures=figures,
         notes=notes,
         titles=TITLES,
-        charts=list(filter(None, charts(figures))),
+        charts=list(filter(None, [*charts(figures), exposure_chart(figures.run)])),
+        masks=masks,
+        masked_count=masked_count,
+        mask_words=_mask_words(use),
         histograms=list(filter(None, histograms(figures))),
         stages=stage_rows(figures),
         shown=[(place, view, scores[view.name]) for place, view in enumerate(shown, 1)],
         places=places,
+        low=[(view, scores[view.name]) for view in low],
         left_out=len(listed) - len(shown),
         white_error=thumbnails.WHITE_ERROR,
         columns=[(name, TITLES[name]) for name in SCORES if any(name in view for view in listed)],
@@ -223,6 +240,12 @@ def duration(seconds: float | None) -> str:
 def score(value: float, name: str) -> str:
     """A score with the digits that mean something."""
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
+
+
+def _mask_words(use: MaskUse) -> list[str]:
+    """Meanings of the colours that are drawn over photographs with masks."""
+    words = {"ignore": "red is ignored", "transparent": "blue is transparent"}
+    return [text for meaning, text in words.items() if meaning in (use.masks, use.alpha)]
 
 
 def _data(figures: Figures) -> dict[str, Any]:

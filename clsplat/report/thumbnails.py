@@ -8,7 +8,8 @@ import os
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from clsplat.images.colour import displayed, photos_space
 from clsplat.images.reading import downscale, read_image
 from clsplat.images.writing import write_spec
 from clsplat.runs.run import Run
+from clsplat.scenes.masks import after_sfm
 from clsplat.scenes.scene import Scene, View, detect, load_scene
 
 MAX_SIDE = 640
@@ -41,7 +43,7 @@ RAMP = np.array(
 
 @dataclass(frozen=True)
 class Shown:
-    """A view's pictures as data URIs; photo and error None where there is no photograph."""
+    """A view's pictures as data URIs; photo and error None where there is no photograph, depth where none was kept."""
 
     name: str
     width: int
@@ -50,6 +52,7 @@ class Shown:
     photo: str | None = None
     error: str | None = None
     trouble: str | None = None
+    depth: str | None = None
 
     @property
     def small(self) -> bool:
@@ -62,17 +65,20 @@ def scene_of(run: Run) -> Scene | str:
     source = run.scene
     if source is None:
         return "config.toml does not name the scene"
+    masks = run.config.mask_use
     try:
         if detect(source) == "photos":
             source = source.resolve()
             source = source.with_name(f"{source.name}_colmap")
             if not source.is_dir():
                 return "the scene is a folder of photos, and what was reconstructed of it is gone"
+            masks = after_sfm(masks, source)
         return load_scene(
             source,
             resolution=run.config.resolution,
             test_every=run.config.test_every,
-            masks=run.config.mask_use,
+            masks=masks,
+            lenses=run.config.lenses,
         )
     except (InputError, OSError) as error:
         return f"the scene cannot be read ({str(error).replace(str(source), source.name)})"
@@ -88,9 +94,15 @@ def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
 
 
 def show(
-    run: Run, names: Sequence[str], wanted: Sequence[int], scene: Scene | None, background: ArrayLike
+    run: Run,
+    names: Sequence[str],
+    wanted: Sequence[int],
+    scene: Scene | None,
+    background: ArrayLike,
+    side: int = MAX_SIDE,
 ) -> list[Shown]:
-    """The pictures of the views `names[index]`, for each index wanted, whose render is in the run's test/."""
+    """The pictures of the views `names[index]`, for each index wanted, whose render is in the run's test/. side: pixels
+    of the longer side, at most."""
     try:
         paths = picture_names(names)
     except ValueError:  # a name that no file has, such as ""
@@ -99,13 +111,18 @@ def show(
     space = photos_space(view.path for view in views.values())
 
     def one(index: int) -> Shown | None:
-        path = run.test_path / paths[index]
+        path, depth = run.test_path / paths[index], run.depth_path / paths[index]
         if not _is_within(path, run.test_path):
             return None
         try:
-            return _shown(names[index], path, views.get(names[index]), background, space)
+            shown = _shown(names[index], path, views.get(names[index]), background, space, side)
         except InputError:
             return None
+        if depth.is_file() and _is_within(depth, run.depth_path):
+            with suppress(InputError):
+                picture = read_image(depth, orient=False)[:, :, :3]
+                shown = replace(shown, depth=data_uri(downscale(picture, shown.width, shown.height)))
+        return shown
 
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
         return [shown for shown in pool.map(one, wanted) if shown is not None]
@@ -144,10 +161,10 @@ def _is_within(path: Path, folder: Path) -> bool:
         return False
 
 
-def _shown(name: str, path: Path, view: View | None, background: ArrayLike, space: str) -> Shown:
+def _shown(name: str, path: Path, view: View | None, background: ArrayLike, space: str, side: int) -> Shown:
     render = read_image(path, orient=False)[:, :, :3]
     height, width = render.shape[:2]
-    scale = min(1.0, MAX_SIDE / max(width, height))
+    scale = min(1.0, side / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = downscale(render, *size)
     if view is None:

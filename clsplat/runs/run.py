@@ -48,6 +48,7 @@ class Run:
         self.metrics_path = path / "metrics.jsonl"
         self.eval_path = path / "eval.json"
         self.appearance_path = path / "appearance.json"
+        self.depth_path = path / "depth"
         self.checkpoints_path = path / "checkpoints"
         self.test_path = path / "test"
 
@@ -266,7 +267,13 @@ def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
 
 def owned_files(path: Path) -> list[Path]:
     """The files in a run's folder that clsplat wrote, and that --overwrite may therefore remove."""
-    patterns = ("checkpoints/step-*.npz", "trouble-step-*.npz", "test/**/*.png", "**/.*" + TEMPORARY_SUFFIX)
+    patterns = (
+        "checkpoints/step-*.npz",
+        "trouble-step-*.npz",
+        "test/**/*.png",
+        "depth/**/*.png",
+        "**/.*" + TEMPORARY_SUFFIX,
+    )
     # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
     names = ("model.ply", "metrics.jsonl", "eval.json", "appearance.json", "report.html", "scene.json", "config.toml")
     files = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]

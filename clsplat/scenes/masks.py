@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Protocol
 
 import numpy as np
 
 from clsplat.arrays import Float32
-from clsplat.config.masks import NO_MASKS, MaskUse
+from clsplat.config.masks import NO_MASKS, MaskMeaning, MaskUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.images.reading import find_images, image_size, read_image
 from clsplat.images.writing import write_image
@@ -64,6 +65,16 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
     return counts
 
 
+class Named(Protocol):
+    """A photograph of a scene: its name there, and its file."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def path(self) -> Path: ...
+
+
 def folder_of(images: Path) -> Path | None:
     """The folder of masks of a folder of photographs."""
     return next((at for parent in (images.parent, images) for name in FOLDERS if (at := parent / name).is_dir()), None)
@@ -110,7 +121,7 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
         return {}
     found: dict[str, Path] = {}
     if use.masks != "none":
-        found = {**_beside(images), **{image.name: image.mask for image in images if image.mask is not None}}
+        found = {**masks_beside(images), **{image.name: image.mask for image in images if image.mask is not None}}
         if not found:
             raise InputError(
                 f"{where}: --masks {use.masks}, and there are none; expected masks/IMAGE.png beside images/, or "
@@ -126,8 +137,9 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
     return {image.name: Mask(use, found.get(image.name)) for image in images}
 
 
-def _beside(images: Sequence[PosedImage]) -> dict[str, Path]:
-    """The masks in the folder beside the photographs, or in theirs, by the photographs' names."""
+def masks_beside(images: Sequence[Named]) -> dict[str, Path]:
+    """The masks in the folder beside the photographs, or in theirs, by the photographs' names. Raises InputError as
+    `find_masks`."""
     top = images[0].path
     for _ in PurePosixPath(images[0].name).parts:
         top = top.parent
@@ -143,13 +155,44 @@ def _beside(images: Sequence[PosedImage]) -> dict[str, Path]:
     return {}
 
 
-def stage_mask(path: Path, target: Path, size: tuple[int, int], *, invert: bool) -> None:
-    """Write a mask as black and white, for a photo of this width and height. Raises InputError for another size."""
-    mask = read_mask(path, orient=False, invert=invert)
-    if mask.shape[:2] != size[::-1]:
-        raise _misfit(path, (mask.shape[1], mask.shape[0]), size)
+def stage_mask(
+    path: Path | None, target: Path, size: tuple[int, int], *, invert: bool, photo: Path | None = None
+) -> None:
+    """Write a mask as black and white, for a photo of this width and height. path: its file; photo: the photo, whose
+    alpha is a mask too. Raises InputError for another size."""
+    mask = np.ones((*size[::-1], 1), np.float32)
+    if path is not None:
+        mask = read_mask(path, orient=False, invert=invert)
+        if mask.shape[:2] != size[::-1]:
+            raise _misfit(path, (mask.shape[1], mask.shape[0]), size)
+    if photo is not None:
+        mask = mask * (read_image(photo, orient=False)[:, :, 3:] >= HALF)
     target.parent.mkdir(parents=True, exist_ok=True)
     write_image(target, np.repeat(mask, 3, axis=2))
+
+
+def for_sfm(use: MaskUse) -> MaskUse | None:
+    """The use of masks in `clsplat.scenes.sfm`, where all that a mask leaves out has no features; None for none. Raises
+    InputError for masks and alpha of two meanings: what is reconstructed has one mask for both."""
+    meanings = {use.masks, use.alpha} - {"none", "blend"}
+    if len(meanings) > 1:
+        raise InputError(
+            f"--masks {use.masks} and --alpha {use.alpha}: expected one meaning of both for a folder of photos, as "
+            "their reconstruction has one mask for each; give the cameras, or make both the same"
+        )
+    if not meanings:
+        return None
+    masks: MaskMeaning = "none" if use.masks == "none" else "ignore"
+    return MaskUse(masks, "blend" if use.alpha == "blend" else "ignore", use.invert)
+
+
+def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
+    """The use of the masks in a folder that `clsplat.scenes.sfm` has made: white where a pixel counts, alpha among
+    them."""
+    if not (folder / FOLDERS[0]).is_dir():
+        return replace(use, masks="none", invert=False)
+    meaning: MaskMeaning = "none" if use.alpha == "blend" else use.alpha
+    return replace(use, masks=meaning if use.masks == "none" else use.masks, invert=False)
 
 
 def _misfit(path: Path, size: tuple[int, int], photo: tuple[int, int]) -> InputError:

@@ -26,7 +26,8 @@ from clsplat.images.reading import companions, downscale, find_images, image_siz
 from clsplat.progress import Progress
 from clsplat.scenes import colmap, transforms
 from clsplat.scenes.data_set import DataSet, Lens, PosedImage, undistort
-from clsplat.scenes.masks import HALF, Mask, masks_of
+from clsplat.scenes.glance import Glance, glance_at
+from clsplat.scenes.masks import HALF, Mask, after_sfm, for_sfm, masks_of
 from clsplat.scenes.sfm import reconstruct
 
 Kind = Literal["colmap", "blender", "transforms", "photos"]
@@ -100,11 +101,12 @@ class View:
             return downscale(image, width, height)
         return undistort(image, self.lens, self.camera.resized(width, height))
 
-    def check(self) -> None:
-        """Raise InputError where `load` would."""
+    def check(self) -> Glance:
+        """A glance at the picture. Raises InputError where `load` would."""
         image = self._read()
         if self.mask is not None:
             self.mask.applied(image, orient=self.upright)
+        return glance_at(image)
 
     def _read(self) -> Float32:
         image = read_image(self.path, orient=self.upright)
@@ -149,16 +151,18 @@ class Scene:
 
     def check_pictures(self) -> None:
         """Decode every picture once, so that a cut one is named before training and not in the middle of it; the
-        `digests` are made on the way.
+        `digests` and `glances` are made on the way.
 
         Raises InputError for the first by name that does not decode.
         """
+        found = self._of_each(lambda view: (_digest(view), view.check()))
+        self.__dict__["digests"] = {name: digest for name, (digest, _) in found.items()}
+        self.__dict__["glances"] = {name: glance for name, (_, glance) in found.items()}
 
-        def look(view: View) -> str | None:
-            view.check()
-            return _digest(view)
-
-        self.__dict__["digests"] = self._of_each(look)
+    @cached_property
+    def glances(self) -> dict[str, Glance]:
+        """A glance at each picture, by the view's name. Raises InputError as `check_pictures`."""
+        return self._of_each(View.check)
 
     @cached_property
     def digests(self) -> dict[str, str | None]:
@@ -282,7 +286,8 @@ def load_scene(
     whose header does not decode. Pictures that are there and not listed are named in the scene's warnings, but for
     masks, depths and the like (`reading.companions`), and so are those on both sides of the split.
 
-    masks: what masks and alpha channels mean (`clsplat.scenes.masks`); no other folder of pictures stands in then.
+    masks: what masks and alpha channels mean (`clsplat.scenes.masks`); no other folder of pictures stands in then, and
+    photos that go through sfm have no features where they leave something out.
     """
     path = Path(path)
     for name, number in (("resolution", resolution), ("test_every", test_every)):
@@ -300,7 +305,9 @@ def load_scene(
             folder = path
             if kind == "photos":
                 photos = path.resolve()
-                folder = reconstruct(photos, work_dir or photos.with_name(f"{photos.name}_colmap"), progress=progress)
+                folder = work_dir or photos.with_name(f"{photos.name}_colmap")
+                folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
+                masks = after_sfm(masks, folder)
             data, smaller = _read_colmap(folder, images)
         posed = sorted(data.images, key=lambda image: image.name)
         if masks != NO_MASKS:

@@ -71,8 +71,8 @@ def reconstruct(
     SIMPLE_RADIAL (one distortion coefficient) for others. shared_camera: see `sfm_photos.camera_groups`.
     max_image_size: pixels, longest side for features alone, the undistorted photos keep their size. threads: all
     cores if None. The same seed gives the same cameras, bit by bit up to 80 photos. overwrite: replace a result of
-    other photos. masks: leave features under the photos' masks out; the output gets them too, as `masks/IMAGE.jpg.png`,
-    white where a pixel counts. progress(text, fraction or None) is called in every stage.
+    other photos. masks: leave features out where the photos' masks, or their alpha, do; the output gets them too, as
+    `masks/IMAGE.jpg.png`, white where a pixel counts. progress(text, fraction or None) is called in every stage.
 
     Warns of photos that could not be placed, are of a kind that cannot be read, or lost their alpha. Raises InputError
     for a folder without photos, a photo that does not decode, an output that is something else, and photos that no
@@ -107,11 +107,17 @@ def reconstruct(
         photos = sfm_photos.stage_photos(
             images, paths, work / "photos", lambda fraction: report("reading photos", fraction), workers
         )
-        sizes = {photo.name: (photo.width, photo.height) for photo in photos}
-        for name, path in shapes.items():
-            stage_mask(path, work / "masks" / f"{name}.png", sizes[name], invert=masks is not None and masks.invert)
+        masked = []
+        for photo in photos:
+            cut = photo.transparent and masks is not None and masks.alpha != "blend"
+            if cut or photo.name in shapes:
+                shape, target = shapes.get(photo.name), work / "masks" / f"{photo.name}.png"
+                inner = work / "photos" / photo.name if cut else None
+                invert = masks is not None and masks.invert
+                stage_mask(shape, target, (photo.width, photo.height), invert=invert, photo=inner)
+                masked.append(photo.name)
         task = {
-            "masks": sorted(shapes),
+            "masks": masked,
             "photos": str(work / "photos"),
             "work": str(work),
             "groups": sfm_photos.camera_groups(photos, shared_camera),
@@ -132,9 +138,10 @@ def reconstruct(
         (work / "result" / RECORD).write_bytes((json.dumps(record, indent=2) + "\n").encode())
         if missing:
             warn(f"{images}: {_listed(missing)} could not be placed and will not be used")
-        if cut := _without_their_alpha(photos, result["registered"], work / "result" / "images"):
+        lost = _without_their_alpha(photos, result["registered"], work / "result" / "images")
+        if lost and (masks is None or masks.alpha == "blend"):
             loss = "lost their alpha when their lens was undone: the scene's images are opaque there"
-            warn(f"{images}: {_listed(cut)} {loss}")
+            warn(f"{images}: {_listed(lost)} {loss}")
         _move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -144,10 +151,15 @@ def reconstruct(
 def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Path]:
     """The masks by the photos' names. Raises InputError where they are asked for, and there are none or one fits no
     photo."""
-    if use is None:
+    if use is None or use.masks == "none":
         return {}
-    folder = folder_of(images)
-    found = find_masks(folder, (sfm_photos.photo_name(images, path) for path in paths)) if folder is not None else {}
+    found: dict[str, Path] = {}
+    parents = {sfm_photos.photo_name(images, path).partition("/")[0] for path in paths if path.parent != images}
+    alone = len(parents) == 1 and all(path.parent != images for path in paths)
+    for base in (*(images / parent for parent in parents if alone), images):
+        if not found and (folder := folder_of(base)) is not None:
+            names = {sfm_photos.photo_name(base, path): sfm_photos.photo_name(images, path) for path in paths}
+            found = {names[name]: mask for name, mask in find_masks(folder, names).items()}
     if not found:
         raise InputError(
             f"{images}: there are no masks, expected masks/IMAGE.jpg.png beside the photos or in their folder"

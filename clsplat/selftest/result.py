@@ -13,12 +13,14 @@ DEEP = ("deep",)
 """A frame in slices by depth."""
 RAYS = ("rays",)
 """A frame of an equirectangular or a fisheye camera."""
+MASKS = ("masks",)
+"""Stages that photographs with masks or alpha to learn need beside TRAINING."""
 BACKWARD = ("loss", "blend_grad", "project_grad", "adam", "statistics")
 """Stages that training needs beside a frame's."""
 APPEARANCE = ("appearance",)
 """Stages of photographs' gains, which training needs where they are learnt."""
 TRAINING = (*FORWARD, *BACKWARD)
-STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *BACKWARD, *APPEARANCE)
+STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *MASKS, *BACKWARD, *APPEARANCE)
 INDICES = ("project", "duplicate", "sort", "ranges")
 """Stages by whose counts and lists the next ones find their way."""
 
@@ -33,6 +35,7 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "channels": (256, "13 found, of normals that cancel; else as blend"),
     "deep": (256, "27 found; as blend"),
     "rays": (512, "47 found; directions and rays have several quotients and roots of 3 ulp, not 0.5"),
+    "masks": (128, "as loss"),
     "loss": (128, "9 found; the SSIM's quotients may have six times that"),
     "blend_grad": (1024, "32 found; up to 64 divisions one after the other recover the transmittance"),
     "project_grad": (512, "39 found, at opacities near 1; six times that for sloppy divisions"),

@@ -27,6 +27,7 @@ from clsplat.reference.render import parameters
 from clsplat.reference.tiles import touched_tiles
 from clsplat.selftest.appearance_stage import of_appearance
 from clsplat.selftest.harness import WHITEN, Array, Bench, Outcome, cropped, joined
+from clsplat.selftest.mask_stages import MASKS
 from clsplat.selftest.picture_stages import PICTURES
 from clsplat.selftest.scenes import evenly, keys, padded
 from clsplat.stages.adam import adam
@@ -443,6 +444,7 @@ RUN: dict[str, Callable[[Bench], Outcome]] = {
     "ranges": _ranges,
     "blend": _blend,
     **PICTURES,
+    **MASKS,
     "loss": _loss,
     "blend_grad": _blend_grad,
     "project_grad": _project_grad,

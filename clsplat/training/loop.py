@@ -22,6 +22,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.child import TrialInterrupted
 from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
+from clsplat.evaluation.depths import keep_depths
 from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
@@ -215,6 +216,11 @@ class Session:
         result = self.renderer.render(trainer.parameters, trainer.local(camera), background)
         return result.image, result.alpha
 
+    def render(self, model: Gaussians, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Image over black and alpha of a model on the host."""
+        result = Renderer(self.trainer.device, config=self.trainer.config.rasterizer).render(model, camera)
+        return result.image, result.alpha
+
     def evaluate(self, *, keep: bool) -> dict[str, Any]:
         """The held-out views; their renders are kept in the run's test/ if asked for."""
         trainer = self.trainer
@@ -320,7 +326,12 @@ class Session:
             if (appearance := trainer.appearance.record()) is not None:
                 run.write_appearance(appearance)
             if trainer.scene.test_views:
-                run.write_eval(self.evaluate(keep=True))
+                result = self.evaluate(keep=True)
+                run.write_eval(result)
+                if trainer.config.report and trainer.device.memory.limit is None:
+                    with suppress(CapacityError, DriverError):  # a picture less is no failed training
+                        views = trainer.scene.test_views
+                        keep_depths(self.render, model, views, result["views"], run.depth_path)
         return model
 
     def make_steps(self, between: Between | None) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from clsplat.arrays import Float64
 from clsplat.errors import ClsplatError, InputError, plain
 from clsplat.rotations import quaternion_of
+from clsplat.scenes.marked import masked
 from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
 from clsplat.viewer.path_recorder import FPS, add_key, path_document, save_path
 from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose, Start
@@ -274,14 +275,14 @@ def png(image: Image) -> bytes:
 
 @cache
 def thumbnail(view: View) -> Image | None:
-    """(H, W, 3), small; None for a photo that cannot be read."""
+    """(H, W, 3), small, red and blue where masks leave something out; None for a photo that cannot be read."""
     camera = view.camera
     scale = min(THUMBNAIL / max(camera.width, camera.height), 1.0)
     try:
-        pixels = view.load(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        picture = masked(view, max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     except (ClsplatError, OSError):
         return None
-    return colour_picture(pixels[:, :, :3])
+    return colour_picture(picture.drawn())
 
 
 def edges_of(low: Any, high: Any) -> Any:

@@ -62,7 +62,7 @@ def test_it_fits_and_is_coloured_as_asked(opened: Any, kind: str, size: Any, sch
     assert red > 200 if scheme == "light" else red < 60
     broken = "[...document.images].filter(image => !image.complete || !image.naturalWidth).length"
     assert page.evaluate(broken) == 0
-    assert page.evaluate("document.images.length") == (6 if kind == "report" else 0)
+    assert page.evaluate("document.images.length") == (12 if kind == "report" else 0)
     charts = page.locator(".chart svg")
     assert charts.count() >= 6
     assert charts.first.bounding_box()["width"] > 250

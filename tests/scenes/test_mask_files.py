@@ -111,3 +111,13 @@ def test_grey_from_a_half_on_counts(tmp_path: Path) -> None:
     values = np.array([[0.0, 0.4, 0.6, 1.0]] * 2, np.float32)[:, :, None] * np.ones(3, np.float32)
     write_image(tmp_path / "m.png", values)
     assert read_mask(tmp_path / "m.png", orient=False, invert=False)[0, :, 0].tolist() == [0, 0, 1, 1]
+
+
+def test_masks_of_polycam_are_beside_the_keyframes(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "keyframes")
+    (scene / "images").rename(scene / "corrected_images")
+    (scene / "masks").mkdir()
+    for index in range(VIEWS):
+        write_image(scene / "masks" / f"{index:02d}.png", mask_of())
+    read = load_scene(scene, images="corrected_images", masks=IGNORE)
+    assert all(view.mask is not None and view.mask.path is not None for view in read.views)

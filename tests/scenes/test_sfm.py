@@ -404,3 +404,43 @@ def test_features_under_masks_are_left_out_and_masks_are_undistorted(photos, tmp
 def test_masks_that_are_asked_for_and_not_there(photos, tmp_path):
     with pytest.raises(InputError, match="there are no masks, expected masks/"):
         sfm.reconstruct(photos, tmp_path / "out", masks=MaskUse("ignore"))
+
+
+def test_photos_with_masks_are_trained_by_their_folder(photos, tmp_path, monkeypatch):
+    """images/ and masks/ in one folder without cameras: the masks reach sfm, are inverted once, and count after it."""
+    folder = tmp_path / "capture"
+    shutil.copytree(photos, folder / "images")
+    (folder / "masks").mkdir()
+    mask = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    mask[: HEIGHT // 4] = 255
+    for path in (folder / "images").iterdir():
+        write_png(folder / "masks" / f"{path.stem}.png", mask)
+    scene = load_scene(folder, masks=MaskUse("transparent", invert=True))
+    model = pycolmap.Reconstruction(tmp_path / "capture_colmap" / "sparse" / "0")
+    seen = [point.xy[1] for image in model.images.values() for point in image.points2D if point.has_point3D()]
+    assert min(seen) > HEIGHT // 4 - 6
+    alpha = scene.views[0].load()[:, :, 3]
+    assert not alpha[: HEIGHT // 4 - 6].any()
+    assert alpha[HEIGHT // 4 + 6 :].all()
+    monkeypatch.setattr(sfm, "_run_worker", lambda *_: pytest.fail("reconstructed again"))
+    ignored = load_scene(folder, masks=MaskUse("ignore", invert=True)).views[0].load_masked()
+    assert not ignored[: HEIGHT // 4 - 6, :, 4].any(), "the same features, so the same reconstruction"
+
+
+def test_alpha_that_undistortion_loses_is_kept_as_masks(pictures, tmp_path):
+    folder = tmp_path / "photos"
+    for index, picture in enumerate(pictures[0]):
+        alpha = np.full((*picture.shape[:2], 1), 255, np.uint8)
+        alpha[: HEIGHT // 4] = 0
+        write_png(folder / f"{index:02d}.png", np.concatenate([picture, alpha], axis=2))
+    messages = warnings_of(lambda: load_scene(folder, masks=MaskUse(alpha="ignore")))
+    assert not any("lost their alpha" in text for text in messages)
+    view = load_scene(folder, masks=MaskUse(alpha="ignore")).views[0]
+    counts = view.load_masked()[:, :, 4]
+    assert not counts[: HEIGHT // 4 - 6].any()
+    assert counts[HEIGHT // 4 + 6 :].all()
+
+
+def test_two_meanings_of_photos_without_cameras(photos):
+    with pytest.raises(InputError, match="--masks ignore and --alpha transparent: expected one meaning of both"):
+        load_scene(photos, masks=MaskUse("ignore", "transparent"))

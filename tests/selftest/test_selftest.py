@@ -32,6 +32,7 @@ from clsplat.selftest.result import (
     CHANNELS,
     DEEP,
     FORWARD,
+    MASKS,
     RAYS,
     STAGES,
     TRAINING,
@@ -52,6 +53,8 @@ BROKEN = {
     "ranges: = i + 1;": ("= i;", "ranges"),
     "blend: before * alpha": ("before + alpha", "blend"),
     "blend: fmaL(-before, alpha, before)": ("fmaL(-before, before, before)", "blend"),
+    "target: pixel[4] > 0": ("pixel[4] >= 0", "masks"),
+    "alpha_loss: -scale : (": ("scale : (", "masks"),
     "loss: 2.0f * (mu1 * mu2) + C1": ("2.0f * (mu1 * mu2) - C1", "loss"),
     "blend_grad: fmaL(weight, shade, p->behind)": ("fmaL(weight, shade, -p->behind)", "blend_grad"),
     "project_grad: sums[field] += slot[field]": ("sums[field] -= slot[field]", "project_grad"),
@@ -80,7 +83,7 @@ BROKEN = {
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
     monkeypatch.setenv(BREAK, change)
-    group = next(stages for stages in (FORWARD, CHANNELS, DEEP, RAYS, BACKWARD, APPEARANCE) if last in stages)
+    group = next(stages for stages in (FORWARD, CHANNELS, DEEP, RAYS, MASKS, BACKWARD, APPEARANCE) if last in stages)
     before = () if group is FORWARD else FORWARD
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
 

@@ -166,6 +166,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
     pipe.services = replace(
         pipe.services,
         load_scene=load_scene,
+        findings=lambda *_: [],
         open_device=open_device,
         require=lambda device, *_: device,
         train=train,

@@ -13,7 +13,7 @@ from compare import assert_same_bits
 from golden_frames import checksums
 from pipeline import shaped
 from quick import quick
-from tiny import short, write_scene
+from tiny import HEIGHT, WIDTH, short, write_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
@@ -21,6 +21,7 @@ from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
 from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS
+from clsplat.images.writing import write_image
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.training import step as step_module
@@ -45,6 +46,18 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 def many_points(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """The same pictures, and random points to start from."""
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene", points=False))
+
+
+@pytest.fixture(scope="module")
+def masked(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """Pictures with alpha, and masks that leave out whole tiles and parts of others."""
+    folder = write_scene(tmp_path_factory.mktemp("tiny") / "scene", alpha=True)
+    mask = np.ones((HEIGHT, WIDTH, 3), np.float32)
+    mask[: HEIGHT // 2 + 3, : WIDTH // 2 + 5] = 0
+    (folder / "masks").mkdir()
+    for path in sorted((folder / "images").iterdir()):
+        write_image(folder / "masks" / path.name, mask)
+    return load_scene(folder, masks=MASKED.mask_use)
 
 
 # Memory that nobody has written
@@ -92,6 +105,8 @@ EXPLORING = short(
 """Moves, growth, penalties and noise."""
 
 EXPOSED = short(iterations=16, warmup=(2, 4), appearance="exposure")
+MASKED = short(iterations=24, warmup=(2, 4), masks="ignore", alpha="transparent")
+"""Masks at every size of the warm-up, and the alpha loss."""
 
 MANY = short(
     iterations=32,
@@ -103,14 +118,28 @@ MANY = short(
 
 @pytest.mark.parametrize("word", quick(["NaN", "garbage"], "NaN"))
 @pytest.mark.parametrize(
-    "how", quick(["at once", "mcmc", "exposure", "in pieces", "in vectors of 1"], "at once", "mcmc", "exposure")
+    "how",
+    quick(
+        ["at once", "mcmc", "exposure", "masked", "in pieces", "in vectors of 1"],
+        "at once",
+        "mcmc",
+        "exposure",
+        "masked",
+    ),
 )
 def test_training_in_poisoned_memory(
-    scene: Scene, many_points: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, word: str, how: str
+    scene: Scene,
+    many_points: Scene,
+    masked: Scene,
+    default_device: Device,
+    monkeypatch: pytest.MonkeyPatch,
+    word: str,
+    how: str,
 ) -> None:
     device = shaped(default_device, 1, 64) if how == "in vectors of 1" else default_device
     pieces = how == "in pieces"
-    config = {"in pieces": MANY, "mcmc": EXPLORING, "exposure": EXPOSED}.get(how, EVERYTHING)
+    config = {"in pieces": MANY, "mcmc": EXPLORING, "exposure": EXPOSED, "masked": MASKED}.get(how, EVERYTHING)
+    scene = masked if how == "masked" else scene
     found = []
     for value in ("", WORDS[word]):
         monkeypatch.setenv("CLSPLAT_POISON", value)

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of training that answer findings about a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from clsplat.config.training import TrainConfig
+from clsplat.errors import InputError
+from clsplat.scenes.findings import Finding, Kind
+
+ANSWERS: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
+    "exposure": ({"appearance": "exposure"},),
+    "scales": ({"antialiased": True},),
+    "masks": ({"masks": "ignore"},),
+    "cut out": ({"masks": "transparent"}, {"masks": "ignore"}),
+    "alpha": ({"alpha": "transparent"}, {"alpha": "ignore"}),
+    "fisheye": ({"lenses": "native"},),
+}
+"""Settings by the finding that they answer, the best first: the first that goes with the other settings is taken."""
+ADVICE: Mapping[Kind, str] = {
+    "sky": "points far away will stand for it",
+    "few views": "more photographs help, and views near them look best",
+    "blur": "leave them out where others show the same",
+    "duplicates": "remove the copies",
+}
+"""Advice on findings that no setting answers."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A finding and the settings that answer it; none where nothing does, or nothing that goes with the others. given:
+    whether such a setting is given already."""
+
+    finding: Finding
+    settings: Mapping[str, Any]
+    given: bool = False
+
+    @property
+    def words(self) -> str:
+        """The finding with its answer, such as "exposures differ by 0.40 stops (--appearance exposure)"."""
+        kind = self.finding.kind
+        answer = flags(self.settings) or ADVICE.get(kind, "")
+        if kind in ANSWERS and not self.settings:
+            wanted = flags(ANSWERS[kind][0])
+            answer = (
+                f"{wanted.split(' ')[0]} is given" if self.given else f"{wanted} does not go with the other settings"
+            )
+        return f"{self.finding.text} ({answer})" if answer else self.finding.text
+
+
+def flags(settings: Mapping[str, Any]) -> str:
+    """Settings as they are written on the command line."""
+    words = []
+    for name, value in settings.items():
+        words.append(f"--{name.replace('_', '-')}" + ("" if value is True else f" {value}"))
+    return " ".join(words)
+
+
+def answered(
+    found: Sequence[Finding], config: TrainConfig, given: Collection[str] = ()
+) -> tuple[list[Answer], TrainConfig]:
+    """The answers to findings, and the settings with all of them. given: names of settings that stay as they are."""
+    answers = []
+    for finding in found:
+        options = ANSWERS.get(finding.kind, ())
+        own = any(name in given for option in options for name in option)
+        taken: Mapping[str, Any] = {}
+        for option in () if own else options:
+            trial = replace(config, **option)
+            try:
+                trial.check()
+            except InputError:
+                continue
+            if trial.antialiased and trial.lenses == "native":
+                continue
+            taken, config = option, trial
+            break
+        answers.append(Answer(finding, taken, own))
+    return answers, config
+
+
+def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool) -> str:
+    """The findings with their answers, for people. looked: number of photographs; auto: whether they are taken."""
+    if not answers:
+        return f"looked at {looked:,} photographs: nothing found that a setting would answer"
+    text = "; ".join(answer.words for answer in answers)
+    settings = " ".join(filter(None, (flags(answer.settings) for answer in answers)))
+    end = ""
+    if settings:
+        end = f". --auto takes {settings}" if auto else ". --auto takes what is in brackets"
+    return f"looked at {looked:,} photographs: {text}{end}"

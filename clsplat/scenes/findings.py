@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Findings about a scene before it is trained: what in its photographs a setting answers, or nothing but other
+photographs. They come from glances at the photographs, the cameras and the points, without a device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.config.masks import NO_MASKS, MaskUse
+from clsplat.errors import InputError, examples
+from clsplat.scenes.data_set import PANORAMA, RADIAL
+from clsplat.scenes.glance import GREY
+from clsplat.scenes.initialise import pixels_of
+from clsplat.scenes.masks import masks_beside, read_mask
+from clsplat.scenes.scene import Scene, View
+
+Kind = Literal["exposure", "scales", "masks", "cut out", "alpha", "fisheye", "sky", "few views", "blur", "duplicates"]
+
+MAX_POINTS = 4000
+"""Points of the scene that are looked at: more move a median of brightness by less than a hundredth."""
+BEHIND = 1.15
+"""Depth, in that of the nearest point around, from which on a point is taken to be hidden."""
+CELL = 8
+"""Pixels of a glance that a point is alone in front of."""
+LEAST_POINTS = 40
+"""Points in a photograph without which nothing is said of its brightness or scale."""
+DARK, BRIGHT = 0.06, 0.94
+"""Colours outside are clipped or noise, and say nothing of exposure."""
+EXPOSURE = 0.2
+"""Standard deviation over the photographs, in stops, of a channel's brightness. Cameras that hold their exposure are
+under 0.1 by this measure, as points are hidden and shine; gains that are learnt begin to pay at about 0.2."""
+SCALES = 4.0
+"""Distances over focal lengths, the ninth tenth over the first. From 4 on a Gaussian that is a pixel in one photograph
+is a quarter of one, or four, in another."""
+CUT_OUT = 0.9
+"""Part of the photographs' border that masks leave out where they cut a thing out of its surroundings."""
+MOST_MASKS = 12
+"""Masks that are read to tell that."""
+TRANSPARENT = 0.02
+"""Part of a photograph's pixels that is transparent where alpha means something; a seam or a corner is less."""
+WIDE = 100.0
+"""Degrees across a fisheye's picture from which on undistortion loses much: pinhole pictures grow with the tangent."""
+FEW = 16
+"""Training photographs under which each part of a scene is seen from too few sides to fix its depth; published
+trainings of 12 are 8 dB under those of 100, of 24 about 3."""
+BLURRED = 0.72
+"""Sharpness, in the scene's median, under which a photograph is called blurred; a blur of a pixel and a half is there.
+What is photographed moves it by a tenth or two."""
+ODD = 3.5
+"""Standard deviations under the median (by quartiles) that it has to be beside that."""
+COPY = 1.5 / 255
+"""Root mean square difference of two glances up to which they are one picture; JPEG's rounding is a half of it."""
+FLAT = 8 / 255
+"""Standard deviation under which a glance shows nothing, and is no copy of another such."""
+SKY_PART, SKY_VIEWS = 0.06, 0.3
+"""Part of a photograph that its sky is at least, and of the photographs that have one."""
+SKY_POINTS = 0.1
+"""Points in the sky for each in as large a part of the rest, at most."""
+SKY_SMOOTH, SKY_LIGHT = 0.025, 0.45
+"""Largest difference of neighbouring pixels of a glance in a sky, and least brightness."""
+SKY_BLUE = 0.02
+"""Blue less red that a sky has at least; a wall under lamps has less than 0, and a white sky is BRIGHT."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A part of a sentence about the photographs, and its kind."""
+
+    kind: Kind
+    text: str
+
+
+def findings(scene: Scene, use: MaskUse = NO_MASKS) -> list[Finding]:
+    """All findings about a scene, read with these masks. Raises InputError as `Scene.check_pictures`."""
+    looked = _Looked(scene)
+    found = (
+        _few(scene),
+        _exposure(looked),
+        _scales(looked),
+        _masks(scene, use),
+        _alpha(scene, use),
+        _fisheye(scene),
+        _sky(looked),
+        _blur(scene),
+        _duplicates(scene),
+    )
+    return [each for each in found if each is not None]
+
+
+class _Looked:
+    """The training photographs' glances, with the places of the scene's points in them."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        step = max(-(-len(scene.points) // MAX_POINTS), 1)
+        self.points = scene.points[::step]
+        self.colors = scene.point_colors[::step].astype(np.float64)
+
+    @cached_property
+    def places(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float64]]:
+        """By view: points that lie in it and are not hidden, their rows and columns in the glance, and their depths."""
+        flat = [view for view in self.scene.train_views if view.lens.model not in (PANORAMA, *RADIAL)]
+        return {view.name: self._place(view) for view in flat}
+
+    @cached_property
+    def up(self) -> Float64:
+        """Upwards in the world, as the cameras were held on average, (3,)."""
+        mean: Float64 = -np.mean([view.camera.rotation[1] for view in self.scene.train_views], axis=0)
+        return mean / max(float(np.linalg.norm(mean)), 1e-9)
+
+    def _place(self, view: View) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float64]:
+        height, width = self.scene.glances[view.name].pixels.shape[:2]
+        camera = view.camera.resized(width, height)
+        rows, columns, inside = pixels_of(self.points, camera, view.lens)
+        where = np.flatnonzero(inside)
+        depths = (self.points[where] - camera.position) @ camera.rotation[2]
+        across = -(-width // CELL)
+        cells = rows // CELL * across + columns // CELL
+        nearest = np.full(across * -(-height // CELL), np.inf)
+        np.minimum.at(nearest, cells, depths)
+        seen = depths <= BEHIND * nearest[cells]
+        return where[seen], rows[seen], columns[seen], depths[seen]
+
+    @cached_property
+    def gains(self) -> dict[str, Float64]:
+        """log2 of the brightness (3,) of each view by that of the points' colours, less the views' medians."""
+        found = {}
+        for name, (which, rows, columns, _) in self.places.items():
+            seen, known = self.scene.glances[name].pixels[rows, columns], self.colors[which]
+            both = np.concatenate([seen, known], axis=1)
+            good = ((both > DARK) & (both < BRIGHT)).all(axis=1)
+            if good.sum() >= LEAST_POINTS:
+                found[name] = np.median(np.log2(seen[good] / known[good]), axis=0)
+        middle = np.median(list(found.values()), axis=0) if found else 0.0
+        return {name: gain - middle for name, gain in found.items()}
+
+
+def _exposure(looked: _Looked) -> Finding | None:
+    gains = looked.gains
+    if len(gains) < 3:
+        return None
+    values = np.array(list(gains.values()))
+    spread = float(values.std(axis=0).max())
+    if spread < EXPOSURE:
+        return None
+    grey = values @ GREY.astype(np.float64)
+    low, high = (list(gains)[index] for index in (grey.argmin(), grey.argmax()))
+    return Finding(
+        "exposure",
+        f"exposures or colours differ by {spread:.2f} stops from photograph to photograph, {np.ptp(grey):.1f} from "
+        f"{low} to {high}",
+    )
+
+
+def _scales(looked: _Looked) -> Finding | None:
+    distances = []
+    for view in looked.scene.train_views:
+        _, _, _, depths = looked.places.get(view.name, (0, 0, 0, np.empty(0)))
+        if len(depths) >= LEAST_POINTS:
+            distances.append(float(np.median(depths)) / view.camera.fx * view.camera.width)
+    if len(distances) < 3:
+        return None
+    near, far = np.quantile(distances, (0.1, 0.9))
+    if far < SCALES * near:
+        return None
+    return Finding("scales", f"photographs are from near and from far, {far / near:.0f} times as far")
+
+
+def _masks(scene: Scene, use: MaskUse) -> Finding | None:
+    if use.masks != "none":
+        return None
+    try:
+        found = masks_beside(scene.views)
+        some = sorted(found)[:: max(len(found) // MOST_MASKS, 1)]
+        masks = [read_mask(found[name], orient=False, invert=False)[:, :, 0] for name in some]
+    except InputError:  # of something else, by another tool
+        return None
+    if not masks:
+        return None
+    kept = [(mask.mean(), np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()) for mask in masks]
+    inside, border = np.mean(kept, axis=0)
+    text = f"there are masks for {len(found):,} of {len(scene.views):,} photographs, and they are not used"
+    if border <= 1 - CUT_OUT and inside < 0.5:
+        return Finding("cut out", f"{text}; they cut out a thing that is {100 * inside:.0f} % of the pictures")
+    return Finding("masks", f"{text}; they leave out {100 - 100 * inside:.0f} % of the pictures")
+
+
+def _alpha(scene: Scene, use: MaskUse) -> Finding | None:
+    if use.alpha != "blend":
+        return None
+    shares = np.array([scene.glances[view.name].transparent for view in scene.train_views])
+    if (shares >= TRANSPARENT).mean() < 0.5:
+        return None
+    part = f"{100 * shares.mean():.0f} %"
+    return Finding("alpha", f"{part} of the photographs is transparent, and lies over the background")
+
+
+def _fisheye(scene: Scene) -> Finding | None:
+    wide = [
+        (2 * np.degrees(view.lens.width / 2 / view.lens.params[0]), view)
+        for view in scene.train_views
+        if view.lens.model in RADIAL and view.camera.projection == "perspective"
+    ]
+    if not wide or (most := max(angle for angle, _ in wide)) < WIDE:
+        return None
+    return Finding(
+        "fisheye", f"{len(wide):,} photographs are through fisheyes of {most:.0f} degrees across, and undistorted"
+    )
+
+
+def _few(scene: Scene) -> Finding | None:
+    count = len(scene.train_views)
+    if count >= FEW:
+        return None
+    return Finding("few views", f"{count} photographs to train on are few, so that views from elsewhere will show fog")
+
+
+def _sky(looked: _Looked) -> Finding | None:
+    scene = looked.scene
+    parts = [_sky_part(looked, view) for view in scene.train_views if view.name in looked.places]
+    with_sky = [part for part in parts if part >= SKY_PART]
+    if len(with_sky) < max(3, SKY_VIEWS * len(parts)) or not len(scene.points):
+        return None
+    return Finding(
+        "sky", f"{len(with_sky):,} photographs have a sky, {100 * np.mean(with_sky):.0f} % of each, without points"
+    )
+
+
+def _sky_part(looked: _Looked, view: View) -> float:
+    """Part of a view that is sky: light, smooth, blue or white, joined to the upper border, above the horizon, and
+    without points."""
+    pixels = looked.scene.glances[view.name].pixels
+    up = looked.up @ view.camera.rotation.T
+    turns = int(np.round(np.arctan2(up[0], -up[1]) / (np.pi / 2))) % 4  # quarter turns that make the picture upright
+    upright = np.rot90(pixels, turns)
+    light = upright @ GREY
+    steps = np.zeros(light.shape)
+    steps[1:] = np.abs(np.diff(light, axis=0))
+    steps[:, 1:] = np.maximum(steps[:, 1:], np.abs(np.diff(light, axis=1)))
+    blue = upright[:, :, 2] - upright[:, :, 0]
+    likely = (light > SKY_LIGHT) & (steps < SKY_SMOOTH) & ((blue > SKY_BLUE) | (light > BRIGHT))
+    reached = np.logical_and.accumulate(likely, axis=0)  # from the border down
+    part = float(reached.mean())
+    if part < SKY_PART or not likely[0].mean() > 0.5:
+        return 0.0
+    _, rows, columns, _ = looked.places[view.name]
+    held = np.rot90(reached, -turns)[rows, columns].mean() if len(rows) else 1.0
+    if held > SKY_POINTS * part or _elevation(view, np.rot90(reached, -turns), looked.up) < 0:
+        return 0.0
+    return part
+
+
+def _elevation(view: View, part: NDArray[np.bool_], up: Float64) -> float:
+    """Sine of the mean elevation of a view's pixels (h, w) that are in a part of it."""
+    rows, columns = np.nonzero(part)
+    camera = view.camera.resized(part.shape[1], part.shape[0])
+    x, y = (columns.mean() + 0.5 - camera.cx) / camera.fx, (rows.mean() + 0.5 - camera.cy) / camera.fy
+    ray = np.array([x, y, 1.0]) @ camera.rotation
+    return float(ray @ up / np.linalg.norm(ray))
+
+
+def _blur(scene: Scene) -> Finding | None:
+    names = [view.name for view in scene.train_views]
+    logs = np.log([max(scene.glances[name].sharpness, 1e-6) for name in names])
+    if len(names) < 5:
+        return None
+    low, middle, high = np.quantile(logs, (0.25, 0.5, 0.75))
+    limit = min(middle + np.log(BLURRED), middle - ODD * (high - low) / 1.349)
+    blurred = [name for name, value in zip(names, logs, strict=True) if value < limit]
+    if not blurred:
+        return None
+    return Finding("blur", f"{len(blurred):,} photographs are blurred beside the others ({examples(blurred)})")
+
+
+def _duplicates(scene: Scene) -> Finding | None:
+    """Photographs whose glances are one."""
+    by_size: dict[tuple[int, ...], list[str]] = {}
+    for view in scene.views:
+        by_size.setdefault(scene.glances[view.name].pixels.shape, []).append(view.name)
+    copies = []
+    for names in by_size.values():
+        flat = np.array([scene.glances[name].pixels[::4, ::4].ravel() for name in names], np.float64)
+        squares = (flat * flat).sum(axis=1)
+        apart = (squares[:, None] + squares - 2 * flat @ flat.T) / flat.shape[1]
+        for one, other in np.argwhere(np.triu(apart <= 4 * COPY * COPY, 1)):
+            a, b = (scene.glances[names[index]].pixels for index in (one, other))
+            if a.std(axis=(0, 1)).max() > FLAT and float(np.square(a - b).mean()) <= COPY * COPY:
+                copies.append(f"{names[other]} is {names[one]}")
+    if not copies:
+        return None
+    return Finding("duplicates", f"{len(copies):,} photographs are there twice ({examples(copies)})")

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Findings about scenes that are made to have them, and none about a scene that has nothing."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calls import Capture
+from scipy import ndimage
+from tiny import HEIGHT, VIEWS, WIDTH, write_scene
+
+from clsplat.camera import Camera
+from clsplat.cli.main import main
+from clsplat.config.masks import MaskUse
+from clsplat.config.training import TrainConfig
+from clsplat.images.writing import write_image
+from clsplat.runs.run import Run
+from clsplat.scenes.answers import ADVICE, ANSWERS, answered, paragraph
+from clsplat.scenes.data_set import Lens
+from clsplat.scenes.findings import FEW, Finding, findings
+from clsplat.scenes.glance import Glance, glance_at, sharpness_of
+from clsplat.scenes.scene import Scene, View, load_scene
+
+ACROSS, DOWN = 96, 64
+
+
+def camera_at(angle: float, distance: float) -> Camera:
+    """A camera on a circle about the y axis, y down, that looks at the middle."""
+    forward = np.array([-np.sin(angle), 0.0, -np.cos(angle)])
+    rotation = np.stack([np.cross([0.0, 1.0, 0.0], forward), [0.0, 1.0, 0.0], forward])
+    focal, centre = 0.9 * ACROSS, (ACROSS / 2, DOWN / 2)
+    return Camera(ACROSS, DOWN, focal, focal, *centre, rotation, rotation @ forward * distance)
+
+
+def made(count: int = 24, distances: tuple[float, ...] = (4.0,)) -> Scene:
+    """Photographs of a ball of points of many colours, all round it, before a grey wall."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(6000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    colors = rng.uniform(0.2, 0.8, (6000, 3)).astype(np.float32)
+    lens = Lens("PINHOLE", ACROSS, DOWN, (0.9 * ACROSS, 0.9 * ACROSS, ACROSS / 2, DOWN / 2))
+    views, glances = [], {}
+    for index in range(count):
+        camera = camera_at(2 * np.pi * index / count, distances[index % len(distances)])
+        local = points @ camera.rotation.T + camera.translation
+        places = (local[:, :2] / local[:, 2:] * camera.fx + [camera.cx, camera.cy]).astype(int)
+        pixels = rng.uniform(0.45, 0.55, (DOWN, ACROSS, 3)).astype(np.float32)
+        for one in np.argsort(-local[:, 2]):
+            x, y = places[one]
+            pixels[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2] = colors[one]
+        view = View(f"{index:02d}.png", camera, Path(f"{index:02d}.png"), "train", lens)
+        views.append(view)
+        glances[view.name] = Glance(pixels, 0.0, 0.6 + 0.02 * (index % 5))
+    scene = Scene("made", views, points, colors, (-np.ones(3), np.ones(3)))
+    scene.__dict__["glances"] = glances
+    return scene
+
+
+def changed(scene: Scene, index: int, **changes: object) -> None:
+    name = scene.views[index].name
+    scene.glances[name] = replace(scene.glances[name], **changes)  # type: ignore[arg-type]
+
+
+def kinds(scene: Scene) -> list[str]:
+    return [finding.kind for finding in findings(scene)]
+
+
+def test_nothing_is_found_where_nothing_is() -> None:
+    scene = made()
+    start = time.perf_counter()
+    assert findings(scene) == []
+    assert time.perf_counter() - start < 2.0
+    answers, config = answered([], TrainConfig())
+    assert config == TrainConfig()
+    assert paragraph(answers, 24, auto=False) == "looked at 24 photographs: nothing found that a setting would answer"
+
+
+@pytest.mark.parametrize("range_of", [1.0, 0.02])
+def test_exposures_that_differ(range_of: float) -> None:
+    scene = made()
+    gains = 2 ** np.random.default_rng(1).uniform(-range_of, range_of, len(scene.views))
+    for index, gain in enumerate(gains):
+        pixels = scene.glances[scene.views[index].name].pixels * np.float32(gain)
+        changed(scene, index, pixels=np.clip(pixels, 0, 1))
+    found = findings(scene)
+    assert [finding.kind for finding in found] == (["exposure"] if range_of == 1 else [])
+    if found:
+        darkest, brightest = scene.views[gains.argmin()].name, scene.views[gains.argmax()].name
+        assert found[0].text.endswith(f"from {darkest} to {brightest}")
+        spread = float(found[0].text.split()[5])
+        assert abs(spread - np.log2(gains).std()) < 0.15
+
+
+def test_a_cast_of_one_channel_is_an_exposure() -> None:
+    scene = made()
+    for index in range(0, 24, 2):
+        pixels = scene.glances[scene.views[index].name].pixels.copy()
+        pixels[:, :, 2] *= 0.6
+        changed(scene, index, pixels=pixels)
+    assert kinds(scene) == ["exposure"]
+
+
+def test_near_and_far() -> None:
+    assert kinds(made(distances=(3.0, 24.0))) == ["scales"]
+    assert kinds(made(distances=(3.0, 5.0))) == []
+
+
+def test_few_views() -> None:
+    assert kinds(made(FEW - 1)) == ["few views"]
+    assert kinds(made(FEW)) == []
+
+
+def test_a_sky() -> None:
+    """Blue down to the horizon, where no point is, in some pictures that are stored on their side too."""
+    scene = made()
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    for index, view in enumerate(scene.views):
+        pixels = scene.glances[view.name].pixels.copy()
+        pixels[: DOWN // 7] = (0.5, 0.6, 0.85)
+        if index % 4 == 0:
+            camera = replace(
+                view.camera,
+                width=DOWN,
+                height=ACROSS,
+                cx=DOWN / 2,
+                cy=ACROSS / 2,
+                rotation=turn @ view.camera.rotation,
+                translation=turn @ view.camera.translation,
+            )
+            scene.views[index] = replace(view, camera=camera, lens=view.lens.resized(DOWN, ACROSS))
+            pixels = np.rot90(pixels, -1)
+        changed(scene, index, pixels=pixels)
+    (found,) = findings(scene)
+    assert found.kind == "sky"
+    assert found.text.startswith("24 photographs have a sky, 14 % of each")
+
+
+def test_a_white_table_below_is_no_sky() -> None:
+    scene = made()
+    for index, view in enumerate(scene.views):
+        pixels = scene.glances[view.name].pixels.copy()
+        pixels[-DOWN // 6 :] = (0.97, 0.97, 0.97)
+        changed(scene, index, pixels=pixels)
+    assert kinds(scene) == []
+
+
+def test_blur() -> None:
+    scene = made()
+    changed(scene, 7, sharpness=0.3)
+    (found,) = findings(scene)
+    assert found == Finding("blur", "1 photographs are blurred beside the others (07.png)")
+
+
+def test_sharpness_is_of_the_blur_alone() -> None:
+    rng = np.random.default_rng(2)
+    noise = ndimage.gaussian_filter(rng.random((400, 600)), 0.8).astype(np.float32)
+    sharp = sharpness_of(noise)
+    assert abs(sharpness_of(0.3 * noise + 0.2) / sharp - 1) < 1e-3
+    assert sharpness_of(ndimage.gaussian_filter(noise, 2.0)) < 0.72 * sharp
+    assert sharpness_of(np.zeros((40, 40), np.float32)) == 1.0
+
+
+def test_copies() -> None:
+    scene = made()
+    noise = np.random.default_rng(3).normal(0, 0.5 / 255, (DOWN, ACROSS, 3))
+    changed(scene, 9, pixels=(scene.glances["04.png"].pixels + noise).astype(np.float32))
+    (found,) = findings(scene)
+    assert found.text == "1 photographs are there twice (09.png is 04.png)"
+
+
+def test_alpha_and_fisheyes() -> None:
+    scene = made()
+    for index in range(24):
+        changed(scene, index, transparent=0.5)
+    assert kinds(scene) == ["alpha"]
+    assert [finding.kind for finding in findings(scene, MaskUse(alpha="ignore"))] == []
+    lens = Lens("OPENCV_FISHEYE", ACROSS, DOWN, (30.0, 30.0, ACROSS / 2, DOWN / 2, 0.0, 0.0, 0.0, 0.0))
+    scene = made()
+    scene.views[:] = [replace(view, lens=lens) for view in scene.views]
+    assert kinds(scene) == ["fisheye"]
+
+
+@pytest.mark.parametrize(("part", "kind"), [(0.3, "cut out"), (0.9, "masks")])
+def test_masks_that_are_not_used(tmp_path: Path, part: float, kind: str) -> None:
+    folder = write_scene(tmp_path / "scene")
+    (folder / "masks").mkdir()
+    mask = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    side = part**0.5 / 2
+    mask[round((0.5 - side) * HEIGHT) : round((0.5 + side) * HEIGHT)] = 1
+    mask[:, : round((0.5 - side) * WIDTH)] = mask[:, round((0.5 + side) * WIDTH) :] = 0
+    if kind == "masks":
+        mask[:] = 1
+        mask[: HEIGHT // 3] = 0
+    for index in range(VIEWS):
+        write_image(folder / "masks" / f"{index:02d}.png", mask)
+    assert kind in kinds(load_scene(folder))
+    use = MaskUse("ignore")
+    assert kind not in [finding.kind for finding in findings(load_scene(folder, masks=use), use)]
+
+
+def test_every_answer_is_a_setting_that_can_be() -> None:
+    for kind, options in ANSWERS.items():
+        for option in options:
+            config = replace(TrainConfig(), **option)
+            config.check()
+            assert config != TrainConfig(), kind
+    assert not ANSWERS.keys() & ADVICE.keys()
+
+
+def test_answers_that_do_not_go_together() -> None:
+    found = [Finding("exposure", "a"), Finding("cut out", "b"), Finding("blur", "c")]
+    answers, config = answered(found, TrainConfig())
+    assert (config.appearance, config.masks) == ("exposure", "ignore")
+    text = paragraph(answers, 3, auto=True)
+    assert text.startswith("looked at 3 photographs: a (--appearance exposure); b (--masks ignore); c (leave them out")
+    assert text.endswith(". --auto takes --appearance exposure --masks ignore")
+    answers, config = answered(found, TrainConfig(), given={"appearance"})
+    assert (config.appearance, config.masks) == ("none", "transparent")
+    assert "a (--appearance is given)" in paragraph(answers, 3, auto=False)
+    answers, config = answered(found[:1], TrainConfig(batch=2))
+    assert config == TrainConfig(batch=2)
+    assert "does not go with the other settings" in answers[0].words
+
+
+def test_auto_takes_what_answers(tmp_path: Path, capfd: Capture) -> None:
+    folder = write_scene(tmp_path / "scene", alpha=True)
+    short = ("--iterations", "1", "--sh-degree", "0", "--no-report")
+    assert main(["train", str(folder), "-o", str(tmp_path / "plain"), *short]) == 0
+    told = capfd.readouterr().err
+    assert "of the photographs is transparent" in told
+    assert "(--alpha transparent)" in told
+    assert Run.open(tmp_path / "plain").config.alpha == "blend"
+    assert main(["train", str(folder), "-o", str(tmp_path / "auto"), *short, "--auto"]) == 0
+    assert "--auto takes --alpha transparent" in capfd.readouterr().err
+    assert Run.open(tmp_path / "auto").config.alpha == "transparent"
+    assert main(["train", "-o", str(tmp_path / "auto"), "--resume", "--auto"]) == 2
+    assert "--auto and --resume exclude each other" in capfd.readouterr().err
+
+
+def test_a_glance_is_small_and_true() -> None:
+    image = np.zeros((640, 960, 4), np.float32)
+    image[:, 480:] = 1
+    glance = glance_at(image)
+    assert glance.pixels.shape == (64, 96, 3)
+    assert (glance.pixels[:, :48] == 0).all()
+    assert (glance.pixels[:, 48:] == 1).all()
+    assert glance.transparent == 0.5
