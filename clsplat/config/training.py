@@ -118,6 +118,13 @@ class DensityConfig:
     under min-opacity move to where others are opaque, max-gaussians is reached by a twentieth more each time, and noise
     moves what is nearly transparent (3DGS-MCMC). With mcmc there are no clones, splits and resets; max-screen-radius
     moves Gaussians, from the start."""
+    long_axis: bool = False
+    """Split what is densified along its longest axis, small or large, into two that lie on it (Improved-GS); there are
+    no clones then. Not with growth mcmc."""
+    edge_views: int = 0
+    """With growth budget: training views that are looked at before each densification. What is over gradient-threshold
+    is then drawn at random, each as likely as what it adds to the photographs' edges there (Improved-GS); 0: the
+    largest gradients go first, whatever the threshold."""
     spread: float = 1.0
     """With growth mcmc: distance of what moves or is added from the mean of the Gaussian that it comes from, in
     standard deviations, drawn at random; 0 puts it there, as published."""
@@ -144,7 +151,11 @@ class DensityConfig:
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
         rules: tuple[Rule, ...] = (
-            (("every", "start", "stop", "opacity_reset_every", "prune_every"), lambda value: value >= 0, "at least 0"),
+            (
+                ("every", "start", "stop", "opacity_reset_every", "prune_every", "edge_views"),
+                lambda value: value >= 0,
+                "at least 0",
+            ),
             (
                 ("gradient_threshold", "max_world_fraction"),
                 lambda value: 0 < value < inf,
@@ -175,6 +186,15 @@ class DensityConfig:
             raise InputError(
                 f"--density.growth {self.growth}: expected --density.max-gaussians too, the number of Gaussians to "
                 "grow to"
+            )
+        if self.edge_views and self.growth != "budget":
+            raise InputError(
+                f"--density.edge-views {self.edge_views}: chooses what a budget is spent on, expected --density.growth "
+                "budget too"
+            )
+        if self.long_axis and self.growth == "mcmc":
+            raise InputError(
+                "--density.long-axis: nothing is split with --density.growth mcmc, expected another growth"
             )
         if self.growth == "mcmc" and (self.prune_at or self.prune_every):
             found = "prune-at" if self.prune_at else "prune-every"

@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,6 +51,7 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.stages.loss import Loss
+from clsplat.training import edges
 from clsplat.training.appearance import Appearance
 from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
 from clsplat.training.density import HALVED, ModelState, RowPlan, Strategy
@@ -151,7 +153,7 @@ class Trainer:
                 turns=self.pending.turns,
                 antialiased=self.config.antialiased,
                 masks=self.config.mask_use != NO_MASKS,
-                further=self.appearance.pixel_bytes,
+                further=self.appearance.pixel_bytes + edges.pixel_bytes(self.config),
                 **models,
             )
 
@@ -268,7 +270,7 @@ class Trainer:
         bring = self.photographs.bring if self.batch is None else self.photographs.load
         image = bring(view, factor)
         self.background = self._background_colour()
-        camera, kept = self._camera(view, image.shape[1], image.shape[0]), self.photographs.kept(view, factor)
+        camera, kept = self.camera(view, image.shape[1], image.shape[0]), self.photographs.kept(view, factor)
         return Sample(view, image, camera, self.background, begins, kept)
 
     def _watched_in_batch(self, sample: Sample, step: GradientStep) -> StepProbe:
@@ -367,7 +369,8 @@ class Trainer:
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics = self.parameters, self.statistics.named()
         marker, step = Marker(self.device, self.rasterizer.work, model, self.statistics), step or self.step
-        return ModelState(model.count, step, self.scene.extent, model.arrays, statistics, self.rng, marker)
+        edge_sums, extent = partial(edges.edge_contributions, self), self.scene.extent
+        return ModelState(model.count, step, extent, model.arrays, statistics, self.rng, marker, edge_sums)
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out what density control, or a repair, has planned for the rows of everything."""
@@ -439,7 +442,7 @@ class Trainer:
         """A camera in the world as one for the model in training: see `Gaussians.local`."""
         return camera.from_origin(self.origin).before(self.near)
 
-    def _camera(self, view: int, width: int, height: int) -> Camera:
+    def camera(self, view: int, width: int, height: int) -> Camera:
         """A training view's camera at the size of its photograph, the same object while that stays."""
         camera = self._cameras.get(view)
         if camera is None or (camera.width, camera.height) != (width, height):

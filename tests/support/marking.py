@@ -42,10 +42,10 @@ class TwinMarker:
     def scores(self, rules: MarkRules) -> NDArray[np.float32]:
         return twin.scores(rules, self._known())
 
-    def rows(self, rules: MarkRules) -> TwinRows:
+    def rows(self, rules: MarkRules, scores: NDArray[np.float32] | None = None) -> TwinRows:
         logits = self.parameters["opacity_logits"]
         log_scales = self.parameters.get("log_scales", np.zeros((len(logits), 3), np.float32))
-        return TwinRows(*twin.rows(rules, self._known(), log_scales, logits))
+        return TwinRows(*twin.rows(rules, self._known(), log_scales, logits, scores))
 
 
 def on_host(plan: RowPlan, parameters: Mapping[str, NDArray[Any]]) -> RowPlan:

@@ -50,8 +50,9 @@ class Marker(Protocol):
     def scores(self, rules: MarkRules) -> Float32:
         """Mean gradients (n,) of what may be densified, less than 0 for the rest."""
 
-    def rows(self, rules: MarkRules) -> RowList:
-        """List of the rows as they become by the rules: those that stay, clones, first and second halves."""
+    def rows(self, rules: MarkRules, scores: Float32 | None = None) -> RowList:
+        """List of the rows as they become by the rules: those that stay, clones, first and second halves. scores (n,):
+        in place of those that `scores` has."""
 
 
 class HostCopy(Protocol):
@@ -64,7 +65,9 @@ class HostCopy(Protocol):
 @dataclass(frozen=True, eq=False)
 class ModelState:
     """The model of `count` Gaussians after `step` steps, as a strategy sees it. extent: the scene's, in world units;
-    parameters by group; statistics by the names that they have in a checkpoint; marker: compares them with rules."""
+    parameters by group; statistics by the names that they have in a checkpoint; marker: compares them with rules;
+    edges: of so many training views drawn at random, what each Gaussian (n,) adds to the photographs' edges, in
+    pixels."""
 
     count: int
     step: int
@@ -73,9 +76,10 @@ class ModelState:
     statistics: Mapping[str, HostCopy]
     rng: np.random.Generator
     marker: Marker
+    edges: Callable[[int], Float32] | None = None
 
 
-HALVED = ("means", "quaternions", "log_scales")
+HALVED = ("means", "quaternions", "log_scales", "opacity_logits")
 """Groups that halves are made by."""
 
 
