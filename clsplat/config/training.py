@@ -226,6 +226,10 @@ class TrainConfig:
     background: Background = "black"
     """Background behind the Gaussians and behind images with alpha; random: a new colour each step, and black in
     evaluations."""
+    thinning: float = 0.0
+    """For few photographs (DropGaussian): share of the Gaussians, drawn at random, that is left out of the last step, 0
+    to 0.9; it rises from 0 at the first. The others are more opaque in that step. 0.2 is as published; 0 leaves none
+    out."""
     antialiased: bool = False
     """Train for pictures of any size (Mip-Splatting): a narrower low-pass that leaves a Gaussian its light, and no
     Gaussian smaller than the photographs show. The model is drawn so too, and its file says it."""
@@ -281,6 +285,7 @@ class TrainConfig:
             (("sh_degree",), lambda value: 0 <= value <= 3, "0 to 3"),
             (("appearance_rate",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
+            (("thinning",), lambda value: 0 <= value <= 0.9, "0 to 0.9"),
             (("alpha_weight",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
             (
