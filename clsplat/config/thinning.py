@@ -27,7 +27,7 @@ class Thinning:
 
     @property
     def factor(self) -> float:
-        """What the opacities of the others are multiplied by."""
+        """Factor of the opacities of the others."""
         return 1 / (1 - self.rate)
 
 

@@ -20,13 +20,12 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
-from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer, Room
-from clsplat.runs.checkpoints import Checkpoint
+from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.scenes.initialise import from_scene
 from clsplat.stages.density import (
     Marker,
@@ -54,7 +53,7 @@ from clsplat.stages.loss import Loss
 from clsplat.training import edges
 from clsplat.training.appearance import Appearance
 from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
-from clsplat.training.density import HALVED, ModelState, RowPlan, Strategy
+from clsplat.training.density import ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
@@ -383,7 +382,7 @@ class Trainer:
             assert isinstance(listed, RowList)
             self._move(listed.rows, new_statistics=plan.new_statistics)
             if listed.halves and plan.halves is not None:
-                self._halve(listed, plan.halves)
+                self._halve(listed, plan.halves, plan.halved)
         self.mark = None
         if self.batch is not None:
             self.batch.changed()
@@ -404,10 +403,12 @@ class Trainer:
         self.settle()
         self._rearrange(self.strategy.at_end(self._state()))
 
-    def _halve(self, listed: RowList, halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]]) -> None:
-        """Make the last rows, copies yet of what is split, the halves of that."""
+    def _halve(
+        self, listed: RowList, halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]], halved: Sequence[str]
+    ) -> None:
+        """Make the last rows, copies yet of what is split, the halves of that, by its groups `halved`."""
         count, half = listed.count, listed.halves // 2
-        split = {group: self.parameters[group].get_rows(count - half, count) for group in HALVED}
+        split = {group: self.parameters[group].get_rows(count - half, count) for group in halved}
         for group, values in halves(split).items():
             self.parameters[group].set_rows(count - listed.halves, values)
 
@@ -508,15 +509,15 @@ class Trainer:
         del self.parameters, self.first, self.second, self.statistics
         self._make_plan(loaded[0].count)
         self._set_parameters(*(self._placed(model) for model in loaded))
-        statistics = _named(checkpoint, "statistics/")
+        statistics = checkpoint.named("statistics/")
         for name, array in self.statistics.named().items():
             if name in statistics and (statistics[name].shape, statistics[name].dtype) != (array.shape, array.dtype):
                 raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
         self.statistics.load(statistics)  # what the settings did not ask for before the checkpoint is not known
-        self.strategy.load(_named(checkpoint, "strategy/"))
+        self.strategy.load(checkpoint.named("strategy/"))
         try:
-            self.sampling.load(_named(checkpoint, "sampling/"), self.parameters.count)
-            self.appearance.load(_named(checkpoint, "appearance/"))
+            self.sampling.load(checkpoint.named("sampling/"), self.parameters.count)
+            self.appearance.load(checkpoint.named("appearance/"))
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
 
@@ -529,14 +530,3 @@ class Trainer:
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
         return model
-
-
-def _named(checkpoint: Checkpoint, prefix: str) -> dict[str, NDArray[Any]]:
-    """Arrays of a checkpoint whose names begin so, by the rest of their names."""
-    return {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)}
-
-
-def unusable(checkpoint: Checkpoint, why: str) -> InputError:
-    """The error of a checkpoint that is whole, and not one to go on with."""
-    advice = "is it of another run or version?"
-    return InputError(f"checkpoint of step {checkpoint.step}: {why}; {advice}")

@@ -79,8 +79,8 @@ class ModelState:
     edges: Callable[[int], Float32] | None = None
 
 
-HALVED = ("means", "quaternions", "log_scales", "opacity_logits")
-"""Groups that halves are made by."""
+HALVED = ("means", "quaternions", "log_scales")
+"""Groups that halves are made by, if no others are told."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class RowPlan:
     rows (m,) uint32: the row that each is a copy of, None if all stay; fresh (m,) bool: rows whose moments start at
     zero and whose contributions are not known; listed: in place of both, what the model's marker has listed; values: by
     parameter group, the indices of rows that change, counted as they are then, and what they become (k, ...); halves:
-    what becomes of the groups HALVED of a list's halves, by those of what is split; changes: by group, what becomes of
+    what becomes of a list's halves, by the groups `halved` of what is split; changes: by group, what becomes of
     all of it; restarted: groups whose moments start at zero in every row. new_statistics: all but contributions start
     from zero; forget_contributions: of no row they are known.
     """
@@ -100,6 +100,7 @@ class RowPlan:
     listed: RowList | None = None
     values: Mapping[str, tuple[NDArray[Any], Float32]] = field(default_factory=dict)
     halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]] | None = None
+    halved: tuple[str, ...] = HALVED
     changes: Mapping[str, Callable[[Float32], Float32]] = field(default_factory=dict)
     restarted: tuple[str, ...] = ()
     new_statistics: bool = False

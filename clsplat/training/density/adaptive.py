@@ -14,7 +14,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.config.marking import MarkRules, edge
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
-from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
+from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy
 
 LONG_OFFSET, LONG_SCALE, SHORT_SCALE, LONG_OPACITY = 1.35, 0.55, 0.893, 0.6
 """Of halves along the longest axis: the distance of their means from the middle, in standard deviations; what is left
@@ -109,8 +109,9 @@ def plan(config: DensityConfig, model: ModelState) -> RowPlan:
     if config.edge_views > 0:
         scores = edge_scores(model.marker.scores(rules), _edges(config, model), model.rng)
     listed = model.marker.rows(replace(rules, strongest=_strongest(config, model, rules, scores)), scores)
-    halves = long_halves if config.long_axis else partial(draw_halves, config, rng=model.rng)
-    return RowPlan(listed=listed, halves=halves, new_statistics=True)
+    if config.long_axis:
+        return RowPlan(listed=listed, halves=long_halves, halved=(*HALVED, "opacity_logits"), new_statistics=True)
+    return RowPlan(listed=listed, halves=partial(draw_halves, config, rng=model.rng), new_statistics=True)
 
 
 def plan_pruning(config: DensityConfig, model: ModelState) -> RowPlan:
@@ -187,14 +188,13 @@ def budget(config: DensityConfig, step: int, count: int) -> int:
 
 def draw_halves(config: DensityConfig, split: Mapping[str, Float32], *, rng: np.random.Generator) -> dict[str, Float32]:
     """New means and log scales of all first halves and then all second ones, by the groups HALVED of what is split."""
-    groups = ("means", "quaternions", "log_scales")
-    means, log_scales = split_halves(config, **{name: np.tile(split[name], (2, 1)) for name in groups}, rng=rng)
+    means, log_scales = split_halves(config, **{name: np.tile(split[name], (2, 1)) for name in HALVED}, rng=rng)
     return {"means": means, "log_scales": log_scales}
 
 
 def long_halves(split: Mapping[str, Float32]) -> dict[str, Float32]:
     """New means, log scales and opacities of first halves and then second ones, on both sides of the middle of the
-    longest axis: docs/gradients.md, (102). By the groups HALVED of what is split."""
+    longest axis: docs/gradients.md, (102). By the groups HALVED and opacity_logits of what is split."""
     log_scales = split["log_scales"].astype(np.float64)
     longest = log_scales.argmax(axis=1)
     offsets, rows = np.zeros_like(log_scales), np.arange(len(log_scales))
