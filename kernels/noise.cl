@@ -10,13 +10,7 @@
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
-
-// Mixes a word so that each bit of it sways half of the result's; no two words have one result.
-static inline uint mixed(uint x) {
-  x = (x ^ (x >> 16)) * 0x7feb352du;
-  x = (x ^ (x >> 15)) * 0x846ca68bu;
-  return x ^ (x >> 16);
-}
+#include "shared/random.h"
 
 #define HALVES 8              // uniform numbers of 16 bits in a sum
 #define WORDS (HALVES / 2)    // with two in each

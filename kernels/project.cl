@@ -6,7 +6,9 @@
 // Buffers: means (n, 3) in world units, quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n,
 //   3), sh_rest (n, coefficients - 1, 3) -> splats (n, SPLAT_SIZE) in pixels, depth in world units, written where
 //   visible; tile_counts (n): 0 where culled. With KEEP_CULLED shown (n): 1 where a splat is written, also of those
-//   that have no tile. Of a model that is held: with SH_DEGREES sh_degrees (n): the highest that is looked at.
+//   that have no tile. Of a model that is held: with SH_DEGREES sh_degrees (n): the highest that is looked at. With
+//   THINNED a Gaussian is left out whose word is under the threshold, and factor multiplies the other opacities;
+//   model_row: the first one's row in the model; key0, key1: the step's.
 // Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
 //   Kerbl et al. 2023, section 4.
 #include "shared/math.h"
@@ -16,6 +18,9 @@
 #include "shared/tile.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
+#ifdef THINNED
+#include "shared/random.h"
+#endif
 
 // True for a Gaussian that goes on though it reaches no tile (RasterizerConfig.frustum_cull, opacity_cull).
 #if defined(NO_FRUSTUM_CULL)
@@ -37,6 +42,10 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
                       ,
                       __global const uchar *sh_degrees
 #endif
+#ifdef THINNED
+                      ,
+                      const uint model_row, const uint key0, const uint key1, const uint threshold, const float factor
+#endif
 ) {
   ROWS_OF_ITEM(n)
   for (uint lane = 0; lane < lanes_used; ++lane) tile_counts[first_row + lane] = 0;
@@ -46,9 +55,15 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   Projection p;
   if (!project_gaussians(row, means, quaternions, log_scales, camera, &p)) return;
 #ifdef ANTIALIASED
-  const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0)) * compensation(p.det0, p.det);
+  floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0)) * compensation(p.det0, p.det);
 #else
-  const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
+  floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
+#endif
+#ifdef THINNED
+  Lanes left;
+  for (uint lane = 0; lane < LANES; ++lane)
+    left.lane[lane] = random_word((uint)first_row + lane + model_row, key0, key1) < threshold ? 0.0f : factor;
+  opacity *= left.all;
 #endif
   floatL dx = FROM_CAMERA(means, X, 0), dy = FROM_CAMERA(means, Y, 1), dz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(dx, dx, fmaL(dy, dy, dz * dz)));

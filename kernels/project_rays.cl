@@ -15,6 +15,9 @@
 #include "shared/angles.h"
 #include "shared/rays.h"
 #include "shared/tangent.h"
+#ifdef THINNED
+#include "shared/random.h"
+#endif
 
 // Slack of a box in pixels, over TILE_SLACK: what float32 angles lose of a picture 32768 wide.
 #define BOX_SLACK 0.1f
@@ -111,11 +114,19 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
                            ,
                            __global const uchar *sh_degrees
 #endif
+#ifdef THINNED
+                           ,
+                           const uint model_row, const uint key0, const uint key1, const uint threshold,
+                           const float factor
+#endif
 ) {
   const size_t i = get_global_id(0);
   if (i >= n) return;
   tile_counts[i] = 0;
   float opacity = sigmoidL(opacity_logits[i]);
+#ifdef THINNED
+  opacity *= random_word((uint)i + model_row, key0, key1) < threshold ? 0.0f : factor;
+#endif
   if (!(opacity > ALPHA_MIN)) return;
   RayProjection p;
   if (!project_ray(i, means, quaternions, log_scales, camera, &p)) return;

@@ -118,6 +118,13 @@ class DensityConfig:
     under min-opacity move to where others are opaque, max-gaussians is reached by a twentieth more each time, and noise
     moves what is nearly transparent (3DGS-MCMC). With mcmc there are no clones, splits and resets; max-screen-radius
     moves Gaussians, from the start."""
+    long_axis: bool = False
+    """Split what is densified along its longest axis, small or large, into two that lie on it (Improved-GS); there are
+    no clones then. Not with growth mcmc."""
+    edge_views: int = 0
+    """With growth budget: training views that are looked at before each densification. What is over gradient-threshold
+    is then drawn at random, each as likely as what it adds to the photographs' edges there (Improved-GS); 0: the
+    largest gradients go first, whatever the threshold."""
     spread: float = 1.0
     """With growth mcmc: distance of what moves or is added from the mean of the Gaussian that it comes from, in
     standard deviations, drawn at random; 0 puts it there, as published."""
@@ -144,7 +151,11 @@ class DensityConfig:
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
         rules: tuple[Rule, ...] = (
-            (("every", "start", "stop", "opacity_reset_every", "prune_every"), lambda value: value >= 0, "at least 0"),
+            (
+                ("every", "start", "stop", "opacity_reset_every", "prune_every", "edge_views"),
+                lambda value: value >= 0,
+                "at least 0",
+            ),
             (
                 ("gradient_threshold", "max_world_fraction"),
                 lambda value: 0 < value < inf,
@@ -176,6 +187,15 @@ class DensityConfig:
                 f"--density.growth {self.growth}: expected --density.max-gaussians too, the number of Gaussians to "
                 "grow to"
             )
+        if self.edge_views and self.growth != "budget":
+            raise InputError(
+                f"--density.edge-views {self.edge_views}: chooses what a budget is spent on, expected --density.growth "
+                "budget too"
+            )
+        if self.long_axis and self.growth == "mcmc":
+            raise InputError(
+                "--density.long-axis: nothing is split with --density.growth mcmc, expected another growth"
+            )
         if self.growth == "mcmc" and (self.prune_at or self.prune_every):
             found = "prune-at" if self.prune_at else "prune-every"
             raise InputError(
@@ -206,6 +226,10 @@ class TrainConfig:
     background: Background = "black"
     """Background behind the Gaussians and behind images with alpha; random: a new colour each step, and black in
     evaluations."""
+    thinning: float = 0.0
+    """For few photographs (DropGaussian): share of the Gaussians, drawn at random, that is left out of the last step, 0
+    to 0.9; it rises from 0 at the first. The others are more opaque in that step. 0.2 is as published; 0 leaves none
+    out."""
     antialiased: bool = False
     """Train for pictures of any size (Mip-Splatting): a narrower low-pass that leaves a Gaussian its light, and no
     Gaussian smaller than the photographs show. The model is drawn so too, and its file says it."""
@@ -262,6 +286,7 @@ class TrainConfig:
             (("sh_degree",), lambda value: 0 <= value <= 3, "0 to 3"),
             (("appearance_rate",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
+            (("thinning",), lambda value: 0 <= value <= 0.9, "0 to 0.9"),
             (("alpha_weight",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
             (

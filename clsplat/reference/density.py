@@ -31,10 +31,15 @@ def scores(rules: MarkRules, statistics: Mapping[str, Float32]) -> Float32:
 
 
 def rows(
-    rules: MarkRules, statistics: Mapping[str, Float32], log_scales: Float32, opacity_logits: Float32
+    rules: MarkRules,
+    statistics: Mapping[str, Float32],
+    log_scales: Float32,
+    opacity_logits: Float32,
+    given: Float32 | None = None,
 ) -> tuple[NDArray[np.uint32], int]:
-    """Row that each new one is a copy of, with FRESH: what stays, clones, first and second halves; number of halves."""
-    found, largest = scores(rules, statistics), log_scales.max(axis=1)
+    """Row that each new one is a copy of, with FRESH: what stays, clones, first and second halves; number of halves.
+    given (n,): in place of `scores`."""
+    found, largest = scores(rules, statistics) if given is None else given, log_scales.max(axis=1)
     value, row = rules.strongest
     wanted = (found > np.float32(value)) | ((found == np.float32(value)) & (np.arange(len(found)) <= row))
     wanted &= found >= 0

@@ -13,7 +13,8 @@ from clsplat.reference.project import rotation_matrices
 HALVES = 8
 
 
-def _mixed(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
+def mixed(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """A permutation of words of 32 bits (kernels/shared/random.h)."""
     words = (words ^ (words >> np.uint32(16))) * np.uint32(0x7FEB352D)
     words = (words ^ (words >> np.uint32(15))) * np.uint32(0x846CA68B)
     return words ^ (words >> np.uint32(16))
@@ -21,9 +22,9 @@ def _mixed(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 def normal_numbers(key: tuple[int, int], rows: NDArray[np.integer]) -> Float64:
     """Eq. (93): three numbers for each of the rows (n,), (n, 3)."""
-    of_row = _mixed(rows.astype(np.uint32) ^ np.uint32(key[0])) + np.uint32(key[1])
+    of_row = mixed(rows.astype(np.uint32) ^ np.uint32(key[0])) + np.uint32(key[1])
     counters = np.arange(3 * HALVES // 2, dtype=np.uint32) * np.uint32(0x9E3779B9)
-    words = _mixed(of_row[:, None] + counters)
+    words = mixed(of_row[:, None] + counters)
     halves = (words & np.uint32(0xFFFF)).astype(np.int64) + (words >> np.uint32(16)).astype(np.int64)
     sums = halves.reshape(len(rows), 3, HALVES // 2).sum(axis=2) - HALVES * 65535 // 2
     numbers: Float64 = sums / np.sqrt(HALVES * (65536.0**2 - 1) / 12)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from clsplat.camera import BENT_FISHEYE, PROJECTIONS, Camera
 from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.thinning import Thinning
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, pinned
 from clsplat.device.context import Device
 from clsplat.device.layout import CAMERA, PLAIN_SLOTS, READBACK, WIDEST_SLOTS, SlotFields
@@ -147,16 +148,18 @@ class Rasterizer:
         *,
         backward: bool = True,
         room: Room | None = None,
+        thinning: Thinning | None = None,
     ) -> Frame:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
         background: (3,) float32, on the host or the device; backward: True if the gradient will be asked for. Without
         it, what only that needs is left out. room: do not wait for the number of pairs, and have nothing of the pass
-        come to anything where there are more (docs/decisions/0025-launch-by-capacity.md).
+        come to anything where there are more (docs/decisions/0025-launch-by-capacity.md); thinning: of the model, for
+        this pass.
         """
         device, work = self.device_of(camera), self.work
         camera_array, background = self._send(camera, background)
-        projected = project(device, work, gaussians, camera, camera_array)
+        projected = project(device, work, gaussians, camera, camera_array, thinning)
         if room is None:
             counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
         else:

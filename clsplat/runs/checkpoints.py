@@ -15,7 +15,7 @@ from zipfile import ZIP_STORED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import examples
+from clsplat.errors import InputError, examples
 from clsplat.files import open_input, parse_json
 
 STATE_KEY = "state.json"
@@ -36,6 +36,16 @@ class Checkpoint:
     step: int
     arrays: Arrays
     state: dict[str, Any]
+
+    def named(self, prefix: str) -> Arrays:
+        """Arrays whose names begin so, by the rest of their names."""
+        return {name.removeprefix(prefix): array for name, array in self.arrays.items() if name.startswith(prefix)}
+
+
+def unusable(checkpoint: Checkpoint, why: str) -> InputError:
+    """The error of a checkpoint that is whole, and not one to go on with."""
+    advice = "is it of another run or version?"
+    return InputError(f"checkpoint of step {checkpoint.step}: {why}; {advice}")
 
 
 def digest_of(array: NDArray[Any]) -> str:

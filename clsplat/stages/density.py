@@ -160,9 +160,9 @@ class Marker:
         """Mean gradients (n,) of what may be densified, less than 0 for the rest."""
         return _scored(self.device, self, rules).scores.get()
 
-    def rows(self, rules: MarkRules) -> RowList:
-        """List of the rows as they become by the rules."""
-        return _listed(self.device, self, rules)
+    def rows(self, rules: MarkRules, scores: Float32 | None = None) -> RowList:
+        """List of the rows as they become by the rules; scores (n,): in place of those that `scores` has."""
+        return _listed(self.device, self, rules, scores)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,9 +191,11 @@ def _scored(device: Device, marker: Marker, rules: MarkRules) -> _Scratch:
 
 
 @stage("density")
-def _listed(device: Device, marker: Marker, rules: MarkRules) -> RowList:
+def _listed(device: Device, marker: Marker, rules: MarkRules, scores: Float32 | None) -> RowList:
     n, model, kernels = marker.parameters.count, marker.parameters, device.kernels("density")
     scratch, counts = _scored(device, marker, rules), allocate(device, (2,), np.uint32)
+    if scores is not None:
+        scratch.scores.set(scores)
     columns = model.only("log_scales", "opacity_logits")
     edges = (rules.large, rules.transparent, rules.oversized, rules.oversized_half, rules.radius)
     for start, stop, (part,) in parts(marker.work, columns):

@@ -11,6 +11,7 @@ import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.config.exploring import Exploration
+from clsplat.config.thinning import Thinning
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
@@ -52,9 +53,15 @@ class Projected:
 
 @stage("project")
 def project(
-    device: Device, work: Workspace, gaussians: AnyGaussians, camera: Camera, camera_array: DeviceArray
+    device: Device,
+    work: Workspace,
+    gaussians: AnyGaussians,
+    camera: Camera,
+    camera_array: DeviceArray,
+    thinning: Thinning | None = None,
 ) -> Projected:
-    """Project all Gaussians (Kerbl et al. 2023, section 4) and count the tiles that each reaches."""
+    """Project all Gaussians (Kerbl et al. 2023, section 4) but those that thinning leaves out, and count the tiles that
+    each reaches."""
     n = gaussians.count
     splats = work.array("splats", (n, len(SPLAT)))
     tile_counts = work.array("tile_counts", (n,), np.uint32)
@@ -66,6 +73,11 @@ def project(
         defines: dict[str, object] = {"SH_DEGREES": True} if "sh_degrees" in part.arrays else {}
         if part["sh_rest"].dtype == np.float16:
             defines["SH_HALF"] = True
+        thinned: tuple[np.uint32 | float, ...] = ()
+        if thinning is not None:
+            defines["THINNED"] = True
+            words = (start, *thinning.key, thinning.threshold)
+            thinned = (*(np.uint32(word) for word in words), thinning.factor)
         if rays:
             kernel, lanes = device.kernels("project_rays", LANES=1, **defines).project_rays, 1
         else:
@@ -83,6 +95,7 @@ def project(
             out.tile_counts,
             *(() if out.shown is None else (out.shown,)),
             *([part["sh_degrees"]] if "sh_degrees" in part.arrays else []),
+            *thinned,
         )
     return projected
 

@@ -32,6 +32,7 @@ from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs import scene_record
 from clsplat.runs.appearance import held_out_gains
+from clsplat.runs.checkpoints import unusable
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
 from clsplat.scenes.initialise import is_colourless, photographed
@@ -41,7 +42,7 @@ from clsplat.training import telemetry
 from clsplat.training.batch import Losses
 from clsplat.training.health import RETURNS, WINDOW
 from clsplat.training.repro import write_bundle
-from clsplat.training.trainer import Trainer, unusable
+from clsplat.training.trainer import Trainer
 
 REPORT_EVERY = 10
 """Steps between readings of the loss, for which the host waits; the device goes on with the rest of the step."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config.exploring import Exploration
+from clsplat.config.thinning import thinning_of
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
@@ -135,7 +136,8 @@ class GradientStep:
         the photograph's mask, its fifth channel, leaves.
         """
         device, rasterizer, work = self.device, self.rasterizer, self.rasterizer.work
-        frame = rasterizer.forward(model[0], camera, background, room=self.room)
+        thinning = thinning_of(self.config, self.step)
+        frame = rasterizer.forward(model[0], camera, background, room=self.room, thinning=thinning)
         probe.forward(frame)
         alpha_weight = self.config.alpha_loss if photograph.shape[2] > 3 else 0.0
         planes = target(device, work, photograph, frame.background, frame.blended, alpha=alpha_weight > 0)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,13 +20,12 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
-from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.memory_needs import plan_step
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer, Room
-from clsplat.runs.checkpoints import Checkpoint
+from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.scenes.initialise import from_scene
 from clsplat.stages.density import (
     Marker,
@@ -50,9 +50,10 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.stages.loss import Loss
+from clsplat.training import edges
 from clsplat.training.appearance import Appearance
 from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
-from clsplat.training.density import HALVED, ModelState, RowPlan, Strategy
+from clsplat.training.density import ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
@@ -151,7 +152,7 @@ class Trainer:
                 turns=self.pending.turns,
                 antialiased=self.config.antialiased,
                 masks=self.config.mask_use != NO_MASKS,
-                further=self.appearance.pixel_bytes,
+                further=self.appearance.pixel_bytes + edges.pixel_bytes(self.config),
                 **models,
             )
 
@@ -268,7 +269,7 @@ class Trainer:
         bring = self.photographs.bring if self.batch is None else self.photographs.load
         image = bring(view, factor)
         self.background = self._background_colour()
-        camera, kept = self._camera(view, image.shape[1], image.shape[0]), self.photographs.kept(view, factor)
+        camera, kept = self.camera(view, image.shape[1], image.shape[0]), self.photographs.kept(view, factor)
         return Sample(view, image, camera, self.background, begins, kept)
 
     def _watched_in_batch(self, sample: Sample, step: GradientStep) -> StepProbe:
@@ -367,7 +368,8 @@ class Trainer:
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics = self.parameters, self.statistics.named()
         marker, step = Marker(self.device, self.rasterizer.work, model, self.statistics), step or self.step
-        return ModelState(model.count, step, self.scene.extent, model.arrays, statistics, self.rng, marker)
+        edge_sums, extent = partial(edges.edge_contributions, self), self.scene.extent
+        return ModelState(model.count, step, extent, model.arrays, statistics, self.rng, marker, edge_sums)
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out what density control, or a repair, has planned for the rows of everything."""
@@ -380,7 +382,7 @@ class Trainer:
             assert isinstance(listed, RowList)
             self._move(listed.rows, new_statistics=plan.new_statistics)
             if listed.halves and plan.halves is not None:
-                self._halve(listed, plan.halves)
+                self._halve(listed, plan.halves, plan.halved)
         self.mark = None
         if self.batch is not None:
             self.batch.changed()
@@ -401,10 +403,12 @@ class Trainer:
         self.settle()
         self._rearrange(self.strategy.at_end(self._state()))
 
-    def _halve(self, listed: RowList, halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]]) -> None:
-        """Make the last rows, copies yet of what is split, the halves of that."""
+    def _halve(
+        self, listed: RowList, halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]], halved: Sequence[str]
+    ) -> None:
+        """Make the last rows, copies yet of what is split, the halves of that, by its groups `halved`."""
         count, half = listed.count, listed.halves // 2
-        split = {group: self.parameters[group].get_rows(count - half, count) for group in HALVED}
+        split = {group: self.parameters[group].get_rows(count - half, count) for group in halved}
         for group, values in halves(split).items():
             self.parameters[group].set_rows(count - listed.halves, values)
 
@@ -439,7 +443,7 @@ class Trainer:
         """A camera in the world as one for the model in training: see `Gaussians.local`."""
         return camera.from_origin(self.origin).before(self.near)
 
-    def _camera(self, view: int, width: int, height: int) -> Camera:
+    def camera(self, view: int, width: int, height: int) -> Camera:
         """A training view's camera at the size of its photograph, the same object while that stays."""
         camera = self._cameras.get(view)
         if camera is None or (camera.width, camera.height) != (width, height):
@@ -505,15 +509,15 @@ class Trainer:
         del self.parameters, self.first, self.second, self.statistics
         self._make_plan(loaded[0].count)
         self._set_parameters(*(self._placed(model) for model in loaded))
-        statistics = _named(checkpoint, "statistics/")
+        statistics = checkpoint.named("statistics/")
         for name, array in self.statistics.named().items():
             if name in statistics and (statistics[name].shape, statistics[name].dtype) != (array.shape, array.dtype):
                 raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
         self.statistics.load(statistics)  # what the settings did not ask for before the checkpoint is not known
-        self.strategy.load(_named(checkpoint, "strategy/"))
+        self.strategy.load(checkpoint.named("strategy/"))
         try:
-            self.sampling.load(_named(checkpoint, "sampling/"), self.parameters.count)
-            self.appearance.load(_named(checkpoint, "appearance/"))
+            self.sampling.load(checkpoint.named("sampling/"), self.parameters.count)
+            self.appearance.load(checkpoint.named("appearance/"))
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
 
@@ -526,14 +530,3 @@ class Trainer:
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
         return model
-
-
-def _named(checkpoint: Checkpoint, prefix: str) -> dict[str, NDArray[Any]]:
-    """Arrays of a checkpoint whose names begin so, by the rest of their names."""
-    return {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)}
-
-
-def unusable(checkpoint: Checkpoint, why: str) -> InputError:
-    """The error of a checkpoint that is whole, and not one to go on with."""
-    advice = "is it of another run or version?"
-    return InputError(f"checkpoint of step {checkpoint.step}: {why}; {advice}")

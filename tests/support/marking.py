@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.config.marking import FRESH, MarkRules
 from clsplat.reference import density as twin
-from clsplat.training.density import HALVED, RowPlan
+from clsplat.training.density import RowPlan
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,10 @@ class TwinMarker:
     def scores(self, rules: MarkRules) -> NDArray[np.float32]:
         return twin.scores(rules, self._known())
 
-    def rows(self, rules: MarkRules) -> TwinRows:
+    def rows(self, rules: MarkRules, scores: NDArray[np.float32] | None = None) -> TwinRows:
         logits = self.parameters["opacity_logits"]
         log_scales = self.parameters.get("log_scales", np.zeros((len(logits), 3), np.float32))
-        return TwinRows(*twin.rows(rules, self._known(), log_scales, logits))
+        return TwinRows(*twin.rows(rules, self._known(), log_scales, logits, scores))
 
 
 def on_host(plan: RowPlan, parameters: Mapping[str, NDArray[Any]]) -> RowPlan:
@@ -57,6 +57,6 @@ def on_host(plan: RowPlan, parameters: Mapping[str, NDArray[Any]]) -> RowPlan:
     if listed.halves and plan.halves is not None:
         split = rows[len(rows) - listed.halves // 2 :]
         halves = np.arange(len(rows) - listed.halves, len(rows))
-        drawn = plan.halves({name: parameters[name][split] for name in HALVED})
+        drawn = plan.halves({name: parameters[name][split] for name in plan.halved})
         values |= {name: (halves, found) for name, found in drawn.items()}
     return replace(plan, rows=rows, fresh=entries >= FRESH, values=values, listed=None)

@@ -50,8 +50,9 @@ class Marker(Protocol):
     def scores(self, rules: MarkRules) -> Float32:
         """Mean gradients (n,) of what may be densified, less than 0 for the rest."""
 
-    def rows(self, rules: MarkRules) -> RowList:
-        """List of the rows as they become by the rules: those that stay, clones, first and second halves."""
+    def rows(self, rules: MarkRules, scores: Float32 | None = None) -> RowList:
+        """List of the rows as they become by the rules: those that stay, clones, first and second halves. scores (n,):
+        in place of those that `scores` has."""
 
 
 class HostCopy(Protocol):
@@ -64,7 +65,9 @@ class HostCopy(Protocol):
 @dataclass(frozen=True, eq=False)
 class ModelState:
     """The model of `count` Gaussians after `step` steps, as a strategy sees it. extent: the scene's, in world units;
-    parameters by group; statistics by the names that they have in a checkpoint; marker: compares them with rules."""
+    parameters by group; statistics by the names that they have in a checkpoint; marker: compares them with rules;
+    edges: of so many training views drawn at random, what each Gaussian (n,) adds to the photographs' edges, in
+    pixels."""
 
     count: int
     step: int
@@ -73,10 +76,11 @@ class ModelState:
     statistics: Mapping[str, HostCopy]
     rng: np.random.Generator
     marker: Marker
+    edges: Callable[[int], Float32] | None = None
 
 
 HALVED = ("means", "quaternions", "log_scales")
-"""Groups that halves are made by."""
+"""Groups that halves are made by, if no others are told."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +90,7 @@ class RowPlan:
     rows (m,) uint32: the row that each is a copy of, None if all stay; fresh (m,) bool: rows whose moments start at
     zero and whose contributions are not known; listed: in place of both, what the model's marker has listed; values: by
     parameter group, the indices of rows that change, counted as they are then, and what they become (k, ...); halves:
-    what becomes of the groups HALVED of a list's halves, by those of what is split; changes: by group, what becomes of
+    what becomes of a list's halves, by the groups `halved` of what is split; changes: by group, what becomes of
     all of it; restarted: groups whose moments start at zero in every row. new_statistics: all but contributions start
     from zero; forget_contributions: of no row they are known.
     """
@@ -96,6 +100,7 @@ class RowPlan:
     listed: RowList | None = None
     values: Mapping[str, tuple[NDArray[Any], Float32]] = field(default_factory=dict)
     halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]] | None = None
+    halved: tuple[str, ...] = HALVED
     changes: Mapping[str, Callable[[Float32], Float32]] = field(default_factory=dict)
     restarted: tuple[str, ...] = ()
     new_statistics: bool = False

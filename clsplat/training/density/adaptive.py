@@ -16,6 +16,10 @@ from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
 from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy
 
+LONG_OFFSET, LONG_SCALE, SHORT_SCALE, LONG_OPACITY = 1.35, 0.55, 0.893, 0.6
+"""Of halves along the longest axis: the distance of their means from the middle, in standard deviations; what is left
+of that axis, of the others, and of the opacity (Improved-GS, Deng et al. 2025)."""
+
 
 class Adaptive(Strategy):
     """The strategy of Kerbl et al., with what `DensityConfig` adds to it."""
@@ -84,10 +88,12 @@ def plan(config: DensityConfig, model: ModelState) -> RowPlan:
     and what hardly contributes. Kept ones come first and in order; fresh are clones and halves of splits."""
     # Each rule in the float widths of a comparison of arrays: of float32 with a Python number.
     too_large, dense = config.max_world_fraction * model.extent, config.dense_fraction * model.extent
+    all_wanted = config.growth == "budget" and config.edge_views == 0
+    shrinks = 1 / LONG_SCALE if config.long_axis else config.split_factor
     rules = replace(
         _pruning(config, model),
-        gradient=0.0 if config.growth == "budget" else edge(lambda mean: mean >= config.gradient_threshold),
-        large=edge(lambda log_scale: np.exp(log_scale) > dense),
+        gradient=0.0 if all_wanted else edge(lambda mean: mean >= config.gradient_threshold),
+        large=-inf if config.long_axis else edge(lambda log_scale: np.exp(log_scale) > dense),
     )
     if config.views_agree > 1 and "agreeing" in model.statistics:
         rules = replace(rules, agreeing=edge(lambda views: views >= config.views_agree))
@@ -95,11 +101,16 @@ def plan(config: DensityConfig, model: ModelState) -> RowPlan:
         rules = replace(
             rules,
             oversized=edge(lambda log_scale: np.exp(log_scale) > too_large),
-            oversized_half=edge(lambda log_scale: np.exp(log_scale) / config.split_factor > too_large),
+            oversized_half=edge(lambda log_scale: np.exp(log_scale) / shrinks > too_large),
         )
         if config.max_screen_radius > 0:
             rules = replace(rules, radius=edge(lambda radius: radius > config.max_screen_radius))
-    listed = model.marker.rows(replace(rules, strongest=_strongest(config, model, rules)))
+    scores = None
+    if config.edge_views > 0:
+        scores = edge_scores(model.marker.scores(rules), _edges(config, model), model.rng)
+    listed = model.marker.rows(replace(rules, strongest=_strongest(config, model, rules, scores)), scores)
+    if config.long_axis:
+        return RowPlan(listed=listed, halves=long_halves, halved=(*HALVED, "opacity_logits"), new_statistics=True)
     return RowPlan(listed=listed, halves=partial(draw_halves, config, rng=model.rng), new_statistics=True)
 
 
@@ -130,9 +141,23 @@ def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
     return rules
 
 
-def _strongest(config: DensityConfig, model: ModelState, rules: MarkRules) -> tuple[float, int]:
-    """Score and row of the weakest Gaussian that there is room to clone or split, for `MarkRules`. Scores are looked at
-    only where room may be short."""
+def _edges(config: DensityConfig, model: ModelState) -> Float32:
+    assert model.edges is not None, "a trainer has them"
+    return model.edges(config.edge_views)
+
+
+def edge_scores(scores: Float32, edges: Float32, rng: np.random.Generator) -> Float32:
+    """Scores whose largest k are those of k Gaussians drawn without replacement, each as likely as what it adds to
+    edges (Efraimidis and Spirakis 2006). (n,); what is less than 0 stays as it is."""
+    drawn = edges.astype(np.float64) / rng.standard_exponential(len(edges))
+    return np.where(scores < 0, scores, np.minimum(drawn, np.finfo(np.float32).max).astype(np.float32))
+
+
+def _strongest(
+    config: DensityConfig, model: ModelState, rules: MarkRules, scores: Float32 | None = None
+) -> tuple[float, int]:
+    """Score and row of the weakest Gaussian that there is room to clone or split, for `MarkRules`. The marker's scores
+    are looked at only where room may be short; scores: others in their place."""
     room = config.max_gaussians - model.count
     if config.growth == "budget":
         room = budget(config, model.step, model.count) - model.count
@@ -140,7 +165,8 @@ def _strongest(config: DensityConfig, model: ModelState, rules: MarkRules) -> tu
         return -inf, 0
     if room <= 0:
         return inf, 0
-    scores = model.marker.scores(rules)
+    if scores is None:
+        scores = model.marker.scores(rules)
     if np.count_nonzero(scores >= 0) <= room:
         return -inf, 0
     last = int(np.argsort(-scores, kind="stable")[room - 1])
@@ -166,6 +192,27 @@ def draw_halves(config: DensityConfig, split: Mapping[str, Float32], *, rng: np.
     return {"means": means, "log_scales": log_scales}
 
 
+def long_halves(split: Mapping[str, Float32]) -> dict[str, Float32]:
+    """New means, log scales and opacities of first halves and then second ones, on both sides of the middle of the
+    longest axis: docs/gradients.md, (102). By the groups HALVED and opacity_logits of what is split."""
+    log_scales = split["log_scales"].astype(np.float64)
+    longest = log_scales.argmax(axis=1)
+    offsets, rows = np.zeros_like(log_scales), np.arange(len(log_scales))
+    offsets[rows, longest] = LONG_OFFSET * np.exp(log_scales[rows, longest])
+    turned = rotated(split["quaternions"], offsets)
+    log_scales += np.log(SHORT_SCALE)
+    log_scales[rows, longest] += np.log(LONG_SCALE) - np.log(SHORT_SCALE)
+    # The logit of a part p of an opacity is ln p - ln(e^-o' + 1 - p).
+    part, logits = LONG_OPACITY, split["opacity_logits"].astype(np.float64)
+    opacities = np.log(part) - np.logaddexp(-logits, np.log(1 - part))
+    means = np.concatenate([split["means"] + turned, split["means"] - turned])
+    return {
+        "means": means.astype(np.float32),
+        "log_scales": np.tile(log_scales, (2, 1)).astype(np.float32),
+        "opacity_logits": np.tile(opacities, 2).astype(np.float32),
+    }
+
+
 def split_halves(
     config: DensityConfig, *, means: Float32, quaternions: Float32, log_scales: Float32, rng: np.random.Generator
 ) -> tuple[Float32, Float32]:
@@ -177,13 +224,17 @@ def split_halves(
 
 def draw_offsets(quaternions: Float32 | Float64, log_scales: Float32 | Float64, rng: np.random.Generator) -> Float64:
     """Places drawn from Gaussians (m,), from their means: (m, 3); quaternions (m, 4), log scales (m, 3)."""
-    offsets = rng.standard_normal(log_scales.shape) * np.exp(log_scales.astype(np.float64))
+    return rotated(quaternions, rng.standard_normal(log_scales.shape) * np.exp(log_scales.astype(np.float64)))
+
+
+def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
+    """Offsets (m, 3) along the axes of Gaussians, turned by their quaternions (m, 4)."""
     q = quaternions.astype(np.float64)
     q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # of length 0, which is not drawn: no rotation
     w, axis = q[:, :1], q[:, 1:]
     twice = 2 * np.cross(axis, offsets)
-    rotated: Float64 = offsets + w * twice + np.cross(axis, twice)
-    return rotated
+    turned: Float64 = offsets + w * twice + np.cross(axis, twice)
+    return turned
 
 
 def reset_opacities(config: DensityConfig, opacity_logits: Float32) -> Float32:

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Splits along the longest axis, and edges that choose them: the formulas, and that they repeat to the last byte."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_trainer import model_bytes
+from tiny import short, write_scene
+
+from clsplat.api import train
+from clsplat.config.training import DensityConfig
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.reference.render import render_grad
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.density.adaptive import edge_scores, long_halves
+from clsplat.training.edges import edge_contributions, edge_strength
+from clsplat.training.pending import VARIABLE
+from clsplat.training.trainer import Trainer
+
+CONFIG = short(
+    iterations=48,
+    density={"growth": "budget", "max_gaussians": 120, "long_axis": True, "edge_views": 2, "gradient_threshold": 1e-6},
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return model_bytes(scene, CONFIG, default_device, tmp_path_factory.mktemp("undisturbed"))
+
+
+def test_halves_lie_on_the_longest_axis() -> None:
+    quaternion, scales = np.array([2.0, 0.6, -0.9, 1.4]), np.array([0.1, 0.5, 0.02])
+    split = {
+        "means": np.array([[3.0, -2.0, 1.0]], np.float32),
+        "quaternions": quaternion[None].astype(np.float32),
+        "log_scales": np.log(scales)[None].astype(np.float32),
+        "opacity_logits": np.log(np.array([0.8 / 0.2], np.float32)),
+    }
+    halves = long_halves(split)
+    axis = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()[:, 1]
+    offsets = halves["means"] - split["means"]
+    np.testing.assert_allclose(offsets, 1.35 * 0.5 * np.stack([axis, -axis]), atol=1e-6)
+    np.testing.assert_allclose(np.exp(halves["log_scales"]), np.tile(scales * [0.893, 0.55, 0.893], (2, 1)), rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-halves["opacity_logits"])), 0.48, rtol=1e-6)
+    assert all(array.dtype == np.float32 for array in halves.values())
+
+
+@pytest.mark.parametrize("logit", [-100.0, 100.0])
+def test_extreme_opacities_stay_finite(logit: float) -> None:
+    split = {
+        name: np.zeros((1, size), np.float32) for name, size in (("means", 3), ("quaternions", 4), ("log_scales", 3))
+    }
+    halves = long_halves(split | {"opacity_logits": np.array([logit], np.float32)})
+    assert all(np.isfinite(array).all() for array in halves.values())
+    assert halves["opacity_logits"][0] == pytest.approx(np.log(0.6) + logit if logit < 0 else np.log(1.5), rel=1e-6)
+
+
+def test_draws_follow_the_edges_and_spare_the_unwanted() -> None:
+    edges, rng = np.array([1.0, 3.0, 0.0, 5.0], np.float32), np.random.default_rng(0)
+    scores = np.array([1e-4, 2e-4, 3e-4, -1.0], np.float32)
+    drawn = [edge_scores(scores, edges, rng) for _ in range(4000)]
+    assert all(one[3] == -1 and one[2] == 0 for one in drawn)
+    share = np.mean([one.argmax() == 1 for one in drawn])
+    assert share == pytest.approx(0.75, abs=4 * np.sqrt(0.75 * 0.25 / 4000))
+
+
+def test_edge_strength() -> None:
+    photograph = np.zeros((6, 8, 5), np.uint8)
+    photograph[:, 4:, :3] = 200
+    photograph[..., 4] = 255
+    photograph[0, :, 4] = 0
+    expected = np.zeros((6, 8))
+    expected[1:, 3:5] = 1
+    np.testing.assert_array_equal(edge_strength(photograph), expected)
+    assert not edge_strength(np.full((6, 8, 3), 7, np.uint8)).any()
+    assert edge_strength(np.zeros((1, 8, 3), np.uint8)).shape == (1, 8)
+
+
+def test_contributions_to_edges_are_those_of_the_twin(scene: Scene, default_device: Device) -> None:
+    """The gradient by colour of a picture that is weighed by the edges."""
+    trainer = Trainer(scene, CONFIG, default_device)
+    found = edge_contributions(trainer, 100)
+    model, expected = trainer.gaussians(), np.zeros(trainer.parameters.count)
+    for view in range(len(trainer.views)):
+        photograph = trainer.photographs.load(view, trainer.sizes.factor(1))
+        camera = trainer.camera(view, photograph.shape[1], photograph.shape[0])
+        weights = np.repeat(edge_strength(photograph)[:, :, None], 3, axis=2).astype(np.float64)
+        expected += render_grad(model, camera, weights).colors[:, 0]
+    assert np.linalg.norm(found - expected) <= 1e-4 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("step", [7, 15, 16, 20, 40])
+def test_stopping_and_going_on_gives_the_same_bytes(
+    step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
+) -> None:
+    model_bytes(scene, replace(CONFIG, iterations=step), default_device, tmp_path / "run")
+    run = Run.create(tmp_path / "run", CONFIG, resume=True)
+    train(scene, CONFIG, device=default_device, run=run, resume=True)
+    assert run.model_path.read_bytes() == undisturbed
+
+
+def test_by_capacity_the_same_bytes(
+    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, "1")
+    assert model_bytes(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
+
+
+def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
+    scene = load_scene(write_scene(tmp_path / "scene", points=False))
+    many = replace(CONFIG, random_points=400, density=replace(CONFIG.density, max_gaussians=2500))
+    free = default_device.with_memory_limit(None)
+    whole = model_bytes(scene, many, free, tmp_path / "free")
+    device = default_device.with_memory_limit(int(0.45 * free.memory.peak))
+    run, pieces = Run.create(tmp_path / "limited", many), []
+    train(scene, many, device=device, run=run, on_plan=lambda plan: pieces.append(plan.pieces))
+    assert run.model_path.read_bytes() == whole
+    assert any(streamed or bands > 1 for streamed, bands in pieces)
+
+
+def test_it_grows_by_splits_alone(scene: Scene, default_device: Device) -> None:
+    trainer = Trainer(scene, CONFIG, default_device)
+    for _ in range(16):
+        trainer.train_step()
+    before = trainer.parameters.count
+    for _ in range(20):
+        trainer.train_step()
+    assert trainer.parameters.count > before
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"edge_views": 2}, "--density.edge-views 2"),
+        ({"edge_views": -1}, "--density.edge-views -1"),
+        ({"long_axis": True, "growth": "mcmc", "max_gaussians": 9}, "--density.long-axis"),
+    ],
+)
+def test_settings_that_are_never_used(settings: dict[str, object], name: str) -> None:
+    with pytest.raises(InputError, match=name):
+        DensityConfig(**settings).check()  # type: ignore[arg-type]

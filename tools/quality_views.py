@@ -1,0 +1,126 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Training on few photographs: PSNR of the held-out views against their number, for several settings.
+
+    python tools/quality_views.py SCENE FOLDER [--views 3,6,9,12] [--iterations 2000] [--resolution 200] [--seeds 0]
+        [--try NAME:setting=value,density.setting=value]...
+
+The photographs are picked evenly from the training views by name, so that they are the same each time; the points are
+those of the whole scene. Each --try is a row of the table beside that of `--schedule short`, in the settings' names of
+config.toml. FOLDER/views.json keeps what is measured, and a call goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.api import train
+from clsplat.config.presets import scheduled
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device, open_device
+from clsplat.evaluation.held_out import evaluate
+from clsplat.images.writing import write_image
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.scene import Scene, load_scene
+
+
+def picked(scene: Scene, count: int) -> Scene:
+    """The scene with `count` of its training views, evenly by name, the first and the last among them."""
+    names = [view.name for view in scene.train_views]
+    places = np.rint(np.linspace(0, len(names) - 1, min(count, len(names)))).astype(int)
+    kept = {names[place] for place in places}
+    return replace(scene, views=[view for view in scene.views if view.split == "test" or view.name in kept])
+
+
+def with_settings(config: TrainConfig, settings: str) -> TrainConfig:
+    """The settings with others, `name=value` with commas between; values as in JSON, other words as they are."""
+    for setting in filter(None, settings.split(",")):
+        name, _, text = setting.partition("=")
+        try:
+            value: Any = json.loads(text)
+        except json.JSONDecodeError:
+            value = text
+        *group, field = name.replace("-", "_").split(".")
+        part = replace(getattr(config, group[0]) if group else config, **{field: value})
+        config = replace(config, **{group[0]: part}) if group else part
+    config.check()
+    return config
+
+
+def measured(scene: Scene, config: TrainConfig, device: Device, pictures: Path) -> dict[str, float]:
+    """Mean PSNR and number of Gaussians; the first held-out view, render over photograph, goes to `pictures`."""
+    model = train(scene, config, device=device)
+    renderer = Renderer(device)
+    result = evaluate(
+        lambda view: renderer.render(model, view.camera).image,
+        scene.test_views,
+        (1, 1, 1) if config.background == "white" else (0, 0, 0),
+        step=config.iterations,
+        gaussians=len(model),
+        seconds=None,
+    )
+    view = scene.test_views[0]
+    both = np.concatenate([renderer.render(model, view.camera).image[:, :, :3], view.load()[:, :, :3]])
+    write_image(pictures, np.clip(both, 0, 1).astype(np.float32))
+    return {"psnr": result["mean"]["psnr"], "gaussians": len(model)}
+
+
+def table(rows: dict[str, dict[str, float]], methods: list[str], counts: list[int], seeds: list[int]) -> str:
+    """Markdown: means over the seeds."""
+    lines = [
+        "| settings | " + " | ".join(f"{count} views" for count in counts) + " |",
+        "|---" * (len(counts) + 1) + "|",
+    ]
+    for method in methods:
+        cells = []
+        for count in counts:
+            found = [rows[key]["psnr"] for seed in seeds if (key := f"{method} {count} {seed}") in rows]
+            cells.append(f"{np.mean(found):.2f}" if found else "")
+        lines.append(f"| {method} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def numbers(text: str) -> list[int]:
+    """Whole numbers with commas between."""
+    return [int(number) for number in text.split(",")]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--views", type=numbers, default=[3, 6, 9, 12])
+    parser.add_argument("--iterations", type=int, default=2000)
+    parser.add_argument("--resolution", type=int, default=200)
+    parser.add_argument("--seeds", type=numbers, default=[0])
+    parser.add_argument("--try", dest="tried", action="append", default=[], help="NAME:setting=value,...")
+    options = parser.parse_args()
+    methods = {"as ever": "", **dict(one.split(":", 1) for one in options.tried)}
+    options.folder.mkdir(parents=True, exist_ok=True)
+    file = options.folder / "views.json"
+    rows = json.loads(file.read_text("utf-8")) if file.exists() else {}
+    scene = load_scene(options.scene, resolution=options.resolution)
+    device = open_device()
+    for count in options.views:
+        few = picked(scene, count)
+        for seed in options.seeds:
+            for method, settings in methods.items():
+                key = f"{method} {count} {seed}"
+                config = scheduled("short", options.iterations)
+                config = replace(config, seed=seed, resolution=options.resolution, report=False)
+                if key not in rows:
+                    name = key.replace(" ", "_") + ".png"
+                    rows[key] = measured(few, with_settings(config, settings), device, options.folder / name)
+                    file.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
+                    print(f"{key}: {rows[key]['psnr']:.2f} dB, {rows[key]['gaussians']:,} Gaussians", flush=True)
+    print(table(rows, list(methods), options.views, options.seeds))
+
+
+if __name__ == "__main__":
+    main()
