@@ -19,6 +19,7 @@ from clsplat.cli.session import Services, load_scene
 from clsplat.config.presets import Preset, Schedule, bundled
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
+from clsplat.files import open_input
 from clsplat.progress import TrainProgress
 
 if TYPE_CHECKING:
@@ -61,6 +62,8 @@ class Train(Verb):
     def completed(self, given: Collection[str]) -> Train:
         """The settings are those of the run that is resumed, or of the preset and the schedule, for these devices."""
         verb = self._with_settings(given)
+        if "points" in given and verb.config.points:  # a run goes on from any folder
+            verb = replace(verb, config=replace(verb.config, points=str(Path(verb.config.points).absolute())))
         explicit = self.resume or "batch" in given
         return replace(verb, config=verb.config.on_devices(self.device.count, explicit=explicit))
 
@@ -117,8 +120,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         raise InputError("SCENE is missing, expected the folder of the scene to train on")
     devices = verb.device.open_all(services)
     config = verb.config
-    scene = load_scene(services, source, config.resolution, config.test_every, config.mask_use, config.lenses)
-    _check_scene(scene)
+    scene = _scene(services, source, config)
     if verb.resume and (done := max((step for step, _ in earlier.checkpoints()), default=0)) > verb.config.iterations:
         raise InputError(
             f"--iterations {verb.config.iterations}: {verb.output} is at step {done} already, expected more"
@@ -163,6 +165,20 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         print_summary(result)
     print(f"model in {run.model_path}", file=sys.stderr)
     return 0
+
+
+def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
+    """The scene to train on, with the points to start from. Raises InputError for one that would end a training."""
+    if config.points:  # structure from motion may come first, which takes its time
+        with open_input(Path(config.points), "a cloud of points"):
+            pass
+    scene = load_scene(services, source, config.resolution, config.test_every, config.mask_use, config.lenses)
+    if config.start_points:
+        from clsplat.scenes.cloud import with_points
+
+        scene = with_points(scene, config.start_points)
+    _check_scene(scene)
+    return scene
 
 
 def _check_scene(scene: Scene) -> None:
