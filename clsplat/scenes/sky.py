@@ -68,7 +68,8 @@ def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
         raise InputError(f"{scene.name}: --sky: no photograph shows any above its points, expected some; leave it out")
     if len(chosen) > count:
         chosen = chosen[np.linspace(0, len(chosen) - 1, count).astype(int)]
-    return places[chosen], np.clip(sums[chosen] / votes[chosen, None], 0, 1).astype(np.float32)
+    colors: Float32 = np.clip(sums[chosen] / votes[chosen, None], 0, 1).astype(np.float32)
+    return places[chosen], colors
 
 
 def half_sphere(count: int, up: Float64) -> Float64:
@@ -78,11 +79,8 @@ def half_sphere(count: int, up: Float64) -> Float64:
     aside = np.eye(3)[int(np.argmin(np.abs(up)))]
     east = np.cross(up, aside)
     east /= np.linalg.norm(east)
-    return (
-        (level * np.cos(angle))[:, None] * east
-        + (level * np.sin(angle))[:, None] * np.cross(up, east)
-        + np.outer(height, up)
-    )
+    along = np.outer(level * np.cos(angle), east) + np.outer(level * np.sin(angle), np.cross(up, east))
+    return np.asarray(along + np.outer(height, up))
 
 
 def _skyline(points: Float64, camera: Camera, view: View) -> NDArray[np.int64]:
