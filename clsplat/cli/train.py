@@ -20,6 +20,7 @@ from clsplat.config.masks import NO_MASKS
 from clsplat.config.presets import Preset, Schedule, bundled
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
+from clsplat.files import open_input
 from clsplat.progress import TrainProgress
 
 if TYPE_CHECKING:
@@ -67,6 +68,8 @@ class Train(Verb):
     def completed(self, given: Collection[str]) -> Train:
         """The settings are those of the run that is resumed, or of the preset and the schedule, for these devices."""
         verb = self._with_settings(given)
+        if "points" in given and verb.config.points:  # a run goes on from any folder
+            verb = replace(verb, config=replace(verb.config, points=str(Path(verb.config.points).absolute())))
         explicit = self.resume or "batch" in given
         config = verb.config.on_devices(self.device.count, explicit=explicit)
         return replace(verb, config=config, given=frozenset(given))
@@ -183,13 +186,8 @@ def _looked_at(verb: Train, services: Services, source: Path) -> tuple[Scene, Tr
     """The scene, checked, and the settings, with --auto those that answer what is found in it. Prints that."""
     from clsplat.scenes.answers import answered, paragraph
 
-    def load(config: TrainConfig) -> Scene:
-        scene = load_scene(services, source, config.resolution, config.test_every, config.mask_use, config.lenses)
-        _check_scene(scene)
-        return scene
-
     config = verb.config
-    scene = load(config)
+    scene = _scene(services, source, config)
     if verb.resume:
         return scene, config
     answers, better = answered(services.findings(scene, config.mask_use), config, verb.given)
@@ -197,8 +195,22 @@ def _looked_at(verb: Train, services: Services, source: Path) -> tuple[Scene, Tr
     if not verb.auto:
         return scene, config
     if (better.mask_use, better.lenses) != (config.mask_use, config.lenses):
-        scene = load(better)
+        scene = _scene(services, source, better)
     return scene, better
+
+
+def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
+    """The scene to train on, with the points to start from. Raises InputError for one that would end a training."""
+    if config.points:  # structure from motion may come first, which takes its time
+        with open_input(Path(config.points), "a cloud of points"):
+            pass
+    scene = load_scene(services, source, config.resolution, config.test_every, config.mask_use, config.lenses)
+    if config.start_points:
+        from clsplat.scenes.cloud import with_points
+
+        scene = with_points(scene, config.start_points)
+    _check_scene(scene)
+    return scene
 
 
 def _check_scene(scene: Scene) -> None:

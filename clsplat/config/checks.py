@@ -50,6 +50,8 @@ def misfit(kind: Any, value: object) -> str | None:
     elif kind is float:
         fits = isinstance(value, Real) and not _is_truth(value) and not 1e300 <= abs(value) < inf  # type: ignore[operator]
         expected = "a number below 1e300"
+    elif kind is str:
+        fits, expected = isinstance(value, str), "text"
     else:
         fits = _is_truth(value) if kind is bool else isinstance(value, kind)
         expected = "True or False" if kind is bool else f"{kind.__name__}(...)"

@@ -12,6 +12,7 @@ from typing import Literal
 
 from clsplat.config.checks import Rule, check_kinds, check_rules, check_steps
 from clsplat.config.masks import AlphaMeaning, MaskMeaning, MaskUse
+from clsplat.config.points import PointsUse, StartPoints
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
@@ -260,6 +261,17 @@ class TrainConfig:
     lens, which sees all of them, also beyond 180 degrees. Panoramas (EQUIRECTANGULAR) always are."""
     random_points: int = 100_000
     """Number of Gaussians to start from, at random places, where a scene has no points."""
+    points: str = ""
+    """File of points to start from, in the scene's frame: PLY (COLMAP's fused.ply too), or with the extra las LAS and
+    LAZ. Points without colours take those of the photographs that show them."""
+    points_use: PointsUse = "replace"
+    """replace: the file's points stand in for the scene's own; join: they come in addition."""
+    points_limit: int = 200_000
+    """Most points to keep of the file: one for each voxel that has some, the mean of their places and colours, with
+    voxels as small as that leaves."""
+    sky: int = 0
+    """Points of a sky to start from, at most, on a sphere around the scene, where photographs show nothing above the
+    scene's points; 0 for none."""
     checkpoint_every: int = 1000
     """Steps between checkpoints; 0 writes one at the end only, or at an interruption."""
     eval_at: tuple[int, ...] = ()
@@ -289,8 +301,9 @@ class TrainConfig:
             (("thinning",), lambda value: 0 <= value <= 0.9, "0 to 0.9"),
             (("alpha_weight",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
+            (("points_limit",), lambda value: value >= 1, "at least 1"),
             (
-                ("seed", "frequency_steps", "resolution", "test_every", "checkpoint_every", "stages_every"),
+                ("seed", "frequency_steps", "resolution", "test_every", "checkpoint_every", "stages_every", "sky"),
                 lambda value: value >= 0,
                 "at least 0",
             ),
@@ -306,6 +319,8 @@ class TrainConfig:
             )
         if self.invert_masks and self.masks == "none":
             raise InputError("--invert-masks: no masks are used, expected --masks ignore or --masks transparent too")
+        if self.points_use != "replace" and not self.points:
+            raise InputError(f"--points-use {self.points_use}: no points are given, expected --points FILE too")
         if self.appearance != "none" and "transparent" in (self.masks, self.alpha):
             raise InputError(
                 f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
@@ -318,6 +333,11 @@ class TrainConfig:
     def mask_use(self) -> MaskUse:
         """The use of the scene's masks."""
         return MaskUse(self.masks, self.alpha, self.invert_masks)
+
+    @property
+    def start_points(self) -> StartPoints:
+        """The points to start from beside or in place of the scene's own."""
+        return StartPoints(self.points, self.points_use, self.points_limit if self.points else 0, self.sky)
 
     @property
     def random_background(self) -> bool:

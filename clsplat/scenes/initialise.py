@@ -120,13 +120,14 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
 
 
 def is_colourless(scene: Scene) -> bool:
-    """True if all points are of one colour, as those of clouds without colours are read."""
+    """True if points have no colours, as a cloud of --points, or all the same, as clouds without colours are read."""
     colors = scene.point_colors
-    return len(colors) > 1 and bool((colors == colors[0]).all())
+    return scene.colourless is not None or (len(colors) > 1 and bool((colors == colors[0]).all()))
 
 
 def photographed(scene: Scene, background: ArrayLike) -> Float32:
-    """(N, 3) float32 in [0, 1] for the scene's points. What lies before a point is not known, and counts too."""
+    """(N, 3) float32 in [0, 1] for the scene's points, but for those that have their own. What lies before a point is
+    not known, and counts too."""
     sums, seen = np.zeros((len(scene.points), 3)), np.zeros(len(scene.points))
     for view in scene.train_views:
         factor = min(LONGEST / max(view.camera.width, view.camera.height), 1.0)
@@ -138,6 +139,8 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
         sums[inside] += picture[rows, columns]
         seen[inside] += 1
     means = np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], UNSEEN)
+    if scene.colourless is not None:
+        means = np.where(scene.colourless[:, None], means, scene.point_colors)
     return np.clip(means, 0, 1).astype(np.float32)
 
 

@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, NEARS, Camera
 from clsplat.config.checks import misfit
 from clsplat.config.masks import NO_MASKS, MaskUse
+from clsplat.config.points import OWN_POINTS, StartPoints
 from clsplat.config.training import Lenses
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError, examples, plain, warn
@@ -122,7 +124,8 @@ class Scene:
 
     name: the folder's; views sorted by name; points (N, 3) float64 in the world, N may be 0; point_colors (N, 3)
     float32 in [0, 1]; bounds: corners (low, high), each (3,) float64, world units, of the box for random initial
-    points; warnings: for the user, a line each.
+    points; warnings: for the user, a line each; start: how the points were chosen (`scenes.cloud`); colourless (N,):
+    points whose colours are those of the photographs, None for none.
     """
 
     name: str
@@ -131,6 +134,8 @@ class Scene:
     point_colors: Float32
     bounds: tuple[Float64, Float64]
     warnings: list[str] = field(default_factory=list)
+    start: StartPoints = OWN_POINTS
+    colourless: NDArray[np.bool_] | None = None
 
     @cached_property
     def train_views(self) -> list[View]:

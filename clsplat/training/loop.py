@@ -35,6 +35,7 @@ from clsplat.runs.appearance import held_out_gains
 from clsplat.runs.checkpoints import unusable
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
+from clsplat.scenes.cloud import with_points
 from clsplat.scenes.initialise import is_colourless, photographed
 from clsplat.scenes.scene import Scene
 from clsplat.stages.loss import Loss
@@ -361,6 +362,7 @@ def _reached(every: int, steps: range) -> bool:
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
     """The scene to train on, with colours, recorded in the run; a warning for each doubt in it. Raises InputError where
     the run has been trained already, or on another scene."""
+    scene = with_points(scene, config.start_points)
     if run is not None:
         if not resume and (run.checkpoints() or run.read_metrics()):
             raise InputError(

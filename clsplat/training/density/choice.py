@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from clsplat.config.points import SKY_RADIUS
 from clsplat.config.training import TrainConfig
 from clsplat.training.density import Strategy
 from clsplat.training.density.adaptive import Adaptive
@@ -11,4 +14,9 @@ from clsplat.training.density.mcmc import Mcmc
 
 def strategy_of(config: TrainConfig) -> Strategy:
     """A new one, for one training."""
-    return Mcmc(config) if config.density.growth == "mcmc" else Adaptive(config)
+    if config.density.growth == "mcmc":
+        return Mcmc(config)
+    if config.sky:  # else the sky's Gaussians would all be pruned for their size
+        size = config.density.max_world_fraction * SKY_RADIUS
+        config = replace(config, density=replace(config.density, max_world_fraction=size))
+    return Adaptive(config)

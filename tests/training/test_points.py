@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trainings that start from a cloud, or with a sky."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calls import Capture, error_line
+from tiny import CONFIG, FEW, hidden_model, write_scene
+
+from clsplat.cli.main import main
+from clsplat.config.points import SKY_RADIUS
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.models.formats import ply
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import load_scene
+from clsplat.training.density.adaptive import Adaptive
+from clsplat.training.density.choice import strategy_of
+from clsplat.training.loop import begin
+from clsplat.training.trainer import Trainer
+
+WORDS = ("--iterations", "4", "--density.every", "0", "--resolution", "24")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("points") / "tiny")
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Means without colours, in a file of ours."""
+    path = tmp_path_factory.mktemp("cloud") / "cloud.ply"
+    ply.write(path, hidden_model(300))
+    return path
+
+
+def test_a_run_starts_from_the_cloud_and_goes_on(
+    scene: Path, cloud: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(cloud.parent)
+    points = ("--points", cloud.name, "--points-limit", "100")
+    assert main(["train", str(scene), "-o", str(tmp_path / "whole"), *points, *WORDS]) == 0
+    assert main(["train", str(scene), "-o", str(tmp_path / "two"), *points, *WORDS, "--iterations", "2"]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "-o", str(tmp_path / "two"), "--resume", "--iterations", "4"]) == 0
+    whole, two = (Run.open(tmp_path / name) for name in ("whole", "two"))
+    assert 50 < whole.model_record()["gaussians"] <= 100
+    assert whole.model_path.read_bytes() == two.model_path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--points", "gone.ply"), "gone.ply: no such file, expected a cloud of points"),
+        (("--points-use", "join"), "--points-use join: no points are given, expected --points FILE too"),
+        (("--points-limit", "0"), "--points-limit 0: expected at least 1"),
+        (("--sky", "-1"), "--sky -1: expected at least 0"),
+    ],
+)
+def test_calls_that_make_no_sense(
+    scene: Path, tmp_path: Path, capsys: Capture, words: tuple[str, ...], said: str
+) -> None:
+    assert main(["train", str(scene), "-o", str(tmp_path / "run"), *words, *WORDS]) == 2
+    assert said in error_line(capsys)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_cloud_that_changes_is_refused(scene: Path, tmp_path: Path, capsys: Capture) -> None:
+    cloud, run = tmp_path / "cloud.ply", tmp_path / "run"
+    ply.write(cloud, hidden_model(50))
+    assert main(["train", str(scene), "-o", str(run), "--points", str(cloud), *WORDS]) == 0
+    ply.write(cloud, hidden_model(60))
+    capsys.readouterr()
+    assert main(["train", "-o", str(run), "--resume", "--iterations", "5"]) == 2
+    assert "other points (50 then, 60 now)" in error_line(capsys)
+
+
+def test_colours_come_from_the_photographs(scene: Path, cloud: Path) -> None:
+    config = replace(FEW, points=str(cloud), points_use="join")
+    read = load_scene(scene)
+    with pytest.warns(UserWarning, match="have no colours"):
+        got = begin(read, config, None, resume=False)
+    assert len(got.points) == len(read.points) + 300
+    assert np.ptp(got.point_colors[len(read.points) :], axis=0).min() > 0.05
+    with pytest.raises(InputError, match=r"lost\.ply"):
+        begin(read, replace(FEW, points="lost.ply"), None, resume=False)
+
+
+def test_a_sky_is_not_pruned_for_its_size(default_device: Device, scene: Path) -> None:
+    strategy = strategy_of(replace(CONFIG, sky=100))
+    assert isinstance(strategy, Adaptive)
+    assert strategy.config.max_world_fraction == pytest.approx(SKY_RADIUS * CONFIG.density.max_world_fraction)
+    assert strategy_of(TrainConfig()).config == TrainConfig().density  # type: ignore[attr-defined]
+    read = load_scene(scene)
+    config = replace(CONFIG, sky=100, iterations=30)
+    prepared = begin(read, config, None, resume=False)
+    assert len(prepared.points) > len(read.points)
+    trainer = Trainer(prepared, config, default_device)
+    while trainer.step < 30:  # with an opacity reset at 20
+        trainer.train_step()
+    model = trainer.gaussians()
+    far = np.linalg.norm(model.means, axis=1) > 3 * prepared.extent
+    assert far.any()
+    assert np.exp(model.log_scales[far]).max() > CONFIG.density.max_world_fraction * prepared.extent
