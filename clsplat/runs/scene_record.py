@@ -45,6 +45,7 @@ def record_of(scene: Scene, resolution: int) -> dict[str, Any]:
 
 def _view(view: View, digest: str | None) -> dict[str, Any]:
     camera = view.camera
+    bent = {"projection": camera.projection, "radial": [float(value) for value in camera.radial]}
     return {
         "split": view.split,
         "file": view.path.name,
@@ -53,6 +54,7 @@ def _view(view: View, digest: str | None) -> dict[str, Any]:
         "size": [camera.width, camera.height],
         "lens": [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)],
         "pose": [float(value) for value in (*np.ravel(camera.rotation), *camera.translation)],
+        **(bent if camera.projection != "perspective" else {}),
     }
 
 
@@ -93,6 +95,7 @@ def read(run: Run) -> dict[str, Any] | None:
         for view in views.values():
             assert {"split", "file", "folder", "blake2b", "size", "lens", "pose"} <= view.keys()
             assert all(len(np.array(view[key], float)) == n for key, n in (("size", 2), ("lens", 4), ("pose", 12)))
+            assert "radial" not in view or ("projection" in view and len(np.array(view["radial"], float)) == 4)
     except (ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
         why = str(error) or "not of its form"
         raise InputError(f"{path}: is damaged ({why}), expected {_EXPECTED}; {advice}") from None
@@ -114,7 +117,8 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
         a, b = was[name], new[name]
         same_file = (a["file"], a["folder"]) == (b["file"], b["folder"])
         turned = not (_close(a["pose"][:9], b["pose"][:9]) and _close(a["pose"][9:], b["pose"][9:]))
-        if turned or (a["size"] == b["size"] and not _close(a["lens"], b["lens"])):
+        bent = "radial" in a and (a["projection"] != b.get("projection") or not _close(a["radial"], b["radial"]))
+        if turned or bent or (a["size"] == b["size"] and not _close(a["lens"], b["lens"])):
             changed["another camera"].append(name)
         elif a["size"] != b["size"] and not resized:
             changed["another size"].append(name)

@@ -232,3 +232,19 @@ def test_a_checkpoint_outlives_changes_that_are_accepted(run: Path, own: Path) -
         assert not scene_record.check(opened, changed, own, resolution)
     known = scene_record.known_digests(scene_record.read(Run.open(run)))
     assert known >= {scene_record.digest_of(scene_record.record_of(own_scene, 0))}
+
+
+def test_a_lens_that_is_no_pinhole_is_recorded(scene: Path) -> None:
+    whole = load_scene(scene)
+    plain = scene_record.record_of(whole, 0)
+    bent = replace(whole.views[0], camera=replace(whole.views[0].camera, projection="fisheye", radial=(0.1, 0, 0, 0)))
+    whole.views[0] = bent
+    one = scene_record.record_of(whole, 0)
+    whole.views[0] = replace(bent, camera=replace(bent.camera, radial=(0.1, 0.01, 0, 0)))
+    other = scene_record.record_of(whole, 0)
+    assert not any("radial" in view for view in plain["views"].values())
+    assert one["views"][bent.name]["projection"] == "fisheye"
+    assert one["views"][bent.name]["radial"] == [0.1, 0.0, 0.0, 0.0]
+    assert scene_record.differences(one, one) == []
+    assert scene_record.differences(one, other) == [f"1 view another camera ({bent.name})"]
+    assert scene_record.differences(one, plain) == [f"1 view another camera ({bent.name})"]
