@@ -18,11 +18,11 @@ ANSWERS: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "cut out": ({"masks": "transparent"}, {"masks": "ignore"}),
     "alpha": ({"alpha": "transparent"}, {"alpha": "ignore"}),
     "fisheye": ({"lenses": "native"},),
+    "few views": ({"thinning": 0.2},),
 }
 """Settings by the finding that they answer, the best first: the first that goes with the other settings is taken."""
 ADVICE: Mapping[Kind, str] = {
-    "sky": "points far away will stand for it",
-    "few views": "more photographs help, and views near them look best",
+    "sky": "--sky 1000 starts with points far away for it",
     "blur": "leave them out where others show the same",
     "duplicates": "remove the copies",
 }

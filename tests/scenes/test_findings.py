@@ -221,8 +221,9 @@ def test_answers_that_do_not_go_together() -> None:
     answers, config = answered(found, TrainConfig(), given={"appearance"})
     assert (config.appearance, config.masks) == ("none", "transparent")
     assert "a (--appearance is given)" in paragraph(answers, 3, auto=False)
-    answers, config = answered(found[:1], TrainConfig(batch=2))
-    assert config == TrainConfig(batch=2)
+    transparent = TrainConfig(masks="transparent")
+    answers, config = answered(found[:1], transparent)
+    assert config == transparent
     assert "does not go with the other settings" in answers[0].words
 
 
@@ -235,7 +236,8 @@ def test_auto_takes_what_answers(tmp_path: Path, capfd: Capture) -> None:
     assert "(--alpha transparent)" in told
     assert Run.open(tmp_path / "plain").config.alpha == "blend"
     assert main(["train", str(folder), "-o", str(tmp_path / "auto"), *short, "--auto"]) == 0
-    assert "--auto takes --alpha transparent" in capfd.readouterr().err
+    taken = capfd.readouterr().err.partition("--auto takes ")[2].splitlines()[0]
+    assert taken == "--thinning 0.2 --alpha transparent"
     assert Run.open(tmp_path / "auto").config.alpha == "transparent"
     assert main(["train", "-o", str(tmp_path / "auto"), "--resume", "--auto"]) == 2
     assert "--auto and --resume exclude each other" in capfd.readouterr().err
