@@ -192,6 +192,8 @@ def methods(device: Device) -> None:
     _train(device, replace(short, density=replace(PAPER.density, growth="mcmc", max_gaussians=60)), 3, VIEW)
     _train(device, replace(short, appearance="exposure", masks="ignore"), 5, VIEW)
     _train(device, replace(short, masks="transparent"), 5, VIEW)
+    edges = replace(PAPER.density, growth="budget", max_gaussians=60, long_axis=True, edge_views=1)
+    _train(device, replace(short, thinning=0.3, density=edges), 3, VIEW)
     fisheye = replace(VIEW, fx=9.0, fy=9.0, projection="fisheye", radial=(0.05, 0.01, 0.0, 0.0))
     around = 20 / (2 * np.pi)
     panorama = replace(VIEW, fx=around, fy=around, projection="equirectangular")
