@@ -27,6 +27,7 @@ from dying import standing, standing_device  # noqa: F401  # fixtures
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
 from needs import missing
 from pipeline import QUICK_SHAPES, shaped, shapes_of
+from same_bytes import undisturbed  # noqa: F401  # a fixture
 from tiny import CONFIG, FEW, short, write_scene
 
 from clsplat.device.context import Device, open_device

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from compare import assert_close, assert_same_bits
 from quick import quick
+from same_bytes import model_bytes
 from scenes import random_cloud
-from test_trainer import host, model_bytes
+from test_trainer import host
 from tiny import short, write_scene
 
 from clsplat.api import train
@@ -30,7 +31,7 @@ from clsplat.stages.device_gaussians import HostGaussians
 from clsplat.training.density import ModelState, RowPlan, adaptive
 from clsplat.training.trainer import Trainer
 
-EVERYTHING = short(
+CONFIG = short(
     iterations=48,
     density={
         "min_contribution": 0.6,
@@ -42,17 +43,12 @@ EVERYTHING = short(
         "max_gaussians": 120,
     },
 )
-"""CONFIG of `tiny` with all that goes beyond the paper, and steps of nothing but pruning before and after `stop`."""
+"""All that goes beyond the paper, and steps of nothing but pruning before and after `stop`."""
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
-
-
-@pytest.fixture(scope="module")
-def undisturbed(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return model_bytes(scene, EVERYTHING, default_device, tmp_path_factory.mktemp("undisturbed"))
 
 
 def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,8 +71,8 @@ def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: p
 
     monkeypatch.setattr(adaptive, "plan", noted("plan"))
     monkeypatch.setattr(adaptive, "plan_pruning", noted("plan_pruning"))
-    trainer = Trainer(scene, EVERYTHING, default_device)
-    for _ in range(EVERYTHING.iterations):
+    trainer = Trainer(scene, CONFIG, default_device)
+    for _ in range(CONFIG.iterations):
         trainer.train_step()
     assert [step for name, step in made if name == "plan"] == [15, 20, 25, 30, 35]
     assert [step for name, step in made if name == "plan_pruning"] == [12, 18, 22, 24, 36, 41, 42]
@@ -134,7 +130,7 @@ def test_contributions_are_those_of_an_epoch(scene: Scene, default_device: Devic
 
 
 def test_a_reset_forgets_contributions(scene: Scene, default_device: Device) -> None:
-    trainer = Trainer(scene, EVERYTHING, default_device)
+    trainer = Trainer(scene, CONFIG, default_device)
     for _ in range(20):
         trainer.train_step()
     assert trainer.statistics.whole_totals is not None
@@ -187,9 +183,9 @@ def test_stopping_and_going_on_gives_the_same_bytes(
     step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
 ) -> None:
     """At the seams of epochs (8 views), of resets, of passes and of what is gathered."""
-    model_bytes(scene, replace(EVERYTHING, iterations=step), default_device, tmp_path / "run")
-    run = Run.create(tmp_path / "run", EVERYTHING, resume=True)
-    train(scene, EVERYTHING, device=default_device, run=run, resume=True)
+    model_bytes(scene, replace(CONFIG, iterations=step), default_device, tmp_path / "run")
+    run = Run.create(tmp_path / "run", CONFIG, resume=True)
+    train(scene, CONFIG, device=default_device, run=run, resume=True)
     assert run.model_path.read_bytes() == undisturbed
 
 
@@ -197,21 +193,21 @@ def test_settings_that_come_with_resume(scene: Scene, default_device: Device, tm
     """The checkpoint has no contributions: nothing is known until an epoch is over, and nothing is pruned by it."""
     plain = short(iterations=14)
     model_bytes(scene, plain, default_device, tmp_path / "run")
-    run = Run.create(tmp_path / "run", EVERYTHING, resume=True)
+    run = Run.create(tmp_path / "run", CONFIG, resume=True)
     checkpoint = run.load_latest_checkpoint()
     assert checkpoint is not None
-    trainer = Trainer(scene, EVERYTHING, default_device)
+    trainer = Trainer(scene, CONFIG, default_device)
     trainer.restore(checkpoint)
     assert trainer.statistics.whole_largest is not None
     assert np.isinf(trainer.statistics.whole_largest.get()).all()
     assert trainer.statistics.seen.get().any(), "what it has is taken"
-    train(scene, EVERYTHING, device=default_device, run=run, resume=True)
+    train(scene, CONFIG, device=default_device, run=run, resume=True)
     assert run.model_path.exists()
 
 
 MANY = replace(
-    EVERYTHING,
-    density=replace(EVERYTHING.density, max_gaussians=2500, min_contribution=0.02, views_agree=1),
+    CONFIG,
+    density=replace(CONFIG.density, max_gaussians=2500, min_contribution=0.02, views_agree=1),
     random_points=400,
 )
 
@@ -241,7 +237,7 @@ def test_the_budget_is_reached(scene: Scene, default_device: Device) -> None:
 
 
 def test_every_driver_prunes_alike(device: Device, default_device: Device, scene: Scene) -> None:
-    config: TrainConfig = replace(EVERYTHING, iterations=16)
+    config: TrainConfig = replace(CONFIG, iterations=16)
     trainers = [Trainer(scene, config, opened) for opened in (device, default_device)]
     for trainer in trainers:
         for _ in range(config.iterations):

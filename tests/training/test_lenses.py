@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import assert_close, assert_same_bits
-from test_trainer import host, model_bytes, quiet
+from same_bytes import model_bytes
+from test_trainer import host, quiet
 from tiny import HEIGHT, WIDTH, cameras, hidden_model, short, write_scene
 
 from clsplat.api import train

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from same_bytes import check_in_less_memory, model_bytes
 from scipy.spatial.transform import Rotation
-from test_trainer import model_bytes
 from tiny import short, write_scene
 
 from clsplat.api import train
@@ -33,11 +33,6 @@ CONFIG = short(
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
-
-
-@pytest.fixture(scope="module")
-def undisturbed(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return model_bytes(scene, CONFIG, default_device, tmp_path_factory.mktemp("undisturbed"))
 
 
 def test_halves_lie_on_the_longest_axis() -> None:
@@ -121,13 +116,7 @@ def test_by_capacity_the_same_bytes(
 def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
     scene = load_scene(write_scene(tmp_path / "scene", points=False))
     many = replace(CONFIG, random_points=400, density=replace(CONFIG.density, max_gaussians=2500))
-    free = default_device.with_memory_limit(None)
-    whole = model_bytes(scene, many, free, tmp_path / "free")
-    device = default_device.with_memory_limit(int(0.45 * free.memory.peak))
-    run, pieces = Run.create(tmp_path / "limited", many), []
-    train(scene, many, device=device, run=run, on_plan=lambda plan: pieces.append(plan.pieces))
-    assert run.model_path.read_bytes() == whole
-    assert any(streamed or bands > 1 for streamed, bands in pieces)
+    check_in_less_memory(scene, many, default_device, tmp_path)
 
 
 def test_it_grows_by_splits_alone(scene: Scene, default_device: Device) -> None:

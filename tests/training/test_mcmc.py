@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import assert_same_bits
-from test_trainer import model_bytes
+from same_bytes import model_bytes
 from tiny import short, write_scene
 
 from clsplat.api import train
@@ -35,11 +35,6 @@ CONFIG = short(
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
-
-
-@pytest.fixture(scope="module")
-def undisturbed(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return model_bytes(scene, CONFIG, default_device, tmp_path_factory.mktemp("undisturbed"))
 
 
 # The policy

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from compare import assert_same_bits
 from numpy.typing import NDArray
+from same_bytes import check_in_less_memory, model_bytes
 from scenes import random_cloud
-from test_trainer import model_bytes
 from tiny import short, write_scene
 
 from clsplat.api import train
@@ -40,11 +40,6 @@ THINNING = Thinning(0.3, (0x12345678, 0x9ABCDEF0))
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
-
-
-@pytest.fixture(scope="module")
-def undisturbed(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return model_bytes(scene, CONFIG, default_device, tmp_path_factory.mktemp("undisturbed"))
 
 
 def cloud() -> tuple[Gaussians, Camera]:
@@ -146,13 +141,7 @@ def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -
     """Rows that come in parts are thinned by their place in the model."""
     scene = load_scene(write_scene(tmp_path / "scene", points=False))
     many = replace(CONFIG, random_points=1500, thinning=0.5)
-    free = default_device.with_memory_limit(None)
-    whole = model_bytes(scene, many, free, tmp_path / "free")
-    device = default_device.with_memory_limit(int(0.45 * free.memory.peak))
-    run, pieces = Run.create(tmp_path / "limited", many), []
-    train(scene, many, device=device, run=run, on_plan=lambda plan: pieces.append(plan.pieces))
-    assert run.model_path.read_bytes() == whole
-    assert any(streamed or bands > 1 for streamed, bands in pieces)
+    check_in_less_memory(scene, many, default_device, tmp_path)
 
 
 def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from compare import assert_close, assert_same_bits
 from marking import on_host
+from same_bytes import model_bytes
 from test_density import split_of
 from tiny import CONFIG, EVENTS, HEIGHT, WIDTH, hidden_model, short, write_scene
 
@@ -38,18 +39,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 @pytest.fixture(scope="module")
 def alpha_scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene", alpha=True))
-
-
-@pytest.fixture(scope="module")
-def undisturbed(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """model.ply of CONFIG, trained in one go."""
-    return model_bytes(scene, CONFIG, default_device, tmp_path_factory.mktemp("undisturbed"))
-
-
-def model_bytes(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: Any) -> bytes:
-    run = Run.create(folder, config)
-    train(scene, config, device=device, run=run, **options)
-    return run.model_path.read_bytes()
 
 
 def host(gaussians: DeviceGaussians) -> dict[str, np.ndarray]:

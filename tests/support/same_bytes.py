@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models of trainings, to the byte: in one go, and under a limit of memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clsplat.api import train
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene
+
+
+def model_bytes(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: Any) -> bytes:
+    """model.ply of a training."""
+    run = Run.create(folder, config)
+    train(scene, config, device=device, run=run, **options)
+    return run.model_path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(request: pytest.FixtureRequest, default_device: Device, tmp_path_factory: Any) -> bytes:
+    """model.ply of the module's CONFIG on its `scene`, trained in one go."""
+    scene = request.getfixturevalue("scene")
+    return model_bytes(scene, request.module.CONFIG, default_device, tmp_path_factory.mktemp("undisturbed"))
+
+
+def check_in_less_memory(scene: Scene, config: TrainConfig, device: Device, folder: Path) -> None:
+    """A training with 0.45 of the memory that it takes comes in pieces, and to the same bytes."""
+    free = device.with_memory_limit(None)
+    whole = model_bytes(scene, config, free, folder / "free")
+    limited = device.with_memory_limit(int(0.45 * free.memory.peak))
+    run, pieces = Run.create(folder / "limited", config), []
+    train(scene, config, device=limited, run=run, on_plan=lambda plan: pieces.append(plan.pieces))
+    assert run.model_path.read_bytes() == whole
+    assert any(streamed or bands > 1 for streamed, bands in pieces)
