@@ -330,7 +330,8 @@ class Session:
             if trainer.scene.test_views:
                 result = self.evaluate(keep=True)
                 run.write_eval(result)
-                if trainer.config.report and trainer.device.memory.limit is None:
+                ample = trainer.device.memory.limit is None and not any(trainer.plan.pieces)
+                if trainer.config.report and ample:
                     with suppress(CapacityError, DriverError):  # a picture less is no failed training
                         views = trainer.scene.test_views
                         keep_depths(self.render, model, views, result["views"], run.depth_path)

@@ -47,6 +47,8 @@ def test_train_leaves_a_run(trained: Path, scene: Path) -> None:
         "report.html",
         "test/00.png",
         "test/08.png",
+        "depth/00.png",
+        "depth/08.png",
     }
     assert names == {*expected, "checkpoints/step-0000040.npz"}
     run = Run.open(trained)
@@ -250,7 +252,8 @@ def test_ctrl_c_before_the_first_step(
         patch.setattr(trainer, "upload_gaussians", interrupt)
         assert train(scene, run, CONFIG) == 130
     message = f"clsplat: interrupted before the first checkpoint; go on with: clsplat train -o {run} --resume"
-    started, *_, interrupted = capfd.readouterr().err.splitlines()
+    looked, started, *_, interrupted = capfd.readouterr().err.splitlines()
+    assert looked.startswith("looked at 10 photographs: ")
     assert started.startswith(f"{scene.name}: 8 pictures to train on, 2 held out, 40 points; on ")
     assert interrupted == message
     assert main(["train", "-o", str(run), "--resume", "--iterations", "3"]) == 0

@@ -46,6 +46,7 @@ OUT_OF_RANGE = {
     "--density.views-agree": ("0", "-1"),
     "--density.min-contribution": ("-1", "nan", "inf"),
     "--density.prune-every": ("-1",),
+    "--density.edge-views": ("-1",),
     "--density.prune-at": ("0", "-5", "9,5", "5,5", "3000"),
     "--density.prune-fraction": ("-0.1", "1", "nan", "0.5"),
     "--density.growth": ("budget", "mcmc"),
