@@ -56,15 +56,22 @@ class Result:
     sizes: tuple[float, ...] = ()
 
 
+HALVES = {
+    "budget": ("--density.growth", "budget"),
+    "long axis": ("--density.growth", "budget", "--density.long-axis"),
+    "mcmc": ("--density.growth", "mcmc"),
+}
+"""Rows of the growth table that get half of the Gaussians."""
+
+
 def growth_rows() -> list[Row]:
     """The paper's growth and the short schedule, and the others with half of the better one's Gaussians."""
     rows = []
     for scene in SCENES:
         rows += [Row(f"{scene} default", scene), Row(f"{scene} short", scene, ("--schedule", "short"))]
         ends = (f"{scene} default", f"{scene} short")
-        for growth in ("budget", "mcmc"):
-            settings = ("--schedule", "short", "--density.growth", growth)
-            rows.append(Row(f"{scene} {growth}", scene, settings, half_of=ends))
+        for name, more in HALVES.items():
+            rows.append(Row(f"{scene} {name}", scene, ("--schedule", "short", *more), half_of=ends))
     return rows
 
 
@@ -78,9 +85,14 @@ def antialiasing_rows() -> list[Row]:
 
 
 TRAININGS: dict[str, Callable[[], list[Row]]] = {"growth": growth_rows, "antialiasing": antialiasing_rows}
+FEW_VIEWS = ("--seeds", "0,1", "--try", "thinning:thinning=0.2")
 TOOLS: dict[str, tuple[str, ...]] = {
     "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", "--iterations", "{iterations}"),
     "fisheye": ("quality_fisheye.py", "{work}", "--iterations", "{iterations}"),
+    "points": ("quality_points.py", "{work}", "--iterations", "{iterations}"),
+    "real points": ("quality_points.py", "{work}", "--rgbd", "{scenes}/rgbd_7scenes", "--iterations", "{iterations}"),
+    "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *FEW_VIEWS),
+    "few views of bonsai": ("quality_views.py", "{scenes}/bonsai", "{work}", *FEW_VIEWS),
 }
 """Tables that tools of their own print: the commands, with the folder of scenes, one to work in, and the steps."""
 
