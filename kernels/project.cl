@@ -62,7 +62,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #ifdef THINNED
   Lanes left;
   for (uint lane = 0; lane < LANES; ++lane)
-    left.lane[lane] = random_word((uint)first_row + lane + model_row, key0, key1) < threshold ? 0.0f : factor;
+    left.lane[lane] = thinning((uint)first_row + lane + model_row, key0, key1, threshold, factor);
   opacity *= left.all;
 #endif
   floatL dx = FROM_CAMERA(means, X, 0), dy = FROM_CAMERA(means, Y, 1), dz = FROM_CAMERA(means, Z, 2);

@@ -125,7 +125,7 @@ __kernel void project_rays(const uint n, const int coefficients, const int width
   tile_counts[i] = 0;
   float opacity = sigmoidL(opacity_logits[i]);
 #ifdef THINNED
-  opacity *= random_word((uint)i + model_row, key0, key1) < threshold ? 0.0f : factor;
+  opacity *= thinning((uint)i + model_row, key0, key1, threshold, factor);
 #endif
   if (!(opacity > ALPHA_MIN)) return;
   RayProjection p;

@@ -15,7 +15,7 @@ from clsplat.config.points import StartPoints
 from clsplat.errors import InputError
 from clsplat.files import open_input
 from clsplat.images.reading import one_line
-from clsplat.scenes.initialise import UNSEEN, pixels_of
+from clsplat.scenes.initialise import UNSEEN, of_one_colour, pixels_of
 from clsplat.scenes.sky import sky_points
 from clsplat.scenes.transforms import read_point_cloud
 
@@ -85,8 +85,7 @@ def read_cloud(path: Path) -> Cloud:
             raise InputError(f"{path}: begins as no PLY, LAS or LAZ, expected a cloud of points in one of these")
         else:
             points, colors = read_point_cloud(path)
-            bare = len(colors) > 1 and bool((colors == colors[0]).all())
-            cloud = Cloud(points, None if bare else colors)
+            cloud = Cloud(points, None if of_one_colour(colors) else colors)
     if len(cloud.points) == 0:
         raise InputError(f"{path}: holds no points, expected at least one")
     return cloud
@@ -109,7 +108,7 @@ def _read_las(path: Path) -> Cloud:
         if {"red", "green", "blue"} <= names:
             levels = np.stack([np.asarray(las[name], np.float32) for name in ("red", "green", "blue")], axis=1)
             most = levels.max(initial=0)
-            if most > 0 and (len(levels) == 1 or (levels != levels[0]).any()):
+            if most > 0 and not of_one_colour(levels):
                 colors = np.asarray(levels / np.float32(255 if most < 256 else 65535), np.float32)
     except Exception as error:  # noqa: BLE001  # laspy raises its own, those of struct and NumPy, and LAZ's decoder panics
         why = one_line(f"{type(error).__name__}: {error}")

@@ -121,8 +121,12 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
 
 def is_colourless(scene: Scene) -> bool:
     """True if points have no colours, as a cloud of --points, or all the same, as clouds without colours are read."""
-    colors = scene.point_colors
-    return scene.colourless is not None or (len(colors) > 1 and bool((colors == colors[0]).all()))
+    return scene.colourless is not None or of_one_colour(scene.point_colors)
+
+
+def of_one_colour(colors: Float32) -> bool:
+    """True if several points (N, 3) have the same colour, as a file without colours is read."""
+    return len(colors) > 1 and bool((colors == colors[0]).all())
 
 
 def photographed(scene: Scene, background: ArrayLike) -> Float32:

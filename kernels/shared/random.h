@@ -11,3 +11,9 @@ static inline uint mixed(uint x) {
 static inline uint random_word(const uint row, const uint key0, const uint key1) {
   return mixed(mixed(row ^ key0) + key1);
 }
+
+// Factor of the opacity of a row of the model in a step that leaves out those whose word is under the threshold.
+static inline float thinning(const uint row, const uint key0, const uint key1, const uint threshold,
+                             const float factor) {
+  return random_word(row, key0, key1) < threshold ? 0.0f : factor;
+}

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,3 +39,27 @@ def check_in_less_memory(scene: Scene, config: TrainConfig, device: Device, fold
     train(scene, config, device=limited, run=run, on_plan=lambda plan: pieces.append(plan.pieces))
     assert run.model_path.read_bytes() == whole
     assert any(streamed or bands > 1 for streamed, bands in pieces)
+
+
+def stopped_at(step: int, scene: Scene, config: TrainConfig, device: Device, folder: Path) -> bytes:
+    """model.ply of a training that ended at a step and went on."""
+    model_bytes(scene, replace(config, iterations=step), device, folder)
+    return gone_on(scene, config, device, Run.create(folder, config, resume=True))
+
+
+def interrupted(scene: Scene, config: TrainConfig, device: Device, folder: Path) -> bytes:
+    """model.ply of a training that Ctrl-C ended at its first step and that went on."""
+    run = Run.create(folder, config)
+
+    def stop(report: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(scene, config, device=device, run=run, on_step=stop)
+    return gone_on(scene, config, device, run)
+
+
+def gone_on(scene: Scene, config: TrainConfig, device: Device, run: Run) -> bytes:
+    """model.ply of a run that goes on where it stopped."""
+    train(scene, config, device=device, run=run, resume=True)
+    return run.model_path.read_bytes()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from compare import assert_close, assert_same_bits
 from quick import quick
-from same_bytes import model_bytes
+from same_bytes import model_bytes, stopped_at
 from scenes import random_cloud
 from test_trainer import host
 from tiny import short, write_scene
@@ -183,10 +183,7 @@ def test_stopping_and_going_on_gives_the_same_bytes(
     step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
 ) -> None:
     """At the seams of epochs (8 views), of resets, of passes and of what is gathered."""
-    model_bytes(scene, replace(CONFIG, iterations=step), default_device, tmp_path / "run")
-    run = Run.create(tmp_path / "run", CONFIG, resume=True)
-    train(scene, CONFIG, device=default_device, run=run, resume=True)
-    assert run.model_path.read_bytes() == undisturbed
+    assert stopped_at(step, scene, CONFIG, default_device, tmp_path / "run") == undisturbed
 
 
 def test_settings_that_come_with_resume(scene: Scene, default_device: Device, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import assert_close, assert_same_bits
-from same_bytes import model_bytes
+from same_bytes import interrupted, model_bytes
 from test_trainer import host, quiet
 from tiny import HEIGHT, WIDTH, cameras, hidden_model, short, write_scene
 
@@ -26,7 +26,6 @@ from clsplat.reference import every_pixel
 from clsplat.reference.cameras import pixel_from_cam
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
-from clsplat.runs.run import Run
 from clsplat.scenes.initialise import pixels_of
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
@@ -112,15 +111,7 @@ def test_a_resumed_run_is_an_uninterrupted_one(
     config = short(batch=batch, report=False)
     whole = model_bytes(scene, config, default_device, tmp_path / "whole")
     assert model_bytes(scene, config, default_device, tmp_path / "again") == whole
-    run = Run.create(tmp_path / "stopped", config)
-
-    def stop(report: object) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(scene, config, device=default_device, run=run, on_step=stop)
-    train(scene, config, device=default_device, run=run, resume=True)
-    assert run.model_path.read_bytes() == whole
+    assert interrupted(scene, config, default_device, tmp_path / "stopped") == whole
 
 
 def test_gradients_in_memory_change_no_bit(scene: Scene, default_device: Device) -> None:

@@ -8,16 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from same_bytes import check_in_less_memory, model_bytes
+from same_bytes import check_in_less_memory, model_bytes, stopped_at
 from scipy.spatial.transform import Rotation
 from tiny import short, write_scene
 
-from clsplat.api import train
 from clsplat.config.training import DensityConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.reference.render import render_grad
-from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.training.density.adaptive import edge_scores, long_halves
 from clsplat.training.edges import edge_contributions, edge_strength
@@ -100,10 +98,7 @@ def test_contributions_to_edges_are_those_of_the_twin(scene: Scene, default_devi
 def test_stopping_and_going_on_gives_the_same_bytes(
     step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
 ) -> None:
-    model_bytes(scene, replace(CONFIG, iterations=step), default_device, tmp_path / "run")
-    run = Run.create(tmp_path / "run", CONFIG, resume=True)
-    train(scene, CONFIG, device=default_device, run=run, resume=True)
-    assert run.model_path.read_bytes() == undisturbed
+    assert stopped_at(step, scene, CONFIG, default_device, tmp_path / "run") == undisturbed
 
 
 def test_by_capacity_the_same_bytes(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import assert_same_bits
-from same_bytes import model_bytes
+from same_bytes import model_bytes, stopped_at
 from tiny import short, write_scene
 
 from clsplat.api import train
@@ -163,10 +163,7 @@ def test_it_grows_learns_and_leaves_nothing_undrawn(scene: Scene, default_device
 def test_stopping_and_going_on_gives_the_same_bytes(
     step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
 ) -> None:
-    model_bytes(scene, replace(CONFIG, iterations=step), default_device, tmp_path / "run")
-    run = Run.create(tmp_path / "run", CONFIG, resume=True)
-    train(scene, CONFIG, device=default_device, run=run, resume=True)
-    assert run.model_path.read_bytes() == undisturbed
+    assert stopped_at(step, scene, CONFIG, default_device, tmp_path / "run") == undisturbed
 
 
 @pytest.mark.parametrize("share", [0.6, 0.3])

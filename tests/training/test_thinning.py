@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from compare import assert_same_bits
 from numpy.typing import NDArray
-from same_bytes import check_in_less_memory, model_bytes
+from same_bytes import check_in_less_memory, interrupted, model_bytes
 from scenes import random_cloud
 from tiny import short, write_scene
 
-from clsplat.api import train
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.config.thinning import Thinning, thinning_of
@@ -26,7 +25,6 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference.render import forward, render_grad
 from clsplat.reference.thinning import factors, logit_grad, thinned_logits
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
@@ -122,15 +120,7 @@ def test_frame_and_gradient_are_those_of_thinned_opacities(shaped_device: Device
 def test_stopping_and_going_on_gives_the_same_bytes(
     scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
 ) -> None:
-    run = Run.create(tmp_path / "run", CONFIG)
-
-    def stop(report: object) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(scene, CONFIG, device=default_device, run=run, on_step=stop)
-    train(scene, CONFIG, device=default_device, run=run, resume=True)
-    assert run.model_path.read_bytes() == undisturbed
+    assert interrupted(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
 
 
 def test_it_changes_the_model(scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes) -> None:
