@@ -21,6 +21,7 @@ from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, shared, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SPLAT
+from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer
@@ -186,7 +187,7 @@ class Replica:
         splats: bool,
     ) -> Outcome:
         """Forward, loss and backward of a view; place: its number among this device's; factor: of its resolution;
-        gains: of all photographs, where they are learnt; splats: True if density control goes by its gradients."""
+        gains: of its photograph, where they are learnt; splats: True if density control goes by its gradients."""
         parameters, photograph = self.parameters, self.photographs.bring(sample.view, factor)
         assert parameters is not None, "taken before the view"
         n, sh_rest = parameters.count, updates_sh_rest(step.config.optimiser, step.step)
@@ -204,7 +205,7 @@ class Replica:
         appearance = step.appearance.on(self.device, gains) if step.appearance and gains is not None else None
         columns: list[NDArray[Any]] = []
         view = _RemoteView(*settings, arrays, gradients, columns, explore=step.explore, appearance=appearance)
-        result = view.run((parameters,), *pixels, StepProbe(), room, reads_loss=True, kept=sample.kept)
+        result = view.run((parameters,), *pixels, StepProbe(), room, reads_loss=True, **sample.known)
         return Outcome(arrays, gradients, result, next(iter(columns), None))
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
@@ -218,12 +219,19 @@ class Replica:
 class Batch:
     """The gradients of several views, and Adam along their sum.
 
-    rasterizer, photographs: of the device that has the model; further: the other devices.
+    rasterizer, photographs: of the device that has the model; further: the other devices. Raises InputError for a
+    device that is there twice.
     """
 
     def __init__(
         self, rasterizer: Rasterizer, photographs: Photographs, config: TrainConfig, further: Sequence[Device]
     ) -> None:
+        devices = (rasterizer.device, *further)
+        if len({device.queue.int_ptr for device in devices}) < len(devices):
+            raise InputError(
+                f"several devices to train on: got {', '.join(device.name for device in devices)}, of which two have "
+                "one queue and one set of kernels; expected each opened on its own, as a thread works with it"
+            )
         self.rasterizer, self.photographs, self.config = rasterizer, photographs, config
         self.replicas = [Replica(device, config, photographs) for device in further]
         self._sums: AnyGaussians | None = None
@@ -273,14 +281,15 @@ class Batch:
         step_of_view = _AddedView(*settings, explore=explore and explore.of_view())
         steps = [replace(step_of_view, appearance=appearance) for appearance in appearances]
         steps = steps or [step_of_view] * len(samples)
-        gains = appearances[0].gains.gains.get() if appearances and self.replicas else None
+        gains = [each.values() if self.replicas else None for each in appearances] or [None] * len(samples)
         first, *others = shares(len(samples), 1 + len(self.replicas))
         transfers = self._send(model[0])
         pending: list[tuple[int, Future[Outcome]]] = []
         try:
             for replica, share in zip(self.replicas, others, strict=True):
                 for place, index in enumerate(share):
-                    view = partial(replica.view, place, samples[index], factor, steps[index], gains, splats=statistics)
+                    of_view = (samples[index], factor, steps[index], gains[index])
+                    view = partial(replica.view, place, *of_view, splats=statistics)
                     pending.append((index, replica.thread.submit(view)))
             losses = [self._view((model[0], sums), samples[index], factor, steps[index], probes) for index in first]
             for transfer in transfers:
@@ -350,7 +359,7 @@ class Batch:
         """A view on the device that has the model, which here are its parameters and the sums."""
         gradients = _gradients(self.rasterizer.work, model[0])
         pixels = (self.photographs.bring(sample.view, factor), sample.camera, sample.background)
-        return step.run(model, *pixels, probes(sample, step), gradients, reads_loss=True, kept=sample.kept)
+        return step.run(model, *pixels, probes(sample, step), gradients, reads_loss=True, **sample.known)
 
     def _take(self, sums: AnyGaussians, outcome: Outcome, step: _AddedView, probe: StepProbe) -> Loss:
         """Add what a view has found on another device, in the memory of a view on this one."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from compare import assert_same_bits
 from quick import quick
+from same_bytes import opened_again
 from scenes import random_cloud
 from tiny import CONFIG, short, write_scene
 
@@ -221,7 +222,7 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
 
 def test_the_needs_of_a_batch_are_those_of_its_arrays(scene: Scene, default_device: Device) -> None:
     """On the device that has the model, and on another."""
-    devices = [with_limit(default_device, 2**40) for _ in range(2)]
+    devices = [with_limit(each, 2**40) for each in (default_device, opened_again(default_device))]
     config = short(batch=2, iterations=2, random_points=6000, sh_degree_every=0, warmup=())
     trainer = Trainer(scene, config, devices[0], further=devices[1:])
     trainer.train_step()

@@ -252,6 +252,13 @@ def test_trouble_on_a_further_device_ends_the_training(
     assert ended.is_set(), "the other device's view was waited for"
 
 
+def test_a_device_that_is_there_twice_is_refused(scene: Scene, default_device: Device) -> None:
+    """Two threads would set arguments of the same kernels; a limit makes no other device of it."""
+    for twin in (default_device, default_device.with_memory_limit(2**30)):
+        with pytest.raises(InputError, match="one queue and one set of kernels; expected each opened on its own"):
+            train(scene, TWO, device=[default_device, twin])
+
+
 def test_a_view_without_a_finite_loss_is_named(scene: Scene, default_device: Device) -> None:
     """Never a NaN in the model, and the view that had it is told, on either device."""
     for devices in ([default_device], halves(default_device.index)):

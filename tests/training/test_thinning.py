@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from compare import assert_same_bits
 from numpy.typing import NDArray
-from same_bytes import check_in_less_memory, interrupted, model_bytes
+from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
 from scenes import random_cloud
 from tiny import short, write_scene
 
@@ -28,7 +27,6 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
-from clsplat.training.trainer import Trainer
 
 CONFIG = replace(short(iterations=40), thinning=0.5)
 GROUP_FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
@@ -135,15 +133,7 @@ def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -
 
 
 def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:
-    config, models = replace(CONFIG, batch=2), []
-    for further in ((), (default_device,)):
-        trainer = Trainer(scene, config, default_device, further=further)
-        for _ in range(12):
-            trainer.train_step()
-        models.append(trainer.gaussians().arrays())
-        trainer.close()
-    for name, values in models[0].items():
-        assert_same_bits(models[1][name], values, name)
+    check_on_two_devices(scene, CONFIG, default_device, 12)
 
 
 @pytest.mark.parametrize("rate", [-0.1, 0.95])
