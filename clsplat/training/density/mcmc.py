@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Density control as sampling (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo"): dead
-Gaussians move to live ones, the model grows to a given number, and noise explores. Policy only: no device."""
+Gaussians move to live ones, the model grows to a given number, and noise explores. It grows where the picture is wrong,
+which is not as published (docs/decisions/0027-the-long-axis.md). Policy only: no device."""
 
 from __future__ import annotations
 
 from functools import cache
 from itertools import pairwise
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float64
+from clsplat.arrays import Float32, Float64
 from clsplat.config.exploring import Exploration, step_key
+from clsplat.config.marking import MarkRules
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
@@ -25,6 +28,8 @@ OPAQUE = 1 - 1e-7
 """Opacity that is counted as no more than this, and from which on a logit has no room left in float32."""
 DRAWN = 1 / 255
 """Opacity up to which a Gaussian is in no picture."""
+EVERY = MarkRules(gradient=-inf, large=-inf)
+"""Rules by which every Gaussian has its mean gradient for a score."""
 
 
 class Mcmc(Strategy):
@@ -35,8 +40,10 @@ class Mcmc(Strategy):
         self.train, self.config = config, config.density
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Radii, where Gaussians move for being large on the screen."""
-        return StatisticsNeeds(gradients=self.config.max_screen_radius > 0 and step < self.config.stop)
+        """Gradients as long as the model grows, and radii where Gaussians move for being large on the screen."""
+        config = self.config
+        moves = config.max_screen_radius > 0 and step < config.stop
+        return StatisticsNeeds(gradients=moves or step <= halfway(config))
 
     def is_due(self, step: int) -> bool:
         """True if Gaussians move."""
@@ -64,9 +71,10 @@ class Mcmc(Strategy):
         fresh[count:] = True
         opacities = np.concatenate([opacities, np.zeros(more)])
         log_scales = np.concatenate([log_scales, np.zeros((more, 3))])
+        wrong = grown_from(model.marker.scores(EVERY), dead) if more else None
         for places, weights in (
             (np.flatnonzero(dead), np.where(dead, 0.0, opacities[:count])),
-            (np.arange(count, count + more), None),
+            (np.arange(count, count + more), wrong),
         ):
             chances = opacities[:count] if weights is None else weights
             parents = draw(chances, len(places), rng)
@@ -110,10 +118,22 @@ class Mcmc(Strategy):
         return None if drawn.all() or not drawn.any() else RowPlan(rows=np.flatnonzero(drawn).astype(np.uint32))
 
 
+def halfway(config: DensityConfig) -> int:
+    """Step in the middle of growth and moves, at which the cap is reached."""
+    return (config.start + config.stop) // 2
+
+
+def grown_from(scores: Float32, dead: NDArray[np.bool_]) -> Float64 | None:
+    """Weights (n,) by which Gaussians are drawn to grow from: mean gradients on the screen, 0 for the dead; None if all
+    are 0."""
+    weights = np.where(dead, 0.0, np.maximum(scores, 0)).astype(np.float64)
+    return weights if weights.any() else None
+
+
 def wanted(config: DensityConfig, step: int, count: int) -> int:
     """Number of Gaussians after this step's growth, when there are `count` before it: a twentieth more, or as many as
     let the cap be reached halfway from `start` to `stop`."""
-    left = max((config.start + config.stop) // 2 - step, 0) // config.every + 1
+    left = max(halfway(config) - step, 0) // config.every + 1
     factor: float = max(GROWTH, (config.max_gaussians / count) ** (1 / left))
     return max(min(config.max_gaussians, round(factor * count)), count)
 
