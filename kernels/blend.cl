@@ -8,9 +8,11 @@
 // Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), camera
 //   with RAYS -> image (3, height, width) of colour; transmittance (height, width): what is left at the end, 0 to 1;
 //   stops (height, width): the sorted index from which on the pixel takes no more, -1 in padding. Sizes are padded to
-//   whole tiles, and padding is black. cells_from_sorted (pairs): the cells of the tile, as bits, in which the Gaussian
+//   whole tiles, and padding is black. With NEARNESS nearness (height, width): the sum of weight over depth, 0 in
+//   padding. cells_from_sorted (pairs): the cells of the tile, as bits, in which the Gaussian
 //   contributes, for the gradient to go through.
-// Equations: docs/gradients.md, (14) to (16) and (45); with RAYS docs/cameras.md, (14); Kerbl et al. 2023, section 6
+// Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
+// section 6
 //   and algorithm 2.
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -47,10 +49,14 @@
 typedef struct {
   floatL t, kept, red, green, blue;
   intL stop;
+#ifdef NEARNESS
+  floatL near;
+#endif
 } Pixels;
 
 // Adds the tile's i-th pair to a cell that it reaches; returns whether that fills the last pixel of the cell.
-static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, float c_green, float c_blue) {
+static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, float c_green,
+                               float c_blue NEAR_PARAMETER) {
   const floatL before = p->t;
   floatL alpha = exp2L(power);
   alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
@@ -61,6 +67,9 @@ static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, floa
   p->red = fmaL(weight, (floatL)(c_red), p->red);
   p->green = fmaL(weight, (floatL)(c_green), p->green);
   p->blue = fmaL(weight, (floatL)(c_blue), p->blue);
+#ifdef NEARNESS
+  p->near = fmaL(weight, (floatL)(c_near), p->near);
+#endif
   p->t = AS_FLOATL(AS_INTL(after) & goes_on);
   const intL ended = AS_INTL(before) & ~goes_on; // a positive number's bits, or none
   if (!ANYL(ended)) return 0;
@@ -73,6 +82,10 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
                           __global const uint *ranges, __global const uint *gaussian_from_sorted,
                           __global const float *splats, __global const float *background, __global float *image,
                           __global float *transmittance, __global int *stops
+#ifdef NEARNESS
+                          ,
+                          __global float *nearness
+#endif
 #ifdef RECORD_CELLS
                           ,
                           __global uint *cells_from_sorted
@@ -99,6 +112,9 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     const floatL zero = (floatL)(0.0f), one = (floatL)(1.0f);
     const Pixels p = {inside ? one : zero, one, zero, zero, zero, inside ? (intL)(end) : (intL)(-1)};
     pixels[cell] = p;
+#ifdef NEARNESS
+    pixels[cell].near = zero;
+#endif
     if (ANYL(inside)) OPEN_CELL(open, cell);
   }
 
@@ -115,6 +131,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i];
     SPLAT_HERE(splat)
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
+    NEAR_HERE(1.0f / splat[SPLAT_DEPTH])
     RECORD(uint cells = 0;)
     FOR_CELLS(cell, IN_OPEN(reach, open)) {
       const floatL power = LOG2_ALPHA(splat, cell);
@@ -122,7 +139,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
       const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
       if (CONTRIBUTES(reached)) {
         RECORD(cells |= 1u << cell;)
-        if (add_gaussian(pixels + cell, power, i, c_red, c_green, c_blue)) CLOSE_CELL(open, cell);
+        if (add_gaussian(pixels + cell, power, i, c_red, c_green, c_blue NEAR_ARGUMENT)) CLOSE_CELL(open, cell);
         COUNT(added -= reached & MASKL(pixels[cell].t > 0.0f);)
       }
     }
@@ -150,13 +167,14 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
       OPEN_CELLS(open)
       const int i = batch + j;
       SPLAT_STAGED(staged[j])
+      NEAR_HERE(s.near)
       const uint blocks = GOES_ON(open) ? FROM_OWN(s.blocks) : 0;
       FOR_CELLS(cell, blocks) {
         const floatL power = LOG2_ALPHA(splat, cell);
         COUNT(evaluated += LANES;)
         const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
         if (CONTRIBUTES(reached)) {
-          add_gaussian(pixels + cell, power, i, c_red, c_green, c_blue);
+          add_gaussian(pixels + cell, power, i, c_red, c_green, c_blue NEAR_ARGUMENT);
           COUNT(added -= reached & MASKL(pixels[cell].t > 0.0f);)
         }
       }
@@ -185,6 +203,9 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     STORE_CELL(float, fmaL(left, (floatL)(background[0]), p.red), image + pixel, stride);
     STORE_CELL(float, fmaL(left, (floatL)(background[1]), p.green), image + plane + pixel, stride);
     STORE_CELL(float, fmaL(left, (floatL)(background[2]), p.blue), image + 2 * plane + pixel, stride);
+#ifdef NEARNESS
+    STORE_CELL(float, p.near, nearness + pixel, stride);
+#endif
     STORE_CELL(float, at_end, transmittance + pixel, stride);
     STORE_CELL(int, p.stop, stops + pixel, stride);
   }

@@ -5,9 +5,10 @@
 // Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's. An item has pixels; with
 //   BY_GAUSSIAN it has one Gaussian after the other.
 // Buffers: blend's, its transmittance and stops, image_gradient (3, height, width): of the loss by colour,
-//   with ALPHA_GRADIENT a fourth plane: by what is left for the background; slot_from_sorted (pairs) -> slots (pairs,
+//   with ALPHA_GRADIENT a fourth plane: by what is left for the background, with NEARNESS a last one: by the sum of
+//   weight over depth; slot_from_sorted (pairs) -> slots (pairs,
 //   SLOT_STRIDE), every one of them: sums over the tile's pixels in blend's whitened units (49).
-// Equations: docs/gradients.md, (14), (22) to (26), (48), (49) and (55); with RAYS docs/cameras.md, (21).
+// Equations: docs/gradients.md, (14), (22) to (26), (48), (49), (55) and (122); with RAYS docs/cameras.md, (21).
 //
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
@@ -50,6 +51,9 @@ static inline float inverse_of(float x) {
 typedef struct {
   floatL t, behind, red, green, blue;
   intL stop;
+#ifdef NEARNESS
+  floatL near;
+#endif
 } Pixels;
 
 // A pair in a cell's pixels: g, and the pair's weight in the colour.
@@ -58,11 +62,16 @@ typedef struct {
 } Share;
 
 // Takes a pair out of a cell's pixels, by its alpha before the cap, 0 in the lanes that did not take it.
-static inline Share take_out(Pixels *p, floatL uncapped, float c_red, float c_green, float c_blue) {
+static inline Share take_out(Pixels *p, floatL uncapped, float c_red, float c_green, float c_blue NEAR_PARAMETER) {
   const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
   const floatL inverse = INVERSE(1.0f - alpha);
   const floatL before = p->t * inverse;
-  const floatL shade = fmaL(p->red, (floatL)(c_red), fmaL(p->green, (floatL)(c_green), p->blue * c_blue));
+  const floatL colour = fmaL(p->red, (floatL)(c_red), fmaL(p->green, (floatL)(c_green), p->blue * c_blue));
+#ifdef NEARNESS
+  const floatL shade = fmaL(p->near, (floatL)(c_near), colour);
+#else
+  const floatL shade = colour;
+#endif
   const floatL weight = alpha * before;
   const floatL d_alpha = fmaL(before, shade, -(p->behind * inverse));
   const floatL g = AS_FLOATL(AS_INTL(alpha * d_alpha) & MASKL(uncapped < ALPHA_MAX));
@@ -105,6 +114,9 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
 #ifdef CONTRIBUTIONS
   sums[SLOT_WEIGHT] += share.weight;
 #endif
+#ifdef NEARNESS
+  sums[SLOT_NEAR] = fmaL(share.weight, p->near, sums[SLOT_NEAR]);
+#endif
 }
 
 // Alpha of the i-th pair of the tile's list in a cell's pixels.
@@ -146,7 +158,8 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
     u_of[cell] = u;                                                                                                    \
     reached |= (uint)(CONTRIBUTES(taken) != 0) << cell;                                                                \
   }                                                                                                                    \
-  FOR_CELLS(cell, reached) share_of[cell] = take_out(pixels + cell, alpha_of[cell], c_red, c_green, c_blue);           \
+  FOR_CELLS(cell, reached)                                                                                             \
+  share_of[cell] = take_out(pixels + cell, alpha_of[cell], c_red, c_green, c_blue NEAR_ARGUMENT);                      \
   FOR_CELLS(cell, reached)                                                                                             \
   add_gradients(sums, pixels + cell, share_of[cell], u_of[cell], l22 * (my - AT_Y(cell)), l11, l12, l22);
 #else
@@ -156,7 +169,7 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
     ALPHA_IN(cell)                                                                                                     \
     if (CONTRIBUTES(taken)) {                                                                                          \
       const floatL alpha = AS_FLOATL(AS_INTL(exp2L(power)) & taken);                                                   \
-      const Share share = take_out(pixels + cell, alpha, c_red, c_green, c_blue);                                      \
+      const Share share = take_out(pixels + cell, alpha, c_red, c_green, c_blue NEAR_ARGUMENT);                        \
       add_gradients(sums, pixels + cell, share, u, v, W11, W12, W22);                                                  \
     }                                                                                                                  \
   }
@@ -180,8 +193,10 @@ static inline float row_sum(__local const float *row) {
 // The gradient by a pixel's transmittance at the end; background: of what is behind.
 #ifdef ALPHA_GRADIENT
 #define AT_END(background) ((background) + by_t)
+#define NEAR_PLANE 4
 #else
 #define AT_END(background) (background)
+#define NEAR_PLANE 3
 #endif
 
 GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
@@ -203,6 +218,9 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 #ifdef BY_GAUSSIAN
   __local Passing passing[TILE * TILE];
   __local Fixed fixed[TILE * TILE];
+#ifdef NEARNESS
+  __local float near[TILE * TILE];
+#endif
   for (int k = ITEM; k < TILE * TILE; k += ITEMS) {
     const int x = k % TILE, y = k / TILE;
     const size_t pixel = stride * (tile_y + y) + tile_x + x;
@@ -220,6 +238,9 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 #endif
     passing[PLACE(x, y)] = (Passing)(t, t * AT_END(f.x * background[0] + f.y * background[1] + f.z * background[2]));
     fixed[PLACE(x, y)] = f;
+#ifdef NEARNESS
+    near[PLACE(x, y)] = stop >= 0 ? image_gradient[NEAR_PLANE * plane + pixel] : 0.0f;
+#endif
     last = max(last, stop);
   }
 #else
@@ -245,11 +266,16 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     const Pixels p = {t, behind, red, green, blue, stop};
     pixels[cell] = p;
     last = max(last, maxL(stop));
+    intL alive = (red != 0.0f) | (green != 0.0f) | (blue != 0.0f);
 #ifdef ALPHA_GRADIENT
-    if (ANYL((red != 0.0f) | (green != 0.0f) | (blue != 0.0f) | (by_t != 0.0f))) OPEN_CELL(live, cell);
-#else
-    if (ANYL((red != 0.0f) | (green != 0.0f) | (blue != 0.0f))) OPEN_CELL(live, cell);
+    alive |= by_t != 0.0f;
 #endif
+#ifdef NEARNESS
+    pixels[cell].near =
+        AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + NEAR_PLANE * plane + pixel, stride) & inside);
+    alive |= pixels[cell].near != 0.0f;
+#endif
+    if (ANYL(alive)) OPEN_CELL(live, cell);
   }
 #endif
   RAISE_TO_GROUP_MAX(last)
@@ -272,6 +298,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
     __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[i];
     SPLAT_HERE(splat)
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
+    NEAR_HERE(1.0f / splat[SPLAT_DEPTH])
 #ifdef RECORD_CELLS
     const uint reach = LIVE(cells_from_sorted[i], live);
     if (reach == 0) {
@@ -297,6 +324,9 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
 #ifdef CONTRIBUTIONS
     slot[SLOT_WEIGHT] = sumL(sums[SLOT_WEIGHT]);
 #endif
+#ifdef NEARNESS
+    slot[SLOT_NEAR] = sumL(sums[SLOT_NEAR]);
+#endif
   }
 #elif defined(BY_GAUSSIAN)
   __local Staged staged[ITEMS]; // by an item for itself, all at once
@@ -314,13 +344,23 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
         }
         const Staged s = staged[ITEM];
         const int i = turn - 1 - ITEM;
-        const Walker w = {
-            s.mx, s.my, s.l11, s.l12, s.l22, s.log2o, s.red, s.green, s.blue, i, i >= begin ? s.blocks : 0, s.slot};
+        const Walker w = {s.mx,
+                          s.my,
+                          s.l11,
+                          s.l12,
+                          s.l22,
+                          s.log2o,
+                          s.red,
+                          s.green,
+                          s.blue,
+                          i,
+                          i >= begin ? s.blocks : 0,
+                          s.slot NEAR_OF_STAGED};
         walker = w;
         for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
       }
       const int chunk = (round - ITEM) & (ITEMS - 1);
-      if (walker.blocks >> CHUNK_BLOCK(chunk) & 1) take_chunk(&walker, chunk, passing, fixed, sums);
+      if (walker.blocks >> CHUNK_BLOCK(chunk) & 1) take_chunk(&walker, chunk, passing, fixed, sums NEAR_PIXELS);
       BARRIER_LOCAL();
     }
   }
@@ -339,6 +379,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
       for (int j = 0; j < together; ++j) {
         const int i = batch - 1 - first - j;
         SPLAT_STAGED(staged[first + j])
+        NEAR_HERE(s.near)
         float sums[SLOT_STRIDE];
         for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
         TAKE_PAIR(FROM_OWN(s.blocks))

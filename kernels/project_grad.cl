@@ -54,17 +54,6 @@ __kernel void add_slots(const uint n, __global const uint *tile_counts, __global
 }
 #endif
 
-// s1 - s2, their logarithms `x` apart: near each other by the series of exp(x) - 1, as what rounding leaves of two
-// equal scales' difference would turn every ball.
-static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
-  floatL series = fmaL(x, (floatL)(1.0f / 720.0f), (floatL)(1.0f / 120.0f));
-  series = fmaL(x, series, (floatL)(1.0f / 24.0f));
-  series = fmaL(x, series, (floatL)(1.0f / 6.0f));
-  series = fmaL(x, series, (floatL)(0.5f));
-  series = fmaL(x * x, series, x) * s2;
-  return x * x < 0.0625f ? series : s1 - s2;
-}
-
 // Memory that the gradients of the higher SH bands are written to: all Gaussians', or a work-item's own. With one lane
 // project_step makes them of basis and colour.
 #if !defined(ADAM)
@@ -216,6 +205,13 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
   }
 
+  // (122). The gradient of nearness by depth, which along the axis is towards the camera.
+#ifndef NEARNESS
+#define LESS_NEAR(z)
+#else
+#define LESS_NEAR(z) -m[SLOT_NEAR].all / ((z) * (z))
+#endif
+
   // (59) to (61): log scales, the turn in the Gaussian's own frame, and what the Jacobian takes of the gradient.
   floatL d_size = (floatL)(0.0f), along_u = d_size, along_v = d_size, turned[3];
   FOR_AXES(k) {
@@ -265,12 +261,12 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   low_pass_gradient(p.f, camera, by_covariance, by_low_pass);
   const float turn_x = (d_mx + by_low_pass[0] - l11 * along_u / p.distance) / p.distance;
   const float turn_y = (d_my + by_low_pass[1] - fma1(l12, along_u, l22 * along_v) / p.distance) / p.distance;
-  const float shrink = d_size / p.distance;
+  const float shrink = d_size / p.distance - (0.0f LESS_NEAR(p.distance));
   const float d_x = fma1(turn_x, p.t.e1[0], fma1(turn_y, p.t.e2[0], -(shrink * p.f[0])));
   const float d_y = fma1(turn_x, p.t.e1[1], fma1(turn_y, p.t.e2[1], -(shrink * p.f[1])));
   const float d_z = fma1(turn_x, p.t.e1[2], fma1(turn_y, p.t.e2[2], -(shrink * p.f[2])));
 #elif defined(ORTHOGRAPHIC) // the image is linear in x and y, and in nothing else
-  const floatL d_x = p.jx * d_mx, d_y = p.jy * d_my, d_z = (floatL)(0.0f);
+  const floatL d_x = p.jx * d_mx, d_y = p.jy * d_my, d_z = (floatL)(0.0f)LESS_NEAR(p.z);
 #else
   // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, J moves with
   // z alone.
@@ -286,7 +282,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   const floatL d_j12 = ry == p.ry ? fmaL(l12, along_u, l22 * along_v) : (floatL)(0.0f);
 #endif
   const floatL d_x = p.jx * (d_mx - d_j02 / p.z), d_y = p.jy * (d_my - d_j12 / p.z);
-  const floatL d_z = -fmaL(d_x, rx, fmaL(d_y, ry, d_size / p.z));
+  const floatL d_z = -fmaL(d_x, rx, fmaL(d_y, ry, d_size / p.z)) LESS_NEAR(p.z);
 #endif
 
   // Colour, (38) to (40): a channel that is clamped has no gradient; the basis depends on the mean through the view

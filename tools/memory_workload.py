@@ -34,6 +34,7 @@ from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.data_set import Lens
+from clsplat.scenes.depth import KnownDepth
 from clsplat.scenes.scene import Scene
 from clsplat.stages.adam import adam, add_view
 from clsplat.stages.blend import count_pairs, tile_items
@@ -96,11 +97,11 @@ def frames(device: Device) -> None:
         rasterizer = Rasterizer(device, config)
         if small:
             rasterizer.capacity = 70
-        frame = rasterizer.forward(held, view, background)
+        frame = rasterizer.forward(held, view, background, nearness=True)
         if small and len(frame.bands) < 2:
             raise SystemExit("the frame in bands has one band only")
-        gradient = np.zeros(frame.blended.image.shape, np.float32)
-        gradient[:, :17, :33] = np.random.default_rng(1).normal(size=(3, 17, 33))
+        gradient = np.zeros((4, *frame.blended.image.shape[1:]), np.float32)
+        gradient[:, :17, :33] = np.random.default_rng(1).normal(size=(4, 17, 33))
         gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
         screen = rasterizer.backward(held, frame, upload(device, gradient), gradients, fields=WIDEST_SLOTS)
         read = [*(gradients[group].get() for group in GROUPS), screen.gradients.get(), frame.blended.image.get()]
@@ -191,7 +192,9 @@ def methods(device: Device) -> None:
     _train(device, replace(short, antialiased=True), 3, VIEW)
     _train(device, replace(short, density=replace(PAPER.density, growth="mcmc", max_gaussians=60)), 3, VIEW)
     _train(device, replace(short, appearance="exposure", masks="ignore"), 5, VIEW)
+    _train(device, replace(short, appearance="grid"), 3, VIEW)
     _train(device, replace(short, masks="transparent"), 5, VIEW)
+    _train(device, replace(short, depth="points"), 3, VIEW)
     edges = replace(PAPER.density, growth="budget", max_gaussians=60, long_axis=True, edge_views=1)
     _train(device, replace(short, thinning=0.3, density=edges), 3, VIEW)
     fisheye = replace(VIEW, fx=9.0, fy=9.0, projection="fisheye", radial=(0.05, 0.01, 0.0, 0.0))
@@ -227,7 +230,9 @@ def scene_of(view: Camera, pixels: NDArray[np.float32]) -> Scene:
             return self.pixels[: height or view.height, : width or view.width]
 
     lens = Lens("PINHOLE", view.width, view.height, (view.fx, view.fy, view.cx, view.cy))
-    picture = Picture("0.png", view, Path("0.png"), "train", lens, pixels=pixels)
+    means = cloud(18, VIEW, 5, degree=0).means.astype(np.float64)
+    depth = KnownDepth(means, np.ones(len(means)))  # for trainings that compare depths
+    picture = Picture("0.png", view, Path("0.png"), "train", lens, depth=depth, pixels=pixels)
     return Scene("tiny", [picture], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (-np.ones(3), np.ones(3)))
 
 

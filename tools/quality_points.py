@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dense points against sparse ones: in how many steps they reach what sparse ones do in many.
+"""Dense points and known depths against sparse points: in how many steps they reach what sparse ones do in many.
 
     .venv/bin/python tools/quality_points.py FOLDER [--rgbd SCENE] [--width 120] [--photos 40] [--iterations 7000]
         [--least 2500] [--sparse 1000] [--dense 40000] [--seed 0]
@@ -7,8 +7,9 @@
 The scene is the demo's, whose ray caster knows every depth; with --rgbd it is a folder of frame-N.color.jpg, .depth.png
 (16 bit, mm) and .pose.txt, with camera-intrinsics.txt beside. It is written as nerfstudio's transforms.json. Sparse
 points are drawn at random from the dense ones, as many as structure from motion finds in pictures so small. Trained are
-FOLDER/sparse with --iterations steps and FOLDER/dense with --least. Runs that are there are not made again. The table
-is of PSNR on the held-out pictures by step.
+FOLDER/sparse with --iterations steps, FOLDER/dense with --least, FOLDER/depth with as many from the sparse points with
+depth maps, and FOLDER/both. Runs that are there are not made again. The table is of PSNR on the held-out pictures by
+step.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ def write_scene(
     seed: int,
 ) -> Path:
     """The scene with sparse.ply in transforms.json, and dense.ply, of depths that are 0 where they are not known."""
-    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for name in ("images", "depths"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
     frames: list[dict[str, Any]] = []
     points, colors = [], []
     for index, (view, picture, depth) in enumerate(zip(views, pictures, depths, strict=True)):
@@ -52,7 +54,9 @@ def write_scene(
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = view.rotation.T @ COLMAP_FROM_OPENGL, view.position
         lens = {"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy, "w": view.width, "h": view.height}
-        frames.append({"file_path": f"images/{index:03d}.png", **lens, "transform_matrix": matrix.tolist()})
+        np.save(folder / "depths" / f"{index:03d}.npy", depth)
+        files = {"file_path": f"images/{index:03d}.png", "depth_file_path": f"depths/{index:03d}.npy"}
+        frames.append({**files, **lens, "transform_matrix": matrix.tolist()})
         if index % 8:  # none of the points are of held-out pictures
             rows, columns = np.nonzero(depth)
             z = depth[rows, columns].astype(float)
@@ -143,7 +147,12 @@ def main() -> None:
         made = demo(options.width, options.photos, options.seed)
     scene = write_scene(options.folder / "scene", *made, (options.sparse, options.dense), options.seed)
     dense = ("--points", str(scene / "dense.ply"))
-    trainings = {"sparse": (options.iterations, ()), "dense": (options.least, dense)}
+    trainings: dict[str, tuple[int, tuple[str, ...]]] = {
+        "sparse": (options.iterations, ()),
+        "dense": (options.least, dense),
+        "depth": (options.least, ("--depth", "maps")),
+        "both": (options.least, (*dense, "--depth", "maps")),
+    }
     scores: dict[str, dict[int, float]] = {}
     for name, (iterations, more) in trainings.items():
         run = options.folder / name

@@ -35,6 +35,7 @@ from clsplat.config.pictures import (
 )
 from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import check_new, digest
 from clsplat.process import terminable
@@ -79,6 +80,9 @@ class Render(Verb):
     negative number."""
     usd_camera: Annotated[str | None, arg(metavar="PRIM")] = None
     """Path or name of the camera, for a USD stage that has several."""
+    lenses: Annotated[Lenses | None, arg(metavar="undistort|native")] = None
+    """Photographs' cameras that are fisheyes: undistort, as the pinhole cameras that they hold; native, through their
+    own lens. If not given: as the run was trained, but for --path, which is of pinhole cameras, else undistort."""
     channels: Annotated[str, arg(metavar="NAME,...")] = "rgb"
     """Channels of the files: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion, count
     and id (of Gaussians). docs/render.md has each."""
@@ -149,17 +153,17 @@ class Render(Verb):
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
     def completed(self, given: Collection[str]) -> Render:
-        """The rasterizer's settings are those of the preset, or else of the run."""
+        """The rasterizer's settings are those of the preset, or else of the run, as are the lenses."""
         from clsplat.models.formats import model_path
         from clsplat.runs.run import Run, is_run
 
+        bundle, lenses = PRESETS["default"], self.lenses or "undistort"
+        if self.model.is_dir() and (is_run(self.model) or model_path(self.model) == self.model):
+            config = Run.open(self.model).config  # refuses a folder that is neither run nor model
+            bundle, lenses = config.rasterizer, self.lenses or ("undistort" if self.path else config.lenses)
         if self.preset is not None:
             bundle = PRESETS[self.preset]
-        elif self.model.is_dir() and (is_run(self.model) or model_path(self.model) == self.model):
-            bundle = Run.open(self.model).config.rasterizer  # refuses a folder that is neither run nor model
-        else:
-            return self
-        return replace(self, rasterizer=with_given(bundle, self.rasterizer, given, "rasterizer."))
+        return replace(self, rasterizer=with_given(bundle, self.rasterizer, given, "rasterizer."), lenses=lenses)
 
 
 def run(verb: Render, services: Services) -> int:
@@ -199,7 +203,8 @@ def _read_job(verb: Render) -> Job:
     resize = resizer(verb.width, verb.height, verb.scale)
     devices = _devices(verb)
     size = (verb.width, verb.height)
-    whole = choose_shot(verb.cameras, path=verb.path, count=verb.count, size=size, usd_camera=verb.usd_camera)
+    of_cameras: dict[str, Any] = {"usd_camera": verb.usd_camera, "lenses": verb.lenses or "undistort"}
+    whole = choose_shot(verb.cameras, path=verb.path, count=verb.count, size=size, **of_cameras)
     chosen = whole if verb.frames is None else whole.only(verb.frames)
     sampling = options.pictures.sampling
     tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)

@@ -110,7 +110,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
-    from clsplat.selftest.result import APPEARANCE, MASKS, TRAINING
+    from clsplat.selftest.result import APPEARANCE, DEPTH, MASKS, TRAINING
 
     verb.device.check()
     verb.config.check()
@@ -143,7 +143,8 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     stages = (
         *TRAINING,
         *(() if config.mask_use == NO_MASKS else MASKS),
-        *(() if config.appearance == "none" else APPEARANCE),
+        *APPEARANCE[config.appearance],
+        *(DEPTH if config.depth_use else ()),
     )
     devices = [services.require(device, stages) for device in devices]
     verb.output.mkdir(parents=True, exist_ok=True)
@@ -209,6 +210,10 @@ def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
         from clsplat.scenes.cloud import with_points
 
         scene = with_points(scene, config.start_points)
+    if config.depth_use:
+        from clsplat.scenes.depth import with_depths
+
+        scene = with_depths(scene, config.depth_use)
     _check_scene(scene)
     return scene
 

@@ -11,6 +11,7 @@ from math import inf
 from typing import Literal
 
 from clsplat.config.checks import Rule, check_kinds, check_rules, check_steps
+from clsplat.config.depth import DepthSource, DepthUse, MapKind
 from clsplat.config.masks import AlphaMeaning, MaskMeaning, MaskUse
 from clsplat.config.points import PointsUse, StartPoints
 from clsplat.config.rasterizer import RasterizerConfig
@@ -20,7 +21,7 @@ from clsplat.errors import InputError
 Background = Literal["black", "white", "random"]
 Lenses = Literal["undistort", "native"]
 Growth = Literal["paper", "budget", "mcmc"]
-AppearanceKind = Literal["none", "exposure"]
+AppearanceKind = Literal["none", "exposure", "grid"]
 
 
 @dataclass(frozen=True)
@@ -116,9 +117,9 @@ class DensityConfig:
     growth: Growth = "paper"
     """paper: densify what is over the threshold; budget: the number of Gaussians rises along a parabola to
     max-gaussians at density.stop, the largest gradients first, whatever the threshold (Taming 3DGS); mcmc: Gaussians
-    under min-opacity move to where others are opaque, max-gaussians is reached by a twentieth more each time, and noise
-    moves what is nearly transparent (3DGS-MCMC). With mcmc there are no clones, splits and resets; max-screen-radius
-    moves Gaussians, from the start."""
+    under min-opacity move to where others are opaque, max-gaussians is reached by a twentieth more each time, where
+    gradients are large, and noise moves what is nearly transparent (3DGS-MCMC). With mcmc there are no clones, splits
+    and resets; max-screen-radius moves Gaussians, from the start."""
     long_axis: bool = False
     """Split what is densified along its longest axis, small or large, into two that lie on it (Improved-GS); there are
     no clones then. Not with growth mcmc."""
@@ -272,6 +273,18 @@ class TrainConfig:
     sky: int = 0
     """Points of a sky to start from, at most, on a sphere around the scene, where photographs show nothing above the
     scene's points; 0 for none."""
+    depth: DepthSource = "none"
+    """Known depths to compare the render's with. points: of the points of a COLMAP model, in the photographs that show
+    them; maps: depth maps in depths/ beside images/, or depth_file_path of transforms.json; none: none are used."""
+    depth_weight: float = 0.01
+    """Weight of the depth loss at the first step, the mean difference of one over the depth, which counts in parts of
+    one over the scene's extent; it falls to a hundredth at the last step."""
+    depth_maps: MapKind = "metric"
+    """metric: depth maps hold distances along the camera's axis, of fisheyes and panoramas from the camera, 0 where
+    nothing is known; relative: numbers that grow with nearness, brought to scale by the scene's points."""
+    depth_unit: float = 1e-3
+    """World units of one step of a depth map of whole numbers (PNG); the default is of millimetres in a scene in
+    metres."""
     checkpoint_every: int = 1000
     """Steps between checkpoints; 0 writes one at the end only, or at an interruption."""
     eval_at: tuple[int, ...] = ()
@@ -284,10 +297,13 @@ class TrainConfig:
     """Write report.html at the end."""
     appearance: AppearanceKind = "none"
     """exposure: learn a gain for each colour channel of each photograph, whose exposure and white balance then do not
-    go into the model; it has their mean. none: photographs are taken as they are."""
+    go into the model; it has their mean. grid: a bilateral grid of colour maps for each photograph, which also takes
+    what changes by place and brightness, as where photographs are of several cameras or were edited. none: photographs
+    are taken as they are."""
     appearance_rate: float = 2e-3
-    """Learning rate of appearance, as logarithms to base 2 of the gains; times the root of their
-    number, and in trainings of fewer than 10,000 steps by as much more as they are shorter."""
+    """Learning rate of appearance, as logarithms to base 2 of the gains, or as coefficients of a grid; times the
+    root of the photographs' number, and for gains in trainings of fewer than 10,000 steps by as much more as they are
+    shorter."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -299,7 +315,8 @@ class TrainConfig:
             (("appearance_rate",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
             (("thinning",), lambda value: 0 <= value <= 0.9, "0 to 0.9"),
-            (("alpha_weight",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
+            (("alpha_weight", "depth_weight"), lambda value: 0 <= value < inf, "a finite number, at least 0"),
+            (("depth_unit",), lambda value: 0 < value < inf, "a finite number, more than 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
             (("points_limit",), lambda value: value >= 1, "at least 1"),
             (
@@ -325,6 +342,8 @@ class TrainConfig:
             raise InputError(
                 f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
             )
+        if self.depth != "maps" and self.depth_maps != "metric":
+            raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
@@ -333,6 +352,11 @@ class TrainConfig:
     def mask_use(self) -> MaskUse:
         """The use of the scene's masks."""
         return MaskUse(self.masks, self.alpha, self.invert_masks)
+
+    @property
+    def depth_use(self) -> DepthUse:
+        """The known depths that are compared."""
+        return DepthUse(self.depth, self.depth_maps, self.depth_unit) if self.depth != "none" else DepthUse()
 
     @property
     def start_points(self) -> StartPoints:

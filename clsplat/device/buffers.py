@@ -11,15 +11,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from math import prod
-from typing import Any
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike, NDArray
 
 from clsplat.device.context import Device
+from clsplat.device.tape import CHECK, Tape, asked
 from clsplat.errors import CapacityError, InputError, amount
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +76,10 @@ class DeviceArray:
         if self.size:
             self.device.calls.fills += 1
             pattern = np.asarray(value, self.dtype)
-            event = cl.enqueue_fill_buffer(self.device.queue, self.buffer, pattern, 0, self.nbytes)
-            self._note("fill", event)
+            fill = partial(cl.enqueue_fill_buffer, self.device.queue, self.buffer, pattern, 0, self.nbytes)
+            self._note("fill", fill())
+            for tape in self.device.tapes:
+                tape.add_fill(fill, self.buffer.int_ptr, pattern.tobytes(), self.nbytes)
 
     def _note(self, name: str, event: cl.Event, nbytes: int | None = None) -> None:
         if self.device.recorder.on:
@@ -86,14 +93,21 @@ class DeviceArray:
         """Start a copy to the host behind what is on the queue now. The result waits for no more than that, and returns
         the copy. into: memory of that shape for it, such as `pinned`."""
         host = np.empty(self.shape, self.dtype) if into is None else into
+        copying = partial(cl.enqueue_copy, self.device.queue, host, self.buffer, is_blocking=False)
         self.device.calls.reads += 1
-        event = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False)
+        event = copying()
         self._note("read", event)
+
+        def again() -> None:
+            nonlocal event
+            event = copying()
 
         def finish() -> NDArray[Any]:
             event.wait()
             return host
 
+        for tape in self.device.tapes:
+            tape.add_read(again, self.buffer.int_ptr, self.nbytes)
         return finish
 
     def get_rows(self, start: int, stop: int) -> NDArray[Any]:
@@ -216,16 +230,58 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[
     return host  # type: ignore[no-any-return]  # it keeps the mapping, and that the buffer
 
 
+MOST_TAPES = 256
+"""Tapes of an object: those of photographs of a few sizes. With one more it begins again."""
+
+
 class Workspace:
     """Scratch arrays by name. A name's buffer is kept from call to call, and grows by half when it is too small, or
-    where memory is `tight` to just what is needed."""
+    where memory is `tight` to just what is needed.
+
+    It has the tapes of what is done to its arrays, which are good until one of these gets another buffer.
+    """
 
     def __init__(self, device: Device) -> None:
         self._device = device
         self.tight = device.memory.limit is not None
         self._poison = _poison()
+        self._use = asked()
         self._arrays: dict[str, DeviceArray] = {}
         self._latest: dict[str, tuple[DeviceArray, DTypeLike]] = {}
+        self._tapes: WeakKeyDictionary[object, dict[tuple[object, ...], tuple[Any, Tape]]] = WeakKeyDictionary()
+        self._renewed = 0
+
+    def replayed(
+        self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
+    ) -> R:
+        """The result of `make`, which is the same whenever it is called with this key, and so is what it puts on the
+        queue: from the second time on that comes from a tape.
+
+        of: the object with the arrays that are not the workspace's; with it its tapes go. The key has all else that
+        `make` depends on, but for `numbers`, which are those that it launches as `Anew`, in order.
+        """
+        if self._poison is not None or self._use == "0" or not self._device.replays:
+            return make()
+        tapes = self._tapes.get(of)
+        known = None if tapes is None else tapes.get(key)
+        if known is not None and self._use != CHECK:
+            known[1].set(numbers)
+            self._device.replay(known[1])
+            return known[0]  # type: ignore[no-any-return]  # what this key's `make` returned
+        renewed = self._renewed
+        result, tape = self._device.record(make)
+        if tape is None or self._renewed != renewed:
+            return result
+        if known is not None:
+            known[1].check(tape, numbers)
+            for read in known[1].reads:  # to where the result that is known has it
+                read()
+            return known[0]  # type: ignore[no-any-return]  # as above
+        tapes = self._tapes.setdefault(of, {})
+        if len(tapes) >= MOST_TAPES:
+            tapes.clear()
+        tapes[key] = result, tape
+        return result
 
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
@@ -241,6 +297,8 @@ class Workspace:
         if held is None or held.buffer.size < elements * kind.itemsize:
             roomy = held is not None and not self.tight
             spare = min(elements * 3 // 2, self._device.max_allocation // kind.itemsize) if roomy else 0
+            if held is not None:
+                self._forget_tapes()
             held = self._arrays.pop(name, None)
             latest = self._latest.pop(name, None)
             del held, latest  # before their successor is made: there need not be room for both
@@ -255,3 +313,9 @@ class Workspace:
         """Let go of every buffer."""
         self._arrays.clear()
         self._latest.clear()
+        self._forget_tapes()
+
+    def _forget_tapes(self) -> None:
+        """Let go of all tapes, and of those that are recorded just now."""
+        self._tapes.clear()
+        self._renewed += 1

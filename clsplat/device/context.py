@@ -25,6 +25,7 @@ from clsplat.device.quirks import compiles_by_size, no_device, title
 from clsplat.device.rehearsal import Rehearsal
 from clsplat.device.shapes import Shape, asked_shape, default_shape, shape_of, shape_text
 from clsplat.device.source import kernel_source
+from clsplat.device.tape import Tape
 from clsplat.device.traits import pretended, traits_of
 from clsplat.errors import DeviceError, DriverError, switched_on
 
@@ -106,9 +107,9 @@ class Device:
 
     why: the warning that this is not the wanted shape, given when the device is used; only_tries: a launch is
     rehearsed, if it has to be, and not made (`launch.only_tried`); waits: for each kernel, as SYNC asks; shares_memory:
-    its memory is the host's; calls: what its queue was given; under_way: events and buffers that keep arrays on the
-    host alive, which the device may still have to read; part: if it is a part of a listed device, that and its number;
-    index: in the list, of the whole.
+    its memory is the host's; calls: what its queue was given; tapes: those that are recorded just now; under_way:
+    events and buffers that keep arrays on the host alive, which the device may still have to read; part: if it is a
+    part of a listed device, that and its number; index: in the list, of the whole.
     """
 
     def __init__(
@@ -138,6 +139,7 @@ class Device:
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
         self.queue = cl.CommandQueue(self.context, device, properties)
         self.calls = Calls()
+        self.tapes: list[Tape] = []
         self.under_way: list[object] = []
         self._options = "-cl-std=CL1.2"
         if traits.exact_division:
@@ -229,9 +231,41 @@ class Device:
             elif wait:  # so that the last kernel that was named is the one that fails
                 self.finish()
         except cl.Error as error:
-            text = " ".join(str(error).split())
-            raise DriverError(self._trouble(kernel, f"cannot be launched: {text}")) from None
+            raise self._not_launched(kernel, error) from None
+        for tape in self.tapes:
+            tape.add_launch(self.queue, kernel, size, local, values)
         return event
+
+    def _not_launched(self, kernel: Kernel, error: cl.Error) -> DriverError:
+        return DriverError(self._trouble(kernel, f"cannot be launched: {' '.join(str(error).split())}"))
+
+    def record(self, work: Callable[[], T]) -> tuple[T, Tape | None]:
+        """The result of `work`, and a tape of what it has put on the queue; None where that cannot be put there again
+        as it was."""
+        tape, before = Tape(), copy(self.calls)
+        self.tapes.append(tape)
+        try:
+            result = work()
+        finally:
+            self.tapes.remove(tape)
+        return result, tape if tape.is_all_of(self.calls.since(before)) else None
+
+    def replay(self, tape: Tape) -> None:
+        """Put on the queue what the tape has. Raises DriverError, as `enqueue` does."""
+        kernel = None
+        try:
+            for kernel, call in tape.entries:  # noqa: B007  # the kernel is that of an error
+                call()
+        except cl.Error as error:
+            if kernel is None:
+                raise
+            raise self._not_launched(kernel, error) from None
+        self.calls.add(tape.calls)
+
+    @property
+    def replays(self) -> bool:
+        """True if what a tape has may be put on the queue: nothing wants to see each launch."""
+        return not (self.waits or self.recorder.on or self.only_tries)
 
     def _wait_for(self, event: cl.Event, kernel: Kernel) -> None:
         """Wait for a kernel that has been put on the queue. Raises DriverError for one that does not come back."""

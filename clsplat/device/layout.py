@@ -58,7 +58,8 @@ distance; tiles of the box, 16 bits each, first and one past the last (kernels/s
 
 SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
 """Partial gradients of one (tile, Gaussian) pair; the last two only where absolute gradients are kept. Where
-contributions are kept, the sum of the blending weights is behind them all (`kernels/shared/splat.h`: SLOT_WEIGHT)."""
+contributions are kept, the sum of the blending weights is behind them all, and behind that, where depths are compared,
+the gradient by nearness (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR)."""
 
 SLOT_PLAIN = SLOT.index("ABSX")
 
@@ -79,25 +80,31 @@ DEEP = ("RED", "GREEN", "BLUE", "ALPHA", "FIRST", "LAST")
 
 @dataclass(frozen=True)
 class SlotFields:
-    """Fields of a slot beside the plain gradients: absolute ones (AbsGS), the contribution to the image."""
+    """Fields of a slot beside the plain gradients: absolute ones (AbsGS), the contribution to the image, the gradient
+    by nearness (one over the depth)."""
 
     absolute: bool = False
     contributions: bool = False
+    nearness: bool = False
 
     @property
     def floats(self) -> int:
         """Floats from one slot to the next."""
-        return (len(SLOT) if self.absolute else SLOT_PLAIN) + self.contributions
+        return (len(SLOT) if self.absolute else SLOT_PLAIN) + self.contributions + self.nearness
 
     @property
     def defines(self) -> dict[str, object]:
         """Defines for the kernels that write and read slots; none for the plain ones."""
-        wanted = {"ABSOLUTE_GRADIENTS": self.absolute, "CONTRIBUTIONS": self.contributions}
+        wanted = {
+            "ABSOLUTE_GRADIENTS": self.absolute,
+            "CONTRIBUTIONS": self.contributions,
+            "NEARNESS": self.nearness,
+        }
         return {name: True for name, on in wanted.items() if on}
 
 
 PLAIN_SLOTS = SlotFields()
-WIDEST_SLOTS = SlotFields(absolute=True, contributions=True)
+WIDEST_SLOTS = SlotFields(absolute=True, contributions=True, nearness=True)
 
 
 def header() -> str:

@@ -50,6 +50,17 @@ class Calls:
         """The counts less those of a copy that was made earlier."""
         return Calls(*(now - then for now, then in zip(astuple(self), astuple(earlier), strict=True)))
 
+    @property
+    def total(self) -> int:
+        """All of them."""
+        return sum(astuple(self))
+
+    def add(self, more: Calls) -> None:
+        """Count what a tape has, which never waits."""
+        self.launches += more.launches
+        self.fills += more.fills
+        self.reads += more.reads
+
 
 class Recorder:
     """A device has one. Off unless inside `recording`; then every launch and transfer is noted under its stage."""

@@ -109,8 +109,8 @@ class Kernel:
     a launch.
     """
 
-    def __init__(self, variant: Variant, kernel: Any) -> None:
-        self.variant = variant
+    def __init__(self, variant: Variant, program: cl.Program, kernel: Any) -> None:
+        self.variant, self.program = variant, program
         self.name: str = kernel.function_name
         self.cl_kernel = kernel
         self.tried: set[str] = set()
@@ -124,7 +124,7 @@ class Kernels:
     """The kernels of one source file with one set of defines, by name; each kernel object is made once."""
 
     def __init__(self, variant: Variant, program: cl.Program) -> None:
-        self._kernels = {kernel.function_name: Kernel(variant, kernel) for kernel in program.all_kernels()}
+        self._kernels = {kernel.function_name: Kernel(variant, program, kernel) for kernel in program.all_kernels()}
 
     def __getattr__(self, name: str) -> Kernel:
         try:

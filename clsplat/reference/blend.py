@@ -23,7 +23,8 @@ TRANSMITTANCE_MIN = float(np.float32(1e-4))
 @dataclass(frozen=True, eq=False)
 class Blended:
     """image (H, W, 3); transmittance (H, W), what is left for the background; last (H, W), position in `order` of
-    the last Gaussian that was added, -1 for none; count (H, W), how many were added; margin (H, W), the smallest
+    the last Gaussian that was added, -1 for none; count (H, W), how many were added; nearness (H, W), the sum of weight
+    over depth; margin (H, W), the smallest
     relative distance of a decision to its threshold (alpha to 1/255 and to 0.99, T to 1e-4), cut at 0.05.
     """
 
@@ -32,11 +33,14 @@ class Blended:
     last: Int64
     count: Int64
     margin: Float64
+    nearness: Float64
 
 
 @dataclass(frozen=True, eq=False)
 class BlendGradients:
-    """means2d (N, 2), abs_means2d (N, 2): per pixel of displacement, or of rays per radian along the axes of the
+    """nearness (N,): by one over the depth, (122).
+
+    means2d (N, 2), abs_means2d (N, 2): per pixel of displacement, or of rays per radian along the axes of the
     tangent plane, the latter the sum of the absolute values of every image pixel's part; conics (N, 3): by a, b, c;
     opacities (N,); colors (N, 3); and contributions (N,), what each adds to the image: eq. (55)."""
 
@@ -46,6 +50,7 @@ class BlendGradients:
     opacities: Float64
     colors: Float64
     contributions: Float64
+    nearness: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,17 +98,18 @@ def blend(
     transmittance = np.ones((height, width))
     last = np.full((height, width), -1, np.int64)
     count = np.zeros((height, width), np.int64)
-    margin = np.full((height, width), BOX_SLACK / 2)
+    margin, nearness = np.full((height, width), BOX_SLACK / 2), np.zeros((height, width))
     for layer in layers(projected, width, height):
         box, added = layer.box, layer.added
         margin[box] = np.minimum(margin[box], layer.margin)
         weight = np.where(added, layer.before * layer.alpha, 0.0)
         image[box] += weight[:, :, None] * projected.colors[layer.gaussian]
+        nearness[box] += weight / projected.depths[layer.gaussian]
         transmittance[box] = layer.after
         last[box] = np.where(added, layer.position, last[box])
         count[box] += added
     image += transmittance[:, :, None] * np.asarray(background, np.float64)
-    return Blended(image, transmittance, last, count, margin)
+    return Blended(image, transmittance, last, count, margin, nearness)
 
 
 def blend_grad(
@@ -113,13 +119,16 @@ def blend_grad(
     background: Sequence[float] | Float64,
     d_image: Float64,
     d_transmittance: Float64 | None = None,
+    d_nearness: Float64 | None = None,
 ) -> BlendGradients:
     """Eqs. (22) to (29) and (55), back to front: d_image (H, W, 3) is dL/dC, d_transmittance (H, W) dL/dT at the end,
-    (82)."""
+    (82), d_nearness (H, W) dL/dN, (122)."""
     forward, order = blend(projected, width, height, background), projected.order
     transmittance = forward.transmittance.copy()
     behind = np.broadcast_to(np.asarray(background, np.float64), (height, width, 3)).copy()
     at_end = transmittance * (0.0 if d_transmittance is None else d_transmittance)
+    by_near = np.zeros((height, width)) if d_nearness is None else d_nearness
+    near_behind = np.zeros((height, width))
     number = len(projected.depths)
     gradients = BlendGradients(
         means2d=np.zeros((number, 2)),
@@ -128,6 +137,7 @@ def blend_grad(
         opacities=np.zeros(number),
         colors=np.zeros((number, 3)),
         contributions=np.zeros(number),
+        nearness=np.zeros(number),
     )
     for position in range(len(order) - 1, -1, -1):
         gaussian = int(order[position])
@@ -146,6 +156,10 @@ def blend_grad(
         gradients.contributions[gaussian] = weight.sum()
         d_alpha = transmittance[box] * (d_image[box] * (color - behind[box])).sum(axis=2)
         d_alpha = d_alpha - at_end[box] / (1 - alpha)
+        nearer = 1 / projected.depths[gaussian] - near_behind[box]
+        d_alpha = d_alpha + transmittance[box] * by_near[box] * nearer
+        gradients.nearness[gaussian] = (weight * by_near[box]).sum()
+        near_behind[box] += alpha * nearer
         gradients.colors[gaussian] = (weight[:, :, None] * d_image[box]).sum(axis=(0, 1))
         behind[box] += alpha[:, :, None] * (color - behind[box])
 

@@ -15,6 +15,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference import render as on_plane
 from clsplat.reference.blend import blend, blend_grad
 from clsplat.reference.channels import Channels, channels
+from clsplat.reference.depth import nearness_grad
 from clsplat.reference.project import Footprint, Projected, Seen, project
 from clsplat.reference.rays import footprints, pixel_sides, tangents, tangents_grad
 from clsplat.reference.render import BLACK, Gradients, parameters
@@ -22,11 +23,12 @@ from clsplat.reference.render import BLACK, Gradients, parameters
 
 @dataclass(frozen=True, eq=False)
 class Picture(Channels):
-    """image (H, W, 3), alpha (H, W); margin (H, W): as of `reference.blend`."""
+    """image (H, W, 3), alpha (H, W); margin, nearness (H, W): as of `reference.blend`."""
 
     image: Float64
     alpha: Float64
     margin: Float64
+    nearness: Float64
 
 
 class _Unbounded(Projected):
@@ -58,19 +60,26 @@ def render(
         seen = tangents(gaussians, camera)
     blended = blend(seen, camera.width, camera.height, background)
     others = channels(seen, gaussians, camera, after or camera)
-    return Picture(**vars(others), image=blended.image, alpha=1 - blended.transmittance, margin=blended.margin)
+    alpha, margin, nearness = 1 - blended.transmittance, blended.margin, blended.nearness
+    return Picture(**vars(others), image=blended.image, alpha=alpha, margin=margin, nearness=nearness)
 
 
 def render_grad(
-    gaussians: Gaussians, camera: Camera, d_image: Float64, background: Sequence[float] | Float64 = BLACK
+    gaussians: Gaussians,
+    camera: Camera,
+    d_image: Float64,
+    background: Sequence[float] | Float64 = BLACK,
+    d_nearness: Float64 | None = None,
 ) -> Gradients:
-    """Gradients of a loss with dL/dimage = d_image (H, W, 3), of a camera of any projection; those of means on the
+    """Gradients of a loss with dL/dimage = d_image (H, W, 3), and by nearness (H, W), of a
+    camera of any projection; those of means on the
     image of rays are along the axes of the tangent plane, per pixel there."""
     if camera.kind.flat:
-        return on_plane.render_grad(gaussians, camera, d_image, background)
+        return on_plane.render_grad(gaussians, camera, d_image, background, d_nearness=d_nearness)
     seen = tangents(gaussians, camera)
-    screen = blend_grad(seen, camera.width, camera.height, background, d_image)
+    screen = blend_grad(seen, camera.width, camera.height, background, d_image, d_nearness=d_nearness)
     by_parameter = tangents_grad(gaussians, camera, seen, screen)
+    by_parameter["means"] += nearness_grad(parameters(gaussians)["means"], camera, screen.nearness)
     sides = pixel_sides(footprints(seen.directions, camera)[2])
     on_image = {"means2d": sides * screen.means2d, "abs_means2d": sides * screen.abs_means2d}
     return Gradients(**{**vars(screen), **on_image}, parameters=by_parameter, visible=seen.visible)

@@ -13,6 +13,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.reference.blend import Blended, BlendGradients, blend, blend_grad
+from clsplat.reference.depth import nearness_grad
 from clsplat.reference.project import Projected, covariance_grad, project, project_grad
 
 BLACK = (0.0, 0.0, 0.0)
@@ -71,12 +72,14 @@ def render_grad(
     background: Sequence[float] | Float64 = BLACK,
     sh_degree: int | None = None,
     d_transmittance: Float64 | None = None,
+    d_nearness: Float64 | None = None,
 ) -> Gradients:
-    """Gradients of a loss with dL/dimage = d_image (H, W, 3), and by the transmittance at the end (H, W)."""
+    """Gradients of a loss with dL/dimage = d_image (H, W, 3), and by the transmittance at the end and nearness, each
+    (H, W)."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     arrays = parameters(gaussians)
     projected = project(**arrays, camera=camera, sh_degree=degree, antialiased=gaussians.antialiased)
-    screen = blend_grad(projected, camera.width, camera.height, background, d_image, d_transmittance)
+    screen = blend_grad(projected, camera.width, camera.height, background, d_image, d_transmittance, d_nearness)
     by_parameter = project_grad(
         **arrays,
         camera=camera,
@@ -88,4 +91,5 @@ def render_grad(
         d_colors=screen.colors,
         antialiased=gaussians.antialiased,
     )
+    by_parameter["means"] = by_parameter["means"] + nearness_grad(arrays["means"], camera, screen.nearness)
     return Gradients(**vars(screen), parameters=by_parameter, visible=projected.visible)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -36,7 +36,7 @@ from clsplat.stages.duplicate import (
     duplicate_and_sort,
     plan_bands,
 )
-from clsplat.stages.project import Projected, Screen, Slots, add_slots, project, project_grad
+from clsplat.stages.project import Projected, Screen, Slots, add_slots, project, project_grad, thinning_numbers
 from clsplat.stages.ranges import TileLists, tile_lists
 
 R = TypeVar("R")
@@ -149,31 +149,41 @@ class Rasterizer:
         backward: bool = True,
         room: Room | None = None,
         thinning: Thinning | None = None,
+        nearness: bool = False,
     ) -> Frame:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
         background: (3,) float32, on the host or the device; backward: True if the gradient will be asked for. Without
         it, what only that needs is left out. room: do not wait for the number of pairs, and have nothing of the pass
         come to anything where there are more (docs/decisions/0025-launch-by-capacity.md); thinning: of the model, for
-        this pass.
+        this pass; nearness: of `blend`.
         """
         device, work = self.device_of(camera), self.work
         camera_array, background = self._send(camera, background)
-        projected = project(device, work, gaussians, camera, camera_array, thinning)
+
+        def make() -> tuple[Projected, tuple[Band, ...], Part, Blended, tuple[int, ...]]:
+            projected = project(device, work, gaussians, camera, camera_array, thinning)
+            if room is None:
+                counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
+            else:
+                counted = count_by_capacity(device, work, projected, self.readback, room.pairs, self._host(room.turn))
+            bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
+            record = backward and len(bands) == 1 and self._switches.record_cells
+            wanted: dict[str, Any] = {"record": record, "nearness": nearness, "camera_array": camera_array}
+            part = None
+            for band in bands:
+                del part  # its arrays may have to make room for larger ones
+                part = self._part(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
+                pixels = (projected.splats, background, camera.width, camera.height)
+                blended = blend(device, work, part.lists, *pixels, **wanted)
+            assert part is not None, "an image has a tile"
+            return projected, bands, part, blended, counted.refused
+
         if room is None:
-            counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
-        else:
-            counted = count_by_capacity(device, work, projected, self.readback, room.pairs, self._host(room.turn))
-        bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
-        record = backward and len(bands) == 1 and self._switches.record_cells
-        part = None
-        for band in bands:
-            del part  # its arrays may have to make room for larger ones
-            part = self._part(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
-            pixels = (projected.splats, background, camera.width, camera.height)
-            blended = blend(device, work, part.lists, *pixels, record=record, camera_array=camera_array)
-        assert part is not None, "an image has a tile"
-        return Frame(camera, camera_array, background, projected, bands, part, blended, counted.refused)
+            return Frame(camera, camera_array, background, *make())
+        size, how = (camera.width, camera.height), (backward, thinning is not None, nearness)
+        key = (self.readback, device, background, *size, *how, room.pairs, room.turn)
+        return Frame(camera, camera_array, background, *work.replayed(gaussians, key, make, thinning_numbers(thinning)))
 
     def _host(self, turn: int) -> NDArray[np.uint32]:
         """Memory on the host for a copy of the counts."""

@@ -33,6 +33,11 @@ def gains_of(model: Path, photograph: str) -> tuple[float, float, float]:
             f"--appearance {photograph}: {model} has learnt no appearances (no appearance.json), expected a run of "
             "clsplat train --appearance exposure"
         )
+    if _kind(path) == "grid":
+        raise InputError(
+            f"--appearance {photograph}: {path} is of bilateral grids, which are for training alone; expected a run of "
+            "clsplat train --appearance exposure"
+        )
     gains = _read(path, "photographs")
     found = [name for name in gains if photograph in (name, *_ends(name))]
     if len(found) > 1 and photograph not in found:
@@ -56,6 +61,13 @@ def held_out_gains(record: Mapping[str, Any] | None) -> Callable[[str], Float32]
     """The same of the content of an appearance.json."""
     known = _gains_in(record, "held_out") if record is not None else {}
     return lambda name: np.array(known.get(name, ONES), np.float32)
+
+
+def _kind(path: Path) -> Any:
+    try:
+        return parse_json(read_document(path, EXPECTED, MAX_BYTES)).get("kind")
+    except (ValueError, AttributeError):
+        return None
 
 
 def _read(path: Path, key: str) -> dict[str, tuple[float, float, float]]:

@@ -114,8 +114,11 @@ class Run:
         """Write eval.json."""
         atomic_write(self.eval_path, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
 
-    def write_appearance(self, record: Mapping[str, Any]) -> None:
-        """Write appearance.json."""
+    def write_appearance(self, record: Mapping[str, Any], tables: Mapping[str, NDArray[Any]] | None = None) -> None:
+        """Write appearance.json, and of the tables that are too large for it appearance.npz."""
+        if tables:
+            with atomic_writer(self.appearance_path.with_suffix(".npz")) as file:
+                np.savez(file, **dict[str, Any](tables))
         atomic_write(self.appearance_path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
 
     def model_record(self) -> dict[str, Any]:
@@ -275,7 +278,8 @@ def owned_files(path: Path) -> list[Path]:
         "**/.*" + TEMPORARY_SUFFIX,
     )
     # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
-    names = ("model.ply", "metrics.jsonl", "eval.json", "appearance.json", "report.html", "scene.json", "config.toml")
+    learnt = ("appearance.json", "appearance.npz")
+    names = ("model.ply", "metrics.jsonl", "eval.json", *learnt, "report.html", "scene.json", "config.toml")
     files = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
     return [file for file in files if file.is_file() or file.is_symlink()]
 

@@ -190,7 +190,7 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         view.name
         for view in known
         if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
-        and was[view.name]["blake2b"] != short_digest(view.path)
+        and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")  # before its mask's
     ]
     reasons = []
     if seen:

@@ -15,7 +15,8 @@ from clsplat.config.points import StartPoints
 from clsplat.errors import InputError
 from clsplat.files import open_input
 from clsplat.images.reading import one_line
-from clsplat.scenes.initialise import UNSEEN, of_one_colour, pixels_of
+from clsplat.scenes.data_set import pixels_of
+from clsplat.scenes.initialise import UNSEEN, of_one_colour
 from clsplat.scenes.sky import sky_points
 from clsplat.scenes.transforms import read_point_cloud
 

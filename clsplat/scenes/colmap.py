@@ -15,14 +15,17 @@ import struct
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
+from clsplat.config.training import Lenses
 from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
 from clsplat.rotations import rotation_from_quaternion
@@ -76,17 +79,49 @@ def _read_posed_images(folder: Path) -> list[PosedImage]:
     return _read_images(folder, _read_cameras(folder))
 
 
-def read_cameras(folder: Path) -> dict[str, Camera]:
+def read_cameras(folder: Path, lenses: Lenses = "undistort") -> dict[str, Camera]:
     """The cameras of a model by image name, sorted; points and pictures are not looked at.
 
     folder: a model's own or a scene's, as `find_model`. Cameras with distortion become the pinhole cameras that a
-    scene is trained with (`Lens.pinhole`), at full size. Raises InputError and warns as `read_model`, and
+    scene is trained with (`Lens.camera`), at full size. Raises InputError and warns as `read_model`, and
     warns of lenses beyond reason.
     """
     model = find_model(Path(folder))
     if model is None:
         raise InputError(f"{folder}: no COLMAP model, expected cameras and images (.bin or .txt) in it or in sparse/0")
-    return cameras_of(_read_posed_images(model))
+    return cameras_of(_read_posed_images(model), lenses)
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Which images show which points. points (N, 3) float64 in the world; errors (N,): mean distances in the images,
+    pixels; by_image: rows (k,) of both by the images' names, in rising order, each once."""
+
+    points: Float64
+    errors: Float64
+    by_image: dict[str, NDArray[np.int64]]
+
+
+def read_tracks(folder: Path) -> Tracks:
+    """Read the tracks of the model in `folder`; those of images that it does not have are left out. Raises InputError
+    as `read_model`."""
+    path = _require(folder, "images")
+    rows = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
+    names = {key: name for key, name, *_ in rows}
+    path = _require(folder, "points3D")
+    places, errors, images, lengths = array("d"), array("d"), array("q"), array("q")
+    for place, error, seen in _binary_tracks(path) if path.suffix == ".bin" else _text_tracks(path):
+        places.extend(place)
+        errors.append(error)
+        images.extend(seen)
+        lengths.append(len(seen))
+    points = np.repeat(np.arange(len(lengths)), np.array(lengths, np.int64))
+    of = np.array(images, np.int64)
+    order = np.argsort(of, kind="stable")
+    keys, begins = np.unique(of[order], return_index=True)
+    parts = np.split(points[order], begins[1:])
+    by_image = {names[key]: np.unique(part) for key, part in zip(keys.tolist(), parts, strict=False) if key in names}
+    return Tracks(np.array(places, np.float64).reshape(-1, 3), np.array(errors, np.float64), by_image)
 
 
 def safe_name(name: str) -> bool:
@@ -107,6 +142,11 @@ class _Binary:
     def read(self, layout: struct.Struct) -> tuple[float, ...]:
         self._take(layout.size)
         return layout.unpack(self.file.read(layout.size))
+
+    def need(self, size: int) -> None:
+        """Raise InputError if fewer bytes are left."""
+        if size > self.left:
+            self._take(size)
 
     def skip(self, size: int) -> None:
         self._take(size)
@@ -237,7 +277,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
 def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
     path = _require(folder, "images")
     images: dict[str, PosedImage] = {}
-    for name, camera, pose in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
+    for _, name, camera, pose in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
         if camera not in lenses:
             raise corrupt(path, f"image {name[:80]!r} has the camera {camera}, which is not in the model")
         if not safe_name(name):
@@ -255,14 +295,14 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
     return [images[name] for name in sorted(images)]
 
 
-def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
+def _binary_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...]]]:
     head = struct.Struct("<I7dI")
     for file in _records(path, "image", head.size + 1 + COUNT.size):
-        _, *pose, camera = file.read(head)
+        key, *pose, camera = file.read(head)
         name = file.name()
         (observations,) = file.read(COUNT)
         file.skip(int(observations) * OBSERVATION_BYTES)
-        yield name, int(camera), tuple(pose)
+        yield int(key), name, int(camera), tuple(pose)
 
 
 def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
@@ -287,12 +327,11 @@ def _are_observations(line: str) -> bool:
     return len(words) % 3 == 0
 
 
-def _text_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
+def _text_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...]]]:
     for number, line, expected in _image_lines(path):
         with _parsing(path, number, expected):
             words = line.split(maxsplit=9)  # the name is the rest of the line, blanks and all
-            int(words[0])
-            yield words[9], int(words[8]), tuple(map(float, words[1:8]))
+            yield int(words[0]), words[9], int(words[8]), tuple(map(float, words[1:8]))
 
 
 def _read_points(folder: Path) -> tuple[Float64, Float32]:
@@ -326,6 +365,23 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
             if track and len(track[0].split()) % 2:
                 raise ValueError("a track is of pairs")
             yield float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue))
+
+
+def _binary_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
+    """Place, error and ids of the images of each point."""
+    layout = struct.Struct("<Q3d3BdQ")
+    for file in _records(path, "point", layout.size):
+        _, *values, error, length = file.read(layout)
+        file.need(int(length) * TRACK_BYTES)
+        track = file.read(struct.Struct(f"<{2 * int(length)}I"))
+        yield tuple(values[:3]), error, tuple(int(key) for key in track[::2])
+
+
+def _text_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
+    for number, line in _lines(path):
+        with _parsing(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
+            _, x, y, z, _, _, _, error, *track = line.split()
+            yield (float(x), float(y), float(z)), float(error), tuple(map(int, track[::2]))
 
 
 def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:

@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsplat.arrays import Float32, Float64
@@ -144,7 +145,8 @@ class PosedImage:
     """An image of a data set: its name, its lens at the listed size, and `cam_from_world`.
 
     rotation (3, 3), translation (3,), float64; path: the file, where the data set says which; split: "train", "test",
-    or None where the data set has no split of its own; mask: the file of its mask, where the data set says which.
+    or None where the data set has no split of its own; mask, depth: the files of its mask and its depth map, where the
+    data set says which.
     """
 
     name: str
@@ -154,6 +156,7 @@ class PosedImage:
     path: Path = Path()
     split: str | None = None
     mask: Path | None = None
+    depth: Path | None = None
 
 
 @dataclass(eq=False)
@@ -167,16 +170,15 @@ class DataSet:
     box: tuple[Float64, Float64] | None = None
 
 
-def cameras_of(images: Sequence[PosedImage]) -> dict[str, Camera]:
-    """The cameras that the images become, pinhole ones but for panoramas, at full size, by name. Warns of lenses beyond
-    reason."""
+def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> dict[str, Camera]:
+    """The cameras that the images become, as of `Lens.camera`, at full size, by name. Warns of lenses beyond reason."""
     if doubt := absurd([(image.name, image.lens) for image in images]):
         warn(doubt)
-    pinholes = {
-        lens: lens.camera(np.eye(3), np.zeros(3), "undistort") for lens in dict.fromkeys(image.lens for image in images)
+    by_lens = {
+        lens: lens.camera(np.eye(3), np.zeros(3), lenses) for lens in dict.fromkeys(image.lens for image in images)
     }
     return {
-        image.name: replace(pinholes[image.lens], rotation=image.rotation, translation=image.translation)
+        image.name: replace(by_lens[image.lens], rotation=image.rotation, translation=image.translation)
         for image in images
     }
 
@@ -233,6 +235,27 @@ def _bends(lens: Lens) -> bool:
     pixels = lens.img_from_cam(rays)
     moved = pixels - pixels[len(pixels) // 2] - edge
     return not bool((np.abs(moved) <= BENT * half).all())
+
+
+def pixels_of(
+    points: Float64, camera: Camera, lens: Lens | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Rows and columns of the pixels that show the points (N, 3) of the world, of those before the camera and in its
+    picture, which are `inside` (N,). lens: of a camera that is no pinhole."""
+    local = points @ camera.rotation.T + camera.translation
+    if lens is not None and camera.projection != "perspective":
+        place = lens.resized(camera.width, camera.height).img_from_cam(local)
+        angle = np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
+        ahead = (np.linalg.norm(local, axis=1) > camera.near) & (angle <= camera.fold[0])
+        with np.errstate(invalid="ignore"):
+            shown = ahead & ((place >= 0) & (place < [camera.width, camera.height])).all(axis=1)
+        return place[shown, 1].astype(np.int64), place[shown, 0].astype(np.int64), shown
+    depth = local[:, 2]
+    ahead = depth > camera.near
+    by = np.where(ahead, depth, 1.0)
+    x, y = camera.fx * local[:, 0] / by + camera.cx, camera.fy * local[:, 1] / by + camera.cy
+    inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return y[inside].astype(np.int64), x[inside].astype(np.int64), inside
 
 
 def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:

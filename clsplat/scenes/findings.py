@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.errors import InputError, examples
-from clsplat.scenes.data_set import PANORAMA, RADIAL
+from clsplat.scenes.data_set import PANORAMA, RADIAL, pixels_of
 from clsplat.scenes.glance import GREY
-from clsplat.scenes.initialise import pixels_of
 from clsplat.scenes.masks import masks_beside, read_mask
 from clsplat.scenes.scene import Scene, View
 

@@ -4,21 +4,19 @@ cloud without colours each has the mean of what the training photographs have wh
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.camera import NEAR, Camera
+from clsplat.camera import NEAR
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import composite
-from clsplat.spherical_harmonics import C0
-
-if TYPE_CHECKING:
-    from clsplat.scenes.data_set import Lens
+from clsplat.scenes.data_set import pixels_of
 from clsplat.scenes.scene import Scene
+from clsplat.spherical_harmonics import C0
 
 INITIAL_OPACITY = 0.1
 MIN_SQUARED_DISTANCE = 1e-7
@@ -146,24 +144,3 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
     if scene.colourless is not None:
         means = np.where(scene.colourless[:, None], means, scene.point_colors)
     return np.clip(means, 0, 1).astype(np.float32)
-
-
-def pixels_of(
-    points: Float64, camera: Camera, lens: Lens | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Rows and columns of the pixels that show the points (N, 3) of the world, of those before the camera and in its
-    picture, which are `inside` (N,). lens: of a camera that is no pinhole."""
-    local = points @ camera.rotation.T + camera.translation
-    if lens is not None and camera.projection != "perspective":
-        place = lens.resized(camera.width, camera.height).img_from_cam(local)
-        angle = np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
-        ahead = (np.linalg.norm(local, axis=1) > camera.near) & (angle <= camera.fold[0])
-        with np.errstate(invalid="ignore"):
-            shown = ahead & ((place >= 0) & (place < [camera.width, camera.height])).all(axis=1)
-        return place[shown, 1].astype(np.int64), place[shown, 0].astype(np.int64), shown
-    depth = local[:, 2]
-    ahead = depth > camera.near
-    by = np.where(ahead, depth, 1.0)
-    x, y = camera.fx * local[:, 0] / by + camera.cx, camera.fy * local[:, 1] / by + camera.cy
-    inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return y[inside].astype(np.int64), x[inside].astype(np.int64), inside

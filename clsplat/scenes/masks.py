@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Protocol
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from clsplat.config.masks import NO_MASKS, MaskMeaning, MaskUse
 from clsplat.errors import InputError, examples, warn
 from clsplat.images.reading import find_images, image_size, read_image
 from clsplat.images.writing import write_image
+from clsplat.scenes.beside import Named, bases_of, beside, owned
 from clsplat.scenes.data_set import PosedImage
 
 FOLDERS = ("masks", "mask")
@@ -65,19 +65,9 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
     return counts
 
 
-class Named(Protocol):
-    """A photograph of a scene: its name there, and its file."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def path(self) -> Path: ...
-
-
 def folder_of(images: Path) -> Path | None:
     """The folder of masks of a folder of photographs."""
-    return next((at for parent in (images.parent, images) for name in FOLDERS if (at := parent / name).is_dir()), None)
+    return beside(images, FOLDERS)
 
 
 def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -92,23 +82,8 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
         stem = str(plain.with_suffix(""))
         for key in (name, stem, f"{stem}_mask", f"{stem}.mask", str(plain.with_name(f"mask_{plain.stem}"))):
             known.setdefault(key, name)
-    found: dict[str, Path] = {}
-    lost: list[str] = []
-    for path in find_images(folder):
-        relative = path.relative_to(folder).as_posix()
-        owner = known.get(str(PurePosixPath(relative).with_suffix("")))
-        if owner is None:
-            lost.append(relative)
-        elif owner in found:
-            raise InputError(f"{path}: is a second mask of {owner}, beside {found[owner].name}; remove one of them")
-        else:
-            found[owner] = path
-    if lost:
-        raise InputError(
-            f"{folder}: {len(lost):,} mask(s) fit no photograph ({examples(lost)}): expected names such as "
-            f"{next(iter(sorted(names)), 'IMAGE.jpg')}.png; rename or remove them"
-        )
-    return found
+    example = next(iter(sorted(names)), "IMAGE.jpg")
+    return owned(folder, find_images(folder), known, "mask", example)
 
 
 def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[str, Mask]:
@@ -140,12 +115,7 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
 def masks_beside(images: Sequence[Named]) -> dict[str, Path]:
     """The masks in the folder beside the photographs, or in theirs, by the photographs' names. Raises InputError as
     `find_masks`."""
-    top = images[0].path
-    for _ in PurePosixPath(images[0].name).parts:
-        top = top.parent
-    firsts = {PurePosixPath(image.name).parts[0] for image in images}
-    bases = [top / first for first in firsts if len(firsts) == 1 and (top / first).is_dir()]  # as of transforms.json
-    for base in (*bases, top):
+    for base in bases_of(images):
         folder = folder_of(base)
         if folder is not None:
             names = {str(PurePosixPath(image.path.relative_to(base).as_posix())): image.name for image in images}

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import NEAR, NEARS, Camera
 from clsplat.config.checks import misfit
+from clsplat.config.depth import NO_DEPTH, DepthUse
 from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.points import OWN_POINTS, StartPoints
 from clsplat.config.training import Lenses
@@ -29,6 +30,7 @@ from clsplat.progress import Progress
 from clsplat.scenes import colmap, transforms
 from clsplat.scenes.data_set import DataSet, Lens, PosedImage, undistort
 from clsplat.scenes.glance import Glance, glance_at
+from clsplat.scenes.known_depth import KnownDepth
 from clsplat.scenes.masks import HALF, Mask, after_sfm, for_sfm, masks_of
 from clsplat.scenes.sfm import reconstruct
 
@@ -54,7 +56,7 @@ class View:
     name: as in the data set, with extension, unique in the scene; camera: at the working size; path: the file that is
     read; split: "train" or "test"; lens: what the file was taken through, at the file's size; upright: the camera
     belongs to the picture turned as its EXIF orientation says, not as stored; mask: what of the picture counts, None
-    for all.
+    for all; depth_file: the depth map that the data set names; depth: what training knows of depths.
     """
 
     name: str
@@ -64,6 +66,8 @@ class View:
     lens: Lens
     upright: bool = False
     mask: Mask | None = None
+    depth_file: Path | None = None
+    depth: KnownDepth | None = None
 
     def load(self, width: int | None = None, height: int | None = None) -> Float32:
         """Read the pixels, float32 (H, W, 3), or (H, W, 4) with straight alpha, undistorted, of the camera's size.
@@ -125,7 +129,8 @@ class Scene:
     name: the folder's; views sorted by name; points (N, 3) float64 in the world, N may be 0; point_colors (N, 3)
     float32 in [0, 1]; bounds: corners (low, high), each (3,) float64, world units, of the box for random initial
     points; warnings: for the user, a line each; start: how the points were chosen (`scenes.cloud`); colourless (N,):
-    points whose colours are those of the photographs, None for none.
+    points whose colours are those of the photographs, None for none; source: the folder that it was read from;
+    depth_use: how what is known of depths was chosen (`scenes.depth`).
     """
 
     name: str
@@ -136,6 +141,8 @@ class Scene:
     warnings: list[str] = field(default_factory=list)
     start: StartPoints = OWN_POINTS
     colourless: NDArray[np.bool_] | None = None
+    source: Path | None = None
+    depth_use: DepthUse = NO_DEPTH
 
     @cached_property
     def train_views(self) -> list[View]:
@@ -236,7 +243,9 @@ def _has_alpha(image: Float32) -> bool:
 
 def _digest(view: View) -> str | None:
     own = short_digest(view.path)
-    return own if view.mask is None else f"{own} {view.mask.use} {view.mask.path and short_digest(view.mask.path)}"
+    if view.mask is not None:
+        own = f"{own} {view.mask.use} {view.mask.path and short_digest(view.mask.path)}"
+    return own if view.depth is None else f"{own} depth {view.depth.digest}"
 
 
 def detect(path: Path) -> Kind:
@@ -302,6 +311,7 @@ def load_scene(
     if images is not None and kind != "colmap":
         raise InputError(f"{path}: is a {kind} scene, a folder of images can be chosen only for a COLMAP one")
     smaller: list[Path] = []
+    source = path
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if kind in ("blender", "transforms"):
@@ -313,6 +323,7 @@ def load_scene(
                 folder = work_dir or photos.with_name(f"{photos.name}_colmap")
                 folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
                 masks = after_sfm(masks, folder)
+            source = folder
             data, smaller = _read_colmap(folder, images)
         posed = sorted(data.images, key=lambda image: image.name)
         if masks != NO_MASKS:
@@ -323,14 +334,15 @@ def load_scene(
         for index, image in enumerate(posed):
             held_out = image.split == "test" if own_split else test_every > 0 and index % test_every == 0
             view = _view(image, "test" if held_out else "train", resolution, smaller, lenses)
-            views.append(replace(view, mask=of_pictures.get(image.name)))
+            views.append(replace(view, mask=of_pictures.get(image.name), depth_file=image.depth))
         _warn_of_copies(views)
     if kind == "blender":
         bounds = (np.full(3, -BLENDER_CUBE), np.full(3, BLENDER_CUBE))
     else:
         bounds = camera_bounds([view.camera for view in views], data.box)
     name = path.resolve().name if path.is_dir() else path.resolve().parent.name
-    return Scene(name, views, data.points, data.colors, bounds, [plain(str(warning.message)) for warning in caught])
+    told = [plain(str(warning.message)) for warning in caught]
+    return Scene(name, views, data.points, data.colors, bounds, told, source=source)
 
 
 def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = None) -> tuple[Float64, Float64]:

@@ -13,7 +13,8 @@ from clsplat.camera import Camera
 from clsplat.config.points import SKY_RADIUS
 from clsplat.errors import InputError
 from clsplat.images.alpha import composite
-from clsplat.scenes.initialise import LONGEST, pixels_of
+from clsplat.scenes.data_set import pixels_of
+from clsplat.scenes.initialise import LONGEST
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene, View

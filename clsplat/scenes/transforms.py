@@ -19,6 +19,7 @@ import numpy as np
 
 from clsplat.arrays import Float32, Float64, numbers
 from clsplat.camera import Camera, Projection, focal_length
+from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import is_file, open_input, parse_json, read_document
 from clsplat.images.reading import EXTENSIONS, image_size, require_images
@@ -67,14 +68,14 @@ def read_transforms(path: Path, *, masks: bool = False) -> DataSet:
     return data
 
 
-def read_poses(path: Path, size: tuple[int, int] | None = None) -> dict[str, Camera]:
-    """The cameras of a transforms.json alone by image name, in its order; distorted ones as `cameras_of`.
+def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses = "undistort") -> dict[str, Camera]:
+    """The cameras of a transforms.json alone by image name, in its order, as of `cameras_of`.
 
     Its pictures need not be there where the file says `w h`; else, where a picture is missing, too, it counts as one of
     `size`, (width, height). Raises InputError as `read_transforms`; warns of what contradicts itself, and of
     lenses beyond reason.
     """
-    return cameras_of(_images(path, _readers(path, load_document(path)), size))
+    return cameras_of(_images(path, _readers(path, load_document(path)), size), lenses)
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
@@ -96,7 +97,8 @@ def _images(path: Path, readers: list[Keys], size: tuple[int, int] | None = None
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
         if name in images:
             raise InputError(f"{path}: lists {name} twice, expected each picture once; remove one of the frames")
-        images[name] = PosedImage(name, lens, rotation, translation, file, mask=_mask_of(keys))
+        mask, depth = (_file_of(keys, key) for key in ("mask_path", "depth_file_path"))
+        images[name] = PosedImage(name, lens, rotation, translation, file, mask=mask, depth=depth)
     _warn_of_contradictions(path, readers, list(images.values()))
     return _split(path, readers, list(images.values()))
 
@@ -269,11 +271,12 @@ def _find_file(keys: Keys) -> Path:
     return path
 
 
-def _mask_of(keys: Keys) -> Path | None:
-    listed = keys.frame.get("mask_path")
+def _file_of(keys: Keys, key: str) -> Path | None:
+    """The file that goes with a frame's picture, if it names one."""
+    listed = keys.frame.get(key)
     if not isinstance(listed, str) or not listed:
         return None
-    _inside(keys.path.parent, listed, f"{keys.where}: 'mask_path'")
+    _inside(keys.path.parent, listed, f"{keys.where}: {key!r}")
     return Path(os.path.normpath(keys.path.parent / listed.replace("\\", "/")))
 
 

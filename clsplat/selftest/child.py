@@ -33,6 +33,7 @@ BUILT_WITH: dict[str, dict[str, object]] = {
     "features": {**_FEATURES, "LANES": 1},
     "channels": _FEATURES,
     "appearance": {"LANES": 1},
+    "grid": {"LANES": 1},
     "noise": {"LANES": 1},
     "project_rays": {"LANES": 1, "RAYS": 1},
     "sampling": {"LANES": 1},

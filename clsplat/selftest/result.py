@@ -17,10 +17,12 @@ MASKS = ("masks",)
 """Stages that photographs with masks or alpha to learn need beside TRAINING."""
 BACKWARD = ("loss", "blend_grad", "project_grad", "adam", "statistics")
 """Stages that training needs beside a frame's."""
-APPEARANCE = ("appearance",)
-"""Stages of photographs' gains, which training needs where they are learnt."""
+APPEARANCE: dict[str, tuple[str, ...]] = {"none": (), "exposure": ("appearance",), "grid": ("grid",)}
+"""Stages of what is learnt of each photograph, which training needs beside TRAINING, by the setting."""
+DEPTH = ("depth",)
+"""Stages of known depths, which training needs where they are compared."""
 TRAINING = (*FORWARD, *BACKWARD)
-STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *MASKS, *BACKWARD, *APPEARANCE)
+STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *MASKS, *BACKWARD, "appearance", "grid", *DEPTH)
 INDICES = ("project", "duplicate", "sort", "ranges")
 """Stages by whose counts and lists the next ones find their way."""
 
@@ -42,6 +44,8 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "adam": (32, "2 found; one root and one division"),
     "statistics": (32, "1 found; one root"),
     "appearance": (1024, "202 found; beta2 in float32 is 1e-5 off in 1 - beta2, 84 ulp, and a picture is added up"),
+    "grid": (1024, "227 found; as appearance"),
+    "depth": (1024, "as blend_grad"),
 }
 """Ulp that a stage may be off, and why. Each bound is the error found where every operation is rounded as in IEEE 754,
 with room for a GPU whose divisions and roots are not. A wrong operation is off by thousands."""

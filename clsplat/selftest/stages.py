@@ -26,6 +26,8 @@ from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters
 from clsplat.reference.tiles import touched_tiles
 from clsplat.selftest.appearance_stage import of_appearance
+from clsplat.selftest.depth_stage import of_depth
+from clsplat.selftest.grid_stage import of_grid
 from clsplat.selftest.harness import WHITEN, Array, Bench, Outcome, cropped, joined
 from clsplat.selftest.mask_stages import MASKS
 from clsplat.selftest.picture_stages import PICTURES
@@ -451,4 +453,6 @@ RUN: dict[str, Callable[[Bench], Outcome]] = {
     "adam": _adam,
     "statistics": _statistics,
     "appearance": of_appearance,
+    "grid": of_grid,
+    "depth": of_depth,
 }

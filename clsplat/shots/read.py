@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples
 from clsplat.scenes.colmap import find_model, read_cameras
 from clsplat.scenes.transforms import load_document, read_poses
@@ -25,12 +26,18 @@ EXPECTED = (
 )
 
 
-def read_shot(path: Path, *, size: tuple[int | None, int | None] = (None, None), usd_camera: str | None = None) -> Shot:
+def read_shot(
+    path: Path,
+    *,
+    size: tuple[int | None, int | None] = (None, None),
+    usd_camera: str | None = None,
+    lenses: Lenses = "undistort",
+) -> Shot:
     """The frames of any camera file, found out from what is in it; docs/cameras.md describes each.
 
     size: the width and height that will be asked for, for formats that have none of their own (USD; transforms.json
-    without its pictures). usd_camera: which camera of a USD stage. Raises InputError, naming the file, for one that is
-    missing, of no known kind, damaged or without frames.
+    without its pictures). usd_camera: which camera of a USD stage. lenses: of photographs, as of `load_scene`. Raises
+    InputError, naming the file, for one that is missing, of no known kind, damaged or without frames.
     """
     path = Path(path)
     if not path.exists():
@@ -39,11 +46,11 @@ def read_shot(path: Path, *, size: tuple[int | None, int | None] = (None, None),
     if usd_camera is not None and not is_usd:
         raise InputError(f"--usd-camera {usd_camera}: {path} is no USD stage, expected it with one only")
     if path.is_dir():
-        return _read_folder(path, size)
+        return _read_folder(path, size, lenses)
     if is_usd:
         return read_usd(path, size, usd_camera)
     if path.suffix.lower() == ".json":
-        return _read_json(path, size)
+        return _read_json(path, size, lenses)
     raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected {EXPECTED}")
 
 
@@ -54,6 +61,7 @@ def choose_shot(
     count: int | None = None,
     size: tuple[int | None, int | None] = (None, None),
     usd_camera: str | None = None,
+    lenses: Lenses = "undistort",
 ) -> Shot:
     """The shot that --cameras, --path and --count ask for together.
 
@@ -64,7 +72,7 @@ def choose_shot(
         raise InputError(f"--count {count}: expected --path with it, the files of cameras have their own frames")
     if count is not None and not 1 <= count <= MOST_FRAMES:
         raise InputError(f"--count {count}: expected 1 to {MOST_FRAMES:,} frames")
-    shot = read_shot(cameras, size=size, usd_camera=usd_camera)
+    shot = read_shot(cameras, size=size, usd_camera=usd_camera, lenses=lenses)
     if path is not None:
         if not (first := shot.frames[0].camera).kind.flat:
             raise InputError(
@@ -79,7 +87,7 @@ def choose_shot(
     return shot
 
 
-def _read_folder(path: Path, size: tuple[int | None, int | None]) -> Shot:
+def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:
     listed = sorted(file.name for file in path.glob("transforms*.json"))
     if listed:
         # a model below colmap/ beside a transforms.json is nerfstudio's, in a world that is not the file's
@@ -87,14 +95,14 @@ def _read_folder(path: Path, size: tuple[int | None, int | None]) -> Shot:
         if model is None or "colmap" in model.relative_to(path).parts:
             if listed != ["transforms.json"]:
                 raise InputError(f"{path}: holds {examples(listed)}, expected one of them to be named by --cameras")
-            return _read_json(path / listed[0], size)
-    cameras = read_cameras(path)
+            return _read_json(path / listed[0], size, lenses)
+    cameras = read_cameras(path, lenses)
     if not cameras:
         raise InputError(f"{path}: has no images, expected at least one")
     return Shot(named(cameras))
 
 
-def _read_json(path: Path, size: tuple[int | None, int | None]) -> Shot:
+def _read_json(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:
     document = load_document(path, "a file of cameras", f"'frames', 'camera_path' or '{VERSION_KEY}'")
     if VERSION_KEY in document:
         return read_keyed(path, document)
@@ -107,4 +115,4 @@ def _read_json(path: Path, size: tuple[int | None, int | None]) -> Shot:
         )
     width, height = size
     both = (width, height) if width is not None and height is not None else None
-    return Shot(named(read_poses(path, both)))
+    return Shot(named(read_poses(path, both, lenses)))

@@ -31,13 +31,15 @@ def gradient_pair_bytes(fields: SlotFields) -> int:
 class Blended:
     """Planes padded to whole tiles: image (3, rows, stride), transmittance (rows, stride), stops (rows, stride).
 
-    cells_from_sorted (pairs) uint32: the cells in which each pair's Gaussian contributes, as bits; or None.
+    cells_from_sorted (pairs) uint32: the cells in which each pair's Gaussian contributes, as bits; or None; nearness
+    (rows, stride): the sum of weight over depth, where it was asked for.
     """
 
     image: DeviceArray
     transmittance: DeviceArray
     stops: DeviceArray
     cells_from_sorted: DeviceArray | None
+    nearness: DeviceArray | None = None
 
 
 def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
@@ -83,22 +85,25 @@ def blend(
     *,
     record: bool = True,
     camera_array: DeviceArray | None = None,
+    nearness: bool = False,
 ) -> Blended:
     """Blend the Gaussians of each of the lists' tiles front to back over the background (3,). Pixels of other tiles are
     left as they are.
 
     record: keep the cells that the gradient has to go through, where the kernels' shape has them; camera_array: for
-    pixels that are rays.
+    pixels that are rays; nearness: add up one over the depth too.
     """
-    planes = _planes(work, width, height, kept=lists.band.first > 0)
+    planes, near = _planes(work, width, height, kept=lists.band.first > 0), None
+    if nearness:
+        near = work.array("nearness", padded_size(width, height), kept=lists.band.first > 0)
     cells, rays = None, device.switched("RAYS")
     if record and not rays and tile_items(device) == 1 and device.shape.lanes >= 8:
         cells = work.array("cells_from_sorted", lists.gaussian_from_sorted.shape, np.uint32)
-    extra = ([cells] if cells else []) + ([camera_array] if rays else [])
+    extra = ([near] if near else []) + ([cells] if cells else []) + ([camera_array] if rays else [])
     arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, *extra)
-    defines = {"RECORD_CELLS": True} if cells else {}
+    defines = {name: True for name, on in (("NEARNESS", near), ("RECORD_CELLS", cells)) if on}
     launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *arrays)
-    return Blended(*planes, cells)
+    return Blended(*planes, cells, near)
 
 
 def count_pairs(
@@ -136,8 +141,8 @@ def blend_grad(
     camera_array: DeviceArray | None = None,
 ) -> DeviceArray:
     """Partial gradients of every pair of the lists at its slot, (pairs, fields.floats), from image_gradient (3, rows,
-    stride), or (4, rows, stride) with the loss's gradient by the transmittance; camera_array: for pixels that are
-    rays."""
+    stride), with the loss's gradient by the transmittance (4, ...), and if the fields have it that by nearness behind;
+    camera_array: for pixels that are rays."""
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]
     slots = work.array("slots", (pairs, fields.floats))
@@ -147,7 +152,7 @@ def blend_grad(
     defines = {**fields.defines, **({"RECORD_CELLS": True} if cells else {})}
     if device.shape.by_gaussian and not rays:
         defines["BY_GAUSSIAN"] = True
-    if image_gradient.shape[0] == 4:
+    if image_gradient.shape[0] - fields.nearness == 4:
         defines["ALPHA_GRADIENT"] = True
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
     planes = (image_gradient, blended.transmittance, blended.stops)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches loss.cl and alpha_loss.cl: L1 + D-SSIM, the alpha loss, and their gradients."""
+"""Launches loss.cl, alpha_loss.cl and depth_loss.cl: L1 + D-SSIM, those of alpha and depth, and their gradients."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,9 @@ PIXEL_BYTES = 12
 """Bytes of the image's gradient, of each pixel with its padding."""
 ALPHA_PIXEL_BYTES = 9
 """Bytes of the alpha loss, of each pixel with its padding: alpha, its gradient and, rounded up, its sums."""
+
+DEPTH_PIXEL_BYTES = 17
+"""Bytes of the depth loss, of each pixel with its padding: nearness, its gradient, its aim and weight, the sums."""
 
 _LEAST_ROWS = 32
 """Rows of such a block, at least: ten more are worked out anew."""
@@ -66,10 +69,10 @@ def scratch_bytes(device: Device, height: int, stride: int, turns: int = 1) -> i
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """gradient (3, rows, stride), with the alpha loss (4, ...); sums (3, ...): partial sums of SSIM, of |x - y| and of
-    its square, in one row with those of the alpha loss behind them where it is there; samples: that count, masked:
-    that do not, in whose windows SSIM is counted all the same; copy: the sums where a copy to the host is under way;
-    alpha: the weight of the alpha loss, and its number of sums."""
+    """gradient (3, rows, stride), one plane more each with alpha's loss and depth's; sums (3, ...): partial sums of
+    SSIM, of |x - y| and of its square, in one row with those of further losses behind them where they are there;
+    samples: that count, masked: that do not, in whose windows SSIM is counted all the same; copy: the sums where a copy
+    to the host is under way; further: weight, divisor and number of the sums of each further loss."""
 
     gradient: DeviceArray
     sums: DeviceArray
@@ -77,23 +80,36 @@ class Loss:
     weight: float
     copy: Callable[[], NDArray[Any]] | None = None
     masked: int = 0
-    alpha: tuple[float, int] = (0.0, 0)
+    further: tuple[tuple[float, float, int], ...] = ()
 
     def fetched(self) -> Loss:
         """The same, its sums on their way to the host: `read` then does not wait for what comes behind them."""
-        return replace(self, copy=self.sums.begin_get())
+        return self.copied(self.sums.begin_get())
+
+    def copied(self, copy: Callable[[], NDArray[Any]]) -> Loss:
+        """The same, its sums on the host from a function that waits for them."""
+        return Loss(self.gradient, self.sums, self.samples, self.weight, copy, self.masked, self.further)
 
     def read(self) -> tuple[float, float]:
         """(loss, mean squared error); waits for the device."""
         sums = (self.copy() if self.copy is not None else self.sums.get()).reshape(-1)
-        weight, behind = self.alpha
-        own = sums.size - behind
+        own = sums.size - sum(count for *_, count in self.further)
         ssim, absolute, squared = sums[:own].reshape(3, -1).sum(axis=1, dtype=np.float64) / self.samples
         unlike = 1 - ssim if not self.masked else (self.samples + self.masked) / self.samples - ssim
         value = (1 - self.weight) * absolute + self.weight * unlike
-        if behind:
-            value += weight * sums[own:].sum(dtype=np.float64) / (self.samples / 3)
+        for weight, divisor, count in self.further:
+            value += weight * sums[own : own + count].sum(dtype=np.float64) / divisor
+            own += count
         return float(value), float(squared)
+
+
+@dataclass(frozen=True, eq=False)
+class DepthAims:
+    """Known depths that the render's nearness is compared with: planes (2, rows, stride) float32 of nearness and
+    weight, 0 where it is not known; factor: of the sum of weighted differences, in the loss."""
+
+    planes: NDArray[np.float32]
+    factor: float
 
 
 @stage("loss")
@@ -110,21 +126,25 @@ def loss(
     kept: int | None = None,
     blended: Blended | None = None,
     alpha_weight: float = 0.0,
+    depth: DepthAims | None = None,
 ) -> Loss:
     """(1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero right of and below the image. turn: those
     of another turn keep their sums.
 
     kept: pixels that count, where others are zero in both pictures: the means are over these. alpha_weight: with a
-    fourth plane in `target`, the alpha, this times the mean absolute difference of the render's is added.
+    fourth plane in `target`, the alpha, this times the mean absolute difference of the render's is added. depth: the
+    weighted differences of the render's nearness are added too.
     """
     _, rows, stride = image.shape
     every, blocks, items = 3 * width * height, _blocks(device, height, stride), device.shape.items
     samples = every if kept is None else max(3 * kept, 1)
     alphas = rows // TILE * stride if target.shape[0] == 4 else 0
     partials = work.array("loss_partials", (blocks.partials,))
-    gradient = work.array("image_gradient", (4 if alphas else 3, rows, stride))
+    nears = rows // TILE * stride if depth is not None else 0
+    gradient = work.array("image_gradient", (3 + bool(alphas) + bool(nears), rows, stride))
     own = blocks.sums // 3 * 3
-    sums = work.array(f"loss_sums{turn or ''}", (own + alphas,) if alphas else (3, own // 3))
+    sums = work.array(f"loss_sums{turn or ''}", (own + alphas + nears,) if alphas or nears else (3, own // 3))
+    further: tuple[tuple[float, float, int], ...] = ()
     sizes, pictures, results = (width, height, stride, rows * stride), (image, target), (partials, gradient, sums)
     weights = ((1 - weight) / samples, weight / samples)
     if items == 1:
@@ -141,5 +161,15 @@ def loss(
         scale = alpha_weight / (samples / 3)
         kernel = device.kernels("alpha_loss").alpha_loss
         launch_grid(device, kernel, (stride, rows // TILE), stride, rows, own, scale, *planes, sums)
+        further += ((alpha_weight, samples / 3, alphas),)
+    if depth is not None:
+        assert blended is not None, "the depth loss is of a render"
+        assert blended.nearness is not None, "with its nearness"
+        aims = work.array("depth_aims", (2, rows, stride))
+        aims.send(depth.planes)
+        planes = (blended.stops, blended.nearness, aims, gradient)
+        sizes, behind = (stride, rows, 3 + bool(alphas), own + alphas), (depth.factor, *planes, sums)
+        launch_grid(device, device.kernels("depth_loss").depth_loss, (stride, rows // TILE), *sizes, *behind)
+        further += ((depth.factor, 1.0, nears),)
     masked = 0 if kept is None else every - 3 * kept
-    return Loss(gradient, sums, samples, weight, masked=masked, alpha=(alpha_weight, alphas))
+    return Loss(gradient, sums, samples, weight, masked=masked, further=further)

@@ -18,6 +18,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import LOCAL, launch_groups, launch_items
 from clsplat.device.layout import PLAIN_SLOTS, SPLAT, SlotFields
 from clsplat.device.profile import stage
+from clsplat.device.tape import Anew, AnewWord
 from clsplat.gaussians import GROUPS
 from clsplat.stages.adam import corrected, updates_sh_rest
 from clsplat.stages.device_camera import tiles_of
@@ -47,8 +48,17 @@ class Projected:
 
     def rows(self, start: int, stop: int) -> Projected:
         """The projected Gaussians from start to before stop."""
+        if (start, stop) == (0, self.tile_counts.shape[0]):
+            return self
         shown = None if self.shown is None else self.shown.rows(start, stop)
         return Projected(self.splats.rows(start, stop), self.tile_counts.rows(start, stop), shown)
+
+
+def thinning_numbers(thinning: Thinning | None) -> tuple[float, ...]:
+    """Numbers of `project` that are of the step."""
+    if thinning is None:
+        return ()
+    return (*map(AnewWord, (*thinning.key, thinning.threshold)), Anew(thinning.factor))
 
 
 @stage("project")
@@ -73,11 +83,10 @@ def project(
         defines: dict[str, object] = {"SH_DEGREES": True} if "sh_degrees" in part.arrays else {}
         if part["sh_rest"].dtype == np.float16:
             defines["SH_HALF"] = True
-        thinned: tuple[np.uint32 | float, ...] = ()
+        thinned: tuple[float, ...] = ()
         if thinning is not None:
             defines["THINNED"] = True
-            words = (start, *thinning.key, thinning.threshold)
-            thinned = (*(np.uint32(word) for word in words), thinning.factor)
+            thinned = (start, *thinning_numbers(thinning))
         if rays:
             kernel, lanes = device.kernels("project_rays", LANES=1, **defines).project_rays, 1
         else:
@@ -160,7 +169,7 @@ def project_grad(
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` from the pairs' slots,
     which have `fields`; explore: its penalties are added."""
-    weights, build = _weights(explore), _build(device)
+    weights, build = penalty_weights(explore), _build(device)
     defines = {**_defines(gaussians, slots, fields, sh_rest=sh_rest), **build.defines}
     defines |= {"PENALTIES": True} if weights else {}
     n = gaussians.count
@@ -174,6 +183,21 @@ def project_grad(
         *([screen.contributions] if fields.contributions else []),
         *weights,
     )
+
+
+def step_numbers(
+    config: OptimiserConfig, step: int, rates: Mapping[str, float], explore: Exploration | None
+) -> tuple[float, ...]:
+    """Numbers of `project_step` that are of the step: weights of penalties, two roots of Adam's, and the rate of each
+    group."""
+    by_group = {
+        group: (0.0, 0.0)
+        if group == "sh_rest" and not updates_sh_rest(config, step)
+        else corrected(config, step, group, rates[group])
+        for group in GROUPS
+    }
+    roots = by_group["means"][1], by_group["sh_rest"][1]
+    return (*penalty_weights(explore), *roots, *(rate for rate, _ in by_group.values()))
 
 
 @stage("project_grad")
@@ -199,20 +223,17 @@ def project_step(
     defines = {**_defines(parameters, slots, fields, sh_rest=sh_rest), "ADAM": True}
     if config.sparse:
         defines["SPARSE"] = True
-    if weights := _weights(explore):
+    numbers = [Anew(number) for number in step_numbers(config, step, rates, explore)]
+    weights = len(penalty_weights(explore))
+    if weights:
         defines["PENALTIES"] = True
-    by_group = {
-        group: (0.0, 0.0) if group == "sh_rest" and not sh_rest else corrected(config, step, group, rates[group])
-        for group in GROUPS
-    }
     arguments = (
         *_inputs(parameters, camera_array, projected, slots),
         screen.gradients,
         *([screen.contributions] if fields.contributions else []),
-        *weights,
+        *numbers[:weights],
         *(config.beta1, config.beta2, config.epsilon),
-        *(by_group["means"][1], by_group["sh_rest"][1]),
-        *(rate for rate, _ in by_group.values()),
+        *numbers[weights:],
         *(GROUPS["means"].limit ** 2, GROUPS["sh_dc"].limit ** 2),
         readback.buffer,  # no array that a step goes through: it is touched where something is wrong
         *(arrays[group] for arrays in model for group in GROUPS),
@@ -227,7 +248,7 @@ def project_step(
         launch_items(device, kernel, parameters.count, *arguments)
 
 
-def _weights(explore: Exploration | None) -> tuple[float, ...]:
+def penalty_weights(explore: Exploration | None) -> tuple[float, ...]:
     """Weights of the penalties on opacity and scale, none where there are none."""
     return (explore.opacity, explore.scale) if explore is not None and explore.penalised else ()
 

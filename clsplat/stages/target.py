@@ -40,15 +40,30 @@ def target(
     image, and the gradient of blending passes them: the render is changed.
     An image on the host goes up without waiting: it must not change before the device is waited for.
     """
-    height, width, channels = image.shape
-    rows, stride = padded_size(width, height)
     if isinstance(image, DeviceArray):
-        source = image
-    else:
-        source = work.array("target_source", image.shape, image.dtype)
-        source.send(np.ascontiguousarray(image))
+        device.under_way.append(image.buffer)  # it may be the host's memory
+        render = () if blended is None else (blended.image.buffer, blended.stops.buffer)
+        key = (background, alpha, *render)
+        return work.replayed(image, key, lambda: _target(device, work, image, background, blended, alpha=alpha))
+    source = work.array("target_source", image.shape, image.dtype)
+    source.send(np.ascontiguousarray(image))
+    return _target(device, work, source, background, blended, alpha=alpha)
+
+
+def _target(
+    device: Device,
+    work: Workspace,
+    source: DeviceArray,
+    background: DeviceArray,
+    blended: Blended | None,
+    *,
+    alpha: bool,
+) -> DeviceArray:
+    """`target` of an image on the device."""
+    height, width, channels = source.shape
+    rows, stride = padded_size(width, height)
     planes = work.array("target", (3 + alpha, rows, stride))
-    defines = {"BYTES": True} if image.dtype == np.uint8 else {}
+    defines = {"BYTES": True} if source.dtype == np.uint8 else {}
     render: tuple[DeviceArray, ...] = ()
     if channels == 5:
         assert blended is not None, "a mask is of a render too"
@@ -58,5 +73,4 @@ def target(
     kernels = device.kernels("target", **defines)
     sizes = (width, height, channels, stride, rows * stride)
     launch_grid(device, kernels.target, (stride, rows), *sizes, source, background, planes, *render)
-    device.under_way.append(source.buffer)  # it may be the host's memory
     return planes

@@ -36,6 +36,7 @@ from clsplat.runs.checkpoints import unusable
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
 from clsplat.scenes.cloud import with_points
+from clsplat.scenes.depth import with_depths
 from clsplat.scenes.initialise import is_colourless, photographed
 from clsplat.scenes.scene import Scene
 from clsplat.stages.loss import Loss
@@ -326,7 +327,7 @@ class Session:
         if run is not None:
             run.save_model(model, photos_space(view.path for view in trainer.scene.views))
             if (appearance := trainer.appearance.record()) is not None:
-                run.write_appearance(appearance)
+                run.write_appearance(appearance, trainer.appearance.tables())
             if trainer.scene.test_views:
                 result = self.evaluate(keep=True)
                 run.write_eval(result)
@@ -363,7 +364,7 @@ def _reached(every: int, steps: range) -> bool:
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
     """The scene to train on, with colours, recorded in the run; a warning for each doubt in it. Raises InputError where
     the run has been trained already, or on another scene."""
-    scene = with_points(scene, config.start_points)
+    scene = with_depths(with_points(scene, config.start_points), config.depth_use)
     if run is not None:
         if not resume and (run.checkpoints() or run.read_metrics()):
             raise InputError(

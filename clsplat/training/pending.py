@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from numpy.typing import NDArray
@@ -117,7 +117,7 @@ class Pending:
         self._steps.append(step)
         under_way.clear()
         self._look(0 if reads_loss else 1)
-        return step.result if reads_loss else replace(result, copy=lambda: self._sums(step))
+        return step.result if reads_loss else result.copied(lambda: self._sums(step))
 
     def _sums(self, step: _Step) -> NDArray[Any]:
         """The sums of a step's loss, once it is known to have been one."""

@@ -34,6 +34,7 @@ from clsplat.gaussians import GROUPS
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.runs.checkpoints import read_arrays
 from clsplat.runs.settings import config_text, parse_config
+from clsplat.stages.device_camera import padded_size
 from clsplat.stages.device_gaussians import (
     DeviceGaussians,
     HostArray,
@@ -43,7 +44,7 @@ from clsplat.stages.device_gaussians import (
     to_device,
     to_host,
 )
-from clsplat.stages.loss import Loss
+from clsplat.stages.loss import DepthAims, Loss
 from clsplat.stages.project import Slots
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.health import Incident, finite_or_zero
@@ -62,7 +63,8 @@ _KINDS = ("parameters", "first", "second")
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """One training step. record: step, stage, name of the view, rates, size, versions, device; config: the settings;
-    camera: at the size of photograph (H, W, 3 to 5); background (3,); models: parameters and moments by group."""
+    camera: at the size of photograph (H, W, 3 to 5); background (3,); models: parameters and moments by group; depth:
+    the view's known depths."""
 
     record: dict[str, Any]
     config: TrainConfig
@@ -70,6 +72,7 @@ class Bundle:
     photograph: NDArray[Any]
     background: NDArray[np.float32]
     models: dict[str, HostGaussians]
+    depth: DepthAims | None = None
 
 
 def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
@@ -95,10 +98,13 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
         "device": {"name": device.name, "driver": device.driver, "shape": str(device.shape)},
     }
     pixels = {"photograph": photograph, "background": incident.background}
+    aims = trainer.depths.aims(incident.view, camera.width, camera.height, incident.step)
+    if aims is not None:
+        record["depth_factor"], pixels["depth"] = aims.factor, aims.planes
     pose = {"rotation": camera.rotation, "translation": camera.translation}
 
     def reproduced(models: dict[str, HostGaussians]) -> bool:
-        bundle = Bundle(record, trainer.config, camera, photograph, incident.background, models)
+        bundle = Bundle(record, trainer.config, camera, photograph, incident.background, models, aims)
         return bool(first_trouble(replay(bundle, device)))
 
     trainer.settle()
@@ -144,7 +150,8 @@ def _bundle_of(arrays: dict[str, NDArray[Any]], path: Path) -> Bundle:
     lens = {**record["camera"], "radial": tuple(record["camera"].get("radial", (0.0,) * 4))}
     camera = Camera(**lens, rotation=arrays["rotation"], translation=arrays["translation"])
     models = {kind: host_model(arrays, kind) for kind in _KINDS}
-    return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models)
+    aims = DepthAims(arrays["depth"], float(record["depth_factor"])) if "depth" in arrays else None
+    return Bundle(record, config, camera, arrays["photograph"], arrays["background"], models, aims)
 
 
 def _checked(bundle: Bundle) -> Bundle:
@@ -163,6 +170,11 @@ def _checked(bundle: Bundle) -> Bundle:
         raise ValueError("a camera that is none")
     if camera.projection not in PROJECTIONS or len(camera.radial) != 4 or not np.isfinite(camera.radial).all():
         raise ValueError("a camera without a projection")
+    planes = (2, *padded_size(camera.width, camera.height))
+    if bundle.depth is not None and (bundle.depth.planes.shape != planes or bundle.depth.planes.dtype != np.float32):
+        raise ValueError(f"depths {bundle.depth.planes.shape} for a camera of {sides}")
+    if bool(bundle.config.depth_use) != (bundle.depth is not None):
+        raise ValueError("settings and depths that do not belong together")
     rates = record["rates"]
     if type(record["step"]) is not int or not np.isfinite([float(rates[group]) for group in GROUPS]).all():
         raise ValueError("no step and no learning rates")
@@ -205,10 +217,11 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     parameters, first, second = (to_device(device, bundle.models[kind]) for kind in _KINDS)
     gradients = allocate_gaussians(device, parameters.count, parameters.coefficients, zero=True)
     probe.counts["parameters"] = _wrong_in(parameters)
-    fields = slot_fields(strategy_of(config).needs(record["step"]))
+    fields = slot_fields(strategy_of(config).needs(record["step"]), nearness=bundle.depth is not None)
     step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
     pixels = (bundle.photograph, bundle.camera, bundle.background)
-    step.run((parameters, first, second), *pixels, probe, gradients, kept=kept_pixels(bundle.photograph))
+    known: dict[str, Any] = {"kept": kept_pixels(bundle.photograph), "depth": bundle.depth}
+    step.run((parameters, first, second), *pixels, probe, gradients, **known)
     return {**probe.counts, "adam": int(rasterizer.readback.get()[-len(REFUSED) :].sum())}
 
 

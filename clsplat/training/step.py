@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
+from weakref import ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +22,20 @@ from clsplat.device.layout import SlotFields
 from clsplat.rendering.rasterizer import Frame, Rasterizer, Room
 from clsplat.stages.adam import adam, updates_sh_rest
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
-from clsplat.stages.loss import Loss, loss
+from clsplat.stages.loss import DepthAims, Loss, loss
 from clsplat.stages.noise import noise
-from clsplat.stages.project import Projected, Screen, Slots, project_grad, project_step
+from clsplat.stages.project import Projected, Screen, Slots, project_grad, project_step, step_numbers
 from clsplat.stages.target import target
 from clsplat.training.appearance import ViewAppearance
 from clsplat.training.density import StatisticsNeeds
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
     """A view of a step: its index, photograph (H, W, 3 to 5), camera of that size, background; begins: with it a pass
-    through all views begins; kept: pixels that its mask leaves, None without one."""
+    through all views begins; kept: pixels that its mask leaves, None without one; depth: its known depths."""
 
     view: int
     photograph: NDArray[Any] | DeviceArray
@@ -39,6 +43,12 @@ class Sample:
     background: NDArray[np.float32]
     begins: bool
     kept: int | None = None
+    depth: DepthAims | None = None
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """Those that `GradientStep.run` takes by name."""
+        return {"kept": self.kept, "depth": self.depth}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +107,11 @@ class StepProbe:
         """Adam has changed these rows."""
 
 
+def _made_anew(_key: tuple[object, ...], make: Callable[[], R]) -> R:
+    """Call `make`: the place of `Workspace.replayed` in a step that waits for its counts."""
+    return make()
+
+
 @dataclass(frozen=True, eq=False)
 class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in the memory of a rasterizer.
@@ -128,39 +143,38 @@ class GradientStep:
         *,
         reads_loss: bool = False,
         kept: int | None = None,
+        depth: DepthAims | None = None,
     ) -> Loss:
         """Update the model (parameters, first and second moments) by a photograph (H, W, 3 to 5) of the camera's size.
 
         gradients: room for those of the rows that are on the device at once, zeros before and after, for a probe that
         looks at them; the bits of the model are the same without; reads_loss: the loss will be read; kept: pixels that
-        the photograph's mask, its fifth channel, leaves.
+        the photograph's mask, its fifth channel, leaves; depth: what the render's depths are compared with, where the
+        step's fields have nearness.
         """
         device, rasterizer, work = self.device, self.rasterizer, self.rasterizer.work
-        thinning = thinning_of(self.config, self.step)
-        frame = rasterizer.forward(model[0], camera, background, room=self.room, thinning=thinning)
+        of_pass: dict[str, Any] = {"thinning": thinning_of(self.config, self.step), "nearness": self.fields.nearness}
+        frame = rasterizer.forward(model[0], camera, background, room=self.room, **of_pass)
         probe.forward(frame)
         alpha_weight = self.config.alpha_loss if photograph.shape[2] > 3 else 0.0
         planes = target(device, work, photograph, frame.background, frame.blended, alpha=alpha_weight > 0)
         size, weight, appearance = (camera.width, camera.height), self.config.dssim_weight, self.appearance
-        image = frame.blended.image if appearance is None else appearance.apply(work, frame.blended.image)
-        result = loss(
-            device,
-            work,
-            image,
-            planes,
-            *size,
-            weight,
-            self.turn,
-            kept=kept,
-            blended=frame.blended,
-            alpha_weight=alpha_weight,
+        image = frame.blended.image if appearance is None else appearance.apply(work, frame.blended.image, *size)
+        replayed = _made_anew if self.room is None else partial(work.replayed, model[0])
+        settings: dict[str, Any] = {"kept": kept, "alpha_weight": alpha_weight, "depth": depth}
+        result = (replayed if depth is None else _made_anew)(  # known depths are sent
+            (frame.part, image.buffer, kept, alpha_weight, self.turn),
+            lambda: loss(device, work, image, planes, *size, weight, self.turn, blended=frame.blended, **settings),
         )
         if reads_loss:
             result = result.fetched()
         probe.loss(result)
         if appearance is not None:
-            columns = appearance.gradient(work, image, result.gradient, camera.height)
-        slots = rasterizer.pair_gradients(frame, result.gradient, fields=self.fields)
+            columns = appearance.gradient(work, frame.blended.image, image, result.gradient, *size)
+        slots = replayed(
+            (frame.part, frame.background, result.gradient, self.fields),
+            lambda: rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
+        )
         probe.pair_gradients(slots)
         for start, stop, part in parts(work, *model, keep=True):
             projected, row_slots = frame.projected.rows(start, stop), slots.rows(start, stop)
@@ -191,14 +205,24 @@ class GradientStep:
             adam(self.device, self.step, self.rates, optimiser, *models, rows.projected.tile_counts, readback)
         else:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
+            arguments = (rows.device, self.step, self.rates, optimiser, rows.model, *view)
             fields, explore = self.fields, self.explore
-            project_step(
-                rows.device, self.step, self.rates, optimiser, rows.model, *view, fields=fields, explore=explore
-            )
+            if self.room is None:
+                project_step(*arguments, fields=fields, explore=explore)
+            else:
+                arrays = (*vars(rows.slots).values(), *vars(rows.screen).values())
+                key = (*map(ref, rows.model), rows.projected, *arrays, updates_sh_rest(optimiser, self.step))
+                penalised = explore is not None and explore.penalised
+                self.rasterizer.work.replayed(
+                    rows.parameters,
+                    (*key, rows.device, rows.camera_array, fields, penalised),
+                    lambda: project_step(*arguments, fields=fields, explore=explore),
+                    step_numbers(optimiser, self.step, self.rates, explore),
+                )
         if self.explore is not None:
             noise(self.device, self.explore, rows.parameters, rows.start, readback)
 
 
-def slot_fields(needs: StatisticsNeeds) -> SlotFields:
-    """The fields of a slot that these statistics need."""
-    return SlotFields(needs.absolute, needs.contributions)
+def slot_fields(needs: StatisticsNeeds, *, nearness: bool = False) -> SlotFields:
+    """The fields of a slot that these statistics need; nearness: depths are compared."""
+    return SlotFields(needs.absolute, needs.contributions, nearness)

@@ -50,8 +50,8 @@ from clsplat.stages.device_gaussians import (
     upload_gaussians,
 )
 from clsplat.stages.loss import Loss
-from clsplat.training import edges
-from clsplat.training.appearance import Appearance
+from clsplat.training import depth, edges
+from clsplat.training.appearance import appearance_of
 from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
 from clsplat.training.density import ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
@@ -59,6 +59,7 @@ from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.pending import Pending
 from clsplat.training.photographs import Photographs
+from clsplat.training.rates import rates_at
 from clsplat.training.resolution import sizes_of
 from clsplat.training.sampling import SamplingFilter
 from clsplat.training.step import GradientStep, Sample, StepProbe, slot_fields
@@ -101,6 +102,7 @@ class Trainer:
         self.rasterizer = Rasterizer(device, config.rasterizer)
         self.rasterizer.antialias(on=config.antialiased)
         self.photographs = Photographs(self.views, device)
+        self.depths = depth.Depths(config, self.views, scene.extent)
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.sizes = sizes_of(
             config.warmup, config.frequency_steps, len(self.views), lambda index: self.views[index].load()
@@ -121,10 +123,11 @@ class Trainer:
         self.mark: _Mark | None = None
         self.rehearsed: set[tuple[object, ...]] = set()
         self.strategy = self._new_strategy(self.config)
+        self._looks_at_steps = type(self.strategy).after_gradient is not Strategy.after_gradient
         initial = self.given
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
-        self.appearance = Appearance(self.config, self.device, self.scene)
+        self.appearance = appearance_of(self.config, self.device, self.scene)
         self.origin, self.near = initial.origin, self.scene.near
         self._cameras: dict[int, Camera] = {}
         cameras = {view.name: self.local(view.camera) for view in self.views}
@@ -146,13 +149,13 @@ class Trainer:
                 (self.config.sh_degree + 1) ** 2,
                 [view.camera for view in self.scene.views],
                 self.config.rasterizer,
-                fields=slot_fields(needs),
+                fields=slot_fields(needs, nearness=bool(self.config.depth_use)),
                 agreement=needs.agreement,
                 photographs=sum(view.camera.width * view.camera.height for view in self.views),
                 turns=self.pending.turns,
                 antialiased=self.config.antialiased,
                 masks=self.config.mask_use != NO_MASKS,
-                further=self.appearance.pixel_bytes + edges.pixel_bytes(self.config),
+                further=self.appearance.pixel_bytes + sum(part.pixel_bytes(self.config) for part in (depth, edges)),
                 **models,
             )
 
@@ -204,12 +207,14 @@ class Trainer:
         Kerbl et al. 2023, algorithm 1, but for where the loop is cut: a model is looked at, kept or finished before
         its Gaussians are split or made transparent, not just after.
         """
-        self._note()
+        if self.mark is None or self._looks_at_steps:
+            self._note()
         self.mend()
         if not self.controlled:
             self._control_density()
             self.controlled = True
-        self._note()
+        if self.mark is None:
+            self._note()
         views = self.views_ahead
         self.step += views
         self._raise_sh_degree()
@@ -220,17 +225,18 @@ class Trainer:
         needs = self.strategy.needs(self.step)
         rates, count = self.rates(), self.parameters.count
         explore = self.strategy.exploration(self.step, rates["means"], count, self.scene.extent)
-        settings = (self.device, self.rasterizer, self.config)
-        exact = GradientStep(*settings, self.step, rates, slot_fields(needs), explore=explore)
+        fields = slot_fields(needs, nearness=bool(self.config.depth_use))
+        settings = (self.device, self.rasterizer, self.config, self.step, rates, fields)
         factor, number = self.sizes.factor(self.step), self.step
         appearances = self.appearance.of_views([sample.view for sample in samples], self.step)
 
         def run(turn: int, room: Room | None) -> Loss:
             sample = samples[0]
-            step = replace(exact, turn=turn, room=room, appearance=appearances[0] if appearances else None)
+            appearance = next(iter(appearances), None)
+            step = GradientStep(*settings, turn=turn, room=room, explore=explore, appearance=appearance)
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
-            result = step.run(model, *pixels, probe, reads_loss=reads_loss, kept=sample.kept)
+            result = step.run(model, *pixels, probe, reads_loss=reads_loss, **sample.known)
             self.sampling.apply(self.parameters)
             return result
 
@@ -239,18 +245,19 @@ class Trainer:
             result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
         else:
             model, look = (self.parameters, self.first, self.second), self._watched_in_batch
+            exact = GradientStep(*settings, explore=explore)
             result = self.batch.run(exact, model, samples, factor, look, appearances, statistics=needs.gradients)
             self.sampling.apply(self.parameters)
         self.controlled, self.last_views = False, views
         self._note()
-        self._rearrange(self.strategy.after_gradient(self._state()))
+        if self._looks_at_steps:
+            self._rearrange(self.strategy.after_gradient(self._state()))
         return result
 
     def _room(self, factor: float) -> int:
         """Pairs to launch the next step for, or 0 for the exact number, as where the strategy looks at each step's
         model."""
-        looked_at = type(self.strategy).after_gradient is not Strategy.after_gradient
-        if not self.pending.on or looked_at or not self.rasterizer.takes_room:
+        if not self.pending.on or self._looks_at_steps or not self.rasterizer.takes_room:
             return 0
         return self.pending.room(self.rasterizer, (factor, self.rasterizer), self.parameters.count)
 
@@ -270,7 +277,8 @@ class Trainer:
         image = bring(view, factor)
         self.background = self._background_colour()
         camera, kept = self.camera(view, image.shape[1], image.shape[0]), self.photographs.kept(view, factor)
-        return Sample(view, image, camera, self.background, begins, kept)
+        aims = self.depths.aims(view, camera.width, camera.height, self.step)
+        return Sample(view, image, camera, self.background, begins, kept, aims)
 
     def _watched_in_batch(self, sample: Sample, step: GradientStep) -> StepProbe:
         """The probe of a view, when the statistics of those before it are complete."""
@@ -314,16 +322,8 @@ class Trainer:
         self._rearrange(RowPlan(remedy.rows))
 
     def rates(self) -> dict[str, float]:
-        """Learning rate of each group at this step. The means' falls exponentially; all fall in the cooldown, and with
-        each return to a checkpoint."""
-        optimiser = self.config.optimiser
-        into = optimiser.cooldown - max(self.config.iterations - self.step, 0)
-        cooled = optimiser.cooldown_to ** (into / optimiser.cooldown) if into > 0 else 1.0
-        fraction = min(self.step / optimiser.means_rate_steps, 1.0)
-        means_rate = optimiser.means_rate ** (1 - fraction) * optimiser.means_rate_end**fraction
-        rates = {name: getattr(optimiser, group.rate) for name, group in GROUPS.items()}
-        rates["means"] = means_rate * self.scene.extent
-        return {group: rate * cooled * self.watch.patience.rate_factor for group, rate in rates.items()}
+        """Learning rate of each group at this step."""
+        return rates_at(self.config, self.step, self.scene.extent, self.watch.patience.rate_factor)
 
     def _next_view(self) -> int:
         if not self.queue:
@@ -364,6 +364,8 @@ class Trainer:
             if step == steps[0]:
                 self._note()
             self._rearrange(self.strategy.before_step(self._state(step)))
+        if steps:
+            self.mark = None  # of what a strategy has drawn, too
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics = self.parameters, self.statistics.named()

@@ -76,7 +76,12 @@ class Watched(StepProbe):
         """Add the step to the statistics of some rows, as far as density control needs them."""
         device, camera, screen = self.trainer.device, self.sample.camera, rows.screen
         if self.needs.gradients:
-            add_statistics(device, statistics, camera, rows.projected, screen, self.needs.threshold)
+            size, threshold = (camera.width, camera.height, camera.fx), self.needs.threshold
+            self.trainer.rasterizer.work.replayed(
+                statistics,
+                (rows.projected, screen.gradients, *size, threshold),
+                lambda: add_statistics(device, statistics, camera, rows.projected, screen, threshold),
+            )
         if screen.contributions is not None and statistics.current_totals is not None:
             full = self.trainer.views[self.sample.view].camera
             area = full.width * full.height / (camera.width * camera.height)

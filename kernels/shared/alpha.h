@@ -8,6 +8,17 @@
 #define REACHES(mask) ANYL(mask)
 #endif
 
+// A Gaussian's nearness, one over its depth, which is blended like a colour (docs/gradients.md, (120)).
+#ifdef NEARNESS
+#define NEAR_PARAMETER , float c_near
+#define NEAR_ARGUMENT , c_near
+#define NEAR_HERE(nearness) const float c_near = nearness;
+#else
+#define NEAR_PARAMETER
+#define NEAR_ARGUMENT
+#define NEAR_HERE(nearness)
+#endif
+
 // u of a pixel, from the mean's offset (dx, dy) to it.
 static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
   return fmaL((floatL)(l12), dy, l11 * dx);

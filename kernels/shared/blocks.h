@@ -105,6 +105,10 @@ typedef struct {
   float l22, log2o, red, green;
   float blue;
   uint blocks, gaussian, slot;
+#ifdef NEARNESS
+  float near;     // one over the depth
+  uint unused[3]; // to the next multiple of 16 bytes: no copy has what nobody wrote
+#endif
 } __attribute__((aligned(16))) Staged;
 
 static inline void stage(__local Staged *place, uint gaussian, uint slot, __global const float *splats, int tile_x,
@@ -123,6 +127,10 @@ static inline void stage(__local Staged *place, uint gaussian, uint slot, __glob
   s.blocks = blocks_of(splat, tile_x, tile_y);
   s.gaussian = gaussian;
   s.slot = slot;
+#ifdef NEARNESS
+  s.near = 1.0f / splat[SPLAT_DEPTH];
+  for (int k = 0; k < 3; ++k) s.unused[k] = 0;
+#endif
   *place = s;
 }
 

@@ -91,3 +91,14 @@ static inline Double scaled2(float a, float a_low, Double b) {
   const Double factor = {(floatL)(a), (floatL)(a_low)};
   return multiply2(factor, b);
 }
+
+// s1 - s2, their logarithms `x` apart: near each other by the series of exp(x) - 1, as what rounding leaves of two
+// equal scales' difference would turn every ball.
+static inline floatL scale_difference(floatL x, floatL s1, floatL s2) {
+  floatL series = fmaL(x, (floatL)(1.0f / 720.0f), (floatL)(1.0f / 120.0f));
+  series = fmaL(x, series, (floatL)(1.0f / 24.0f));
+  series = fmaL(x, series, (floatL)(1.0f / 6.0f));
+  series = fmaL(x, series, (floatL)(0.5f));
+  series = fmaL(x * x, series, x) * s2;
+  return x * x < 0.0625f ? series : s1 - s2;
+}

@@ -13,7 +13,8 @@ static inline float larger_eigenvalue(float l11, float l12, float l22) {
   return middle + sqrt(fma1(half_difference, half_difference, sxy * sxy));
 }
 
-// Floats from one pair's slot to the next. The contribution, where it is kept, is behind the gradients.
+// Floats from one pair's slot to the next. The contribution, where it is kept, is behind the gradients, and that by
+// nearness (one over the depth) behind it.
 #ifdef ABSOLUTE_GRADIENTS
 #define SLOT_GRADIENTS SLOT_SIZE
 #else
@@ -21,9 +22,15 @@ static inline float larger_eigenvalue(float l11, float l12, float l22) {
 #endif
 #ifdef CONTRIBUTIONS
 #define SLOT_WEIGHT SLOT_GRADIENTS
-#define SLOT_STRIDE (SLOT_GRADIENTS + 1)
+#define SLOT_KEPT (SLOT_GRADIENTS + 1)
 #else
-#define SLOT_STRIDE SLOT_GRADIENTS
+#define SLOT_KEPT SLOT_GRADIENTS
+#endif
+#ifdef NEARNESS
+#define SLOT_NEAR SLOT_KEPT
+#define SLOT_STRIDE (SLOT_KEPT + 1)
+#else
+#define SLOT_STRIDE SLOT_KEPT
 #endif
 
 // From the first pixel's centre to the mean: whole pixels apart from the rest, which a float32 of the sum would cut.

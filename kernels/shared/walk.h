@@ -22,13 +22,27 @@ typedef struct {
   float mx, my, l11, l12, l22, log2o, red, green, blue;
   int i;
   uint blocks, slot;
+#ifdef NEARNESS
+  float near;
+#endif
 } Walker;
+
+// The gradient by nearness of a tile's pixels, at the places of their state.
+#ifdef NEARNESS
+#define NEAR_OF_STAGED , s.near
+#define NEAR_PIXELS , near
+#define NEAR_PIXELS_PARAMETER , __local const float *near
+#else
+#define NEAR_OF_STAGED
+#define NEAR_PIXELS
+#define NEAR_PIXELS_PARAMETER
+#endif
 
 // Takes the walker's pair out of a chunk's pixels, and adds their gradients to its sums (SLOT_STRIDE). Pixels that do
 // not take it go along with an alpha of 0: of 32 items some have one that does, and branches would keep the pixels of a
 // chunk apart.
 static inline void take_chunk(const Walker *w, int chunk, __local Passing *passing, __local const Fixed *fixed,
-                              float *sums) {
+                              float *sums NEAR_PIXELS_PARAMETER) {
   const float dy = w->my - (float)(chunk / ROW_CHUNKS), v = w->l22 * dy;
   const float left = (float)(chunk % ROW_CHUNKS * CHUNK);
   float g_row = 0.0f, gu_row = 0.0f; // sums of g and g u: v is the row's
@@ -43,7 +57,12 @@ static inline void take_chunk(const Walker *w, int chunk, __local Passing *passi
     const float alpha = uncapped < ALPHA_MAX ? uncapped : ALPHA_MAX;
     const float inverse = INVERSE(1.0f - alpha);
     const float before = state.x * inverse;
-    const float shade = fmaL(pixel.x, w->red, fmaL(pixel.y, w->green, pixel.z * w->blue));
+    const float colour = fmaL(pixel.x, w->red, fmaL(pixel.y, w->green, pixel.z * w->blue));
+#ifdef NEARNESS
+    const float shade = fmaL(near[place], w->near, colour);
+#else
+    const float shade = colour;
+#endif
     const float weight = alpha * before;
     const float d_alpha = fmaL(before, shade, -(state.y * inverse));
     const float g = uncapped < ALPHA_MAX ? alpha * d_alpha : 0.0f;
@@ -61,6 +80,9 @@ static inline void take_chunk(const Walker *w, int chunk, __local Passing *passi
 #endif
 #ifdef CONTRIBUTIONS
     sums[SLOT_WEIGHT] += weight;
+#endif
+#ifdef NEARNESS
+    sums[SLOT_NEAR] = fmaL(weight, near[place], sums[SLOT_NEAR]);
 #endif
   }
   const float gv_row = v * g_row;

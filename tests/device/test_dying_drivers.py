@@ -26,8 +26,14 @@ from clsplat.device.program import build, variant_of
 from clsplat.device.shapes import shapes_in_turn
 from clsplat.errors import DriverError
 
-SLOW = [pytest.param(how, verb, marks=pytest.mark.slow) for how in ("hang", "empty", "launch") for verb in VERBS]
 QUICK = [("abort", verb) for verb in VERBS]
+OTHERS = {
+    "hang": ("train", "tune", "selftest"),
+    "empty": ("render", "bench", "selftest"),
+    "launch": ("eval", "convert", "selftest"),
+}
+"""Verbs for the other ways to fail: those with a list of shapes or a table, and each of the rest with one of them."""
+SLOW = [pytest.param(how, verb, marks=pytest.mark.slow) for how, verbs in OTHERS.items() for verb in verbs]
 
 
 @pytest.mark.parametrize(("how", "verb"), [*QUICK, *SLOW])

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from models import random_gaussians
-from node import splat_transform
+from node import splat_transform, spz_flag
 from test_packed_formats import ksplat
 
 from clsplat.gaussians import Gaussians
@@ -71,3 +72,10 @@ def test_they_read_our_ksplats_as_we_do(level: int, tmp_path: Path) -> None:
     path = tmp_path / "made.ksplat"
     path.write_bytes(ksplat(random_gaussians(60, 2), level, (23, 37))[0])
     assert_alike(formats.load(path), as_they_read_it(path))
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_they_see_that_our_spz_is_antialiased(antialiased: bool, tmp_path: Path) -> None:
+    path = tmp_path / "ours.spz"
+    formats.save(path, replace(model(), antialiased=antialiased))
+    assert spz_flag(path) == (antialiased, 700)

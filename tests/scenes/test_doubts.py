@@ -21,7 +21,8 @@ from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
 from clsplat.reference.cameras import pixel_from_world
 from clsplat.scenes import doubts
-from clsplat.scenes.initialise import LEAST_COLOUR, from_points, is_colourless, photographed, pixels_of
+from clsplat.scenes.data_set import pixels_of
+from clsplat.scenes.initialise import LEAST_COLOUR, from_points, is_colourless, photographed
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.spherical_harmonics import C0
 

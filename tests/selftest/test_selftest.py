@@ -31,6 +31,7 @@ from clsplat.selftest.result import (
     BOUNDS,
     CHANNELS,
     DEEP,
+    DEPTH,
     FORWARD,
     MASKS,
     RAYS,
@@ -55,6 +56,8 @@ BROKEN = {
     "blend: fmaL(-before, alpha, before)": ("fmaL(-before, before, before)", "blend"),
     "target: pixel[4] > 0": ("pixel[4] >= 0", "masks"),
     "alpha_loss: -scale : (": ("scale : (", "masks"),
+    "depth_loss: nearness[at] - aims[at]": ("nearness[at] + aims[at]", "depth"),
+    "depth_loss: -factor * weight": ("factor * weight", "depth"),
     "loss: 2.0f * (mu1 * mu2) + C1": ("2.0f * (mu1 * mu2) - C1", "loss"),
     "blend_grad: fmaL(weight, shade, p->behind)": ("fmaL(weight, shade, -p->behind)", "blend_grad"),
     "project_grad: sums[field] += slot[field]": ("sums[field] -= slot[field]", "project_grad"),
@@ -76,6 +79,8 @@ BROKEN = {
     "density: stays && wanted && !large": ("stays && wanted && large", "statistics"),
     "appearance: fma1(seen[at], g, sum)": ("fma1(seen[at], g, g)", "appearance"),
     "appearance: moved[i] - 3.0f * sum": ("moved[i] + 3.0f * sum", "appearance"),
+    "grid: risen[k] = b - a": ("risen[k] = a - b", "grid"),
+    "grid: h * (level - (float)l)": ("h * level", "grid"),
 }
 """What is miscompiled: kernel and words, the words that stand there then, and the stage that is to notice."""
 
@@ -83,7 +88,8 @@ BROKEN = {
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
     monkeypatch.setenv(BREAK, change)
-    group = next(stages for stages in (FORWARD, CHANNELS, DEEP, RAYS, MASKS, BACKWARD, APPEARANCE) if last in stages)
+    groups = (FORWARD, CHANNELS, DEEP, RAYS, MASKS, BACKWARD, *APPEARANCE.values(), DEPTH)
+    group = next(stages for stages in groups if last in stages)
     before = () if group is FORWARD else FORWARD
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
 

@@ -161,7 +161,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
     ) -> FrameRenderer:
         return FrameRenderer(Renderer(open_device(device), rasterizer), gaussians, options)
 
-    monkeypatch.setattr(read, "read_cameras", lambda _: pipe.cameras)
+    monkeypatch.setattr(read, "read_cameras", lambda *_: pipe.cameras)
     monkeypatch.setattr(layers, "write_channels", pipe.write_channels)
     pipe.services = replace(
         pipe.services,

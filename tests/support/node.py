@@ -85,6 +85,28 @@ def splat_transform(source: Path, target: Path, *options: str) -> None:
     assert target.exists(), said
 
 
+SPZ = """
+import { readdirSync, readFileSync } from 'node:fs';
+const [folder, path] = process.argv.slice(1);
+const name = readdirSync(folder).find((each) => /^spz-.*[.]js$/.test(each)
+    && readFileSync(`${folder}/${each}`, 'utf8').includes('export {'));
+const { default: createModule } = await import(`${folder}/${name}`);
+const spz = await createModule();
+const cloud = await spz.loadSpzFromBuffer(new Uint8Array(readFileSync(path)), { to: spz.CoordinateSystem.RDF });
+console.log(JSON.stringify({ antialiased: cloud.antialiased, count: cloud.numPoints }));
+"""
+"""Prints an SPZ file's flag and number of Gaussians, read by the module that splat-transform reads them with."""
+
+
+def spz_flag(path: Path) -> tuple[bool, int]:
+    """True if splat-transform's reader has an SPZ file for antialiased; its number of Gaussians."""
+    package, folder = "@playcanvas/splat-transform", node_modules()
+    distribution = f"{folder}/{package}/dist"
+    said = _node(package, "--input-type=module", "-e", SPZ, distribution, str(path))
+    found = json.loads(said.splitlines()[-1])  # their module may say more
+    return found["antialiased"], found["count"]
+
+
 def validate_gltf(path: Path) -> list[dict[str, Any]]:
     """What Khronos's validator finds."""
     found: list[dict[str, Any]] = json.loads(_node("gltf-validator", "-e", VALIDATE, str(path)))

@@ -10,14 +10,13 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from compare import assert_same_bits
 from tiny import CONFIG, write_scene
 
 from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
-from clsplat.device.context import Device, open_devices
-from clsplat.errors import DeviceError, InputError
+from clsplat.device.context import Device
+from clsplat.errors import InputError
 from clsplat.evaluation import metrics
 from clsplat.images.exif import exposure_of
 from clsplat.images.reading import read_image
@@ -25,7 +24,7 @@ from clsplat.runs.appearance import held_out_gains
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, View, load_scene
-from clsplat.training.appearance import Appearance
+from clsplat.training.gains import GainsOfAll
 from clsplat.training.photographs import Photographs
 from clsplat.training.trainer import Trainer
 
@@ -35,63 +34,6 @@ EXPOSED = replace(CONFIG, appearance="exposure")
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
-
-
-def test_a_resumed_training_has_the_same_bytes(default_device: Device, scene: Scene) -> None:
-    whole, first, second = (Trainer(scene, EXPOSED, default_device) for _ in range(3))
-    for _ in range(20):
-        whole.train_step()
-    for _ in range(9):
-        first.train_step()
-    second.restore(Checkpoint(9, *first.checkpoint()))
-    for _ in range(11):
-        second.train_step()
-    wanted, got = whole.checkpoint()[0], second.checkpoint()[0]
-    assert wanted.keys() == got.keys()
-    assert wanted["appearance/logs"].any()
-    for name, array in wanted.items():
-        assert_same_bits(got[name], array, name)
-
-
-def state(trainer: Trainer, steps: int = 24) -> dict[str, np.ndarray]:
-    """All that a training has after so many steps."""
-    for _ in range(steps):
-        trainer.train_step()
-    arrays = trainer.checkpoint()[0]
-    trainer.close()
-    return arrays
-
-
-def assert_same_state(got: dict[str, np.ndarray], wanted: dict[str, np.ndarray]) -> None:
-    assert got.keys() == wanted.keys()
-    assert wanted["appearance/logs"].any()
-    for name, array in wanted.items():
-        assert_same_bits(got[name], array, name)
-
-
-def test_by_capacity_the_bytes_are_the_same(
-    default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", "0")
-    wanted = state(Trainer(scene, EXPOSED, default_device))
-    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", "1")
-    for stopped in (False, True):
-        trainer = Trainer(scene, EXPOSED, default_device)
-        if stopped:  # each time when the room is too small: such a step is made again
-            room = trainer.pending.room
-            monkeypatch.setattr(trainer.pending, "room", lambda *a, room=room: min(room(*a), 1024))
-        assert_same_state(state(trainer), wanted)
-
-
-@pytest.mark.parametrize("batch", [2, 3])
-def test_the_number_of_devices_changes_no_byte(default_device: Device, scene: Scene, batch: int) -> None:
-    config = replace(EXPOSED, batch=batch)
-    wanted = state(Trainer(scene, config, default_device), 10)
-    try:
-        devices = open_devices(",".join(f"{default_device.index}/{half}" for half in range(2)))
-    except DeviceError as error:
-        pytest.skip(str(error))
-    assert_same_state(state(Trainer(scene, config, devices[0], further=devices[1:]), 10), wanted)
 
 
 def test_a_batch_learns_from_all_of_its_views(default_device: Device, scene: Scene) -> None:
@@ -158,7 +100,7 @@ def test_exposures_that_exif_tells(default_device: Device, scene: Scene, tmp_pat
     scene = replace(scene, views=[told(index, view) for index, view in enumerate(scene.views)])
     exposures = {view.name: exposure_of(view.path) for view in scene.views}
     assert [value is None for value in exposures.values()] == [index == 3 for index in range(len(exposures))]
-    appearance = Appearance(EXPOSED, default_device, scene)
+    appearance = GainsOfAll(EXPOSED, default_device, scene)
     record = appearance.record()
     assert record is not None
     known = [value for view in scene.train_views if (value := exposures[view.name]) is not None]

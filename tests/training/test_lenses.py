@@ -15,19 +15,24 @@ from tiny import HEIGHT, WIDTH, cameras, hidden_model, short, write_scene
 
 from clsplat.api import train
 from clsplat.camera import Camera
+from clsplat.cli.main import main, parse
+from clsplat.cli.render import Render
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.errors import InputError
 from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import GROUPS
+from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
 from clsplat.reference import every_pixel
 from clsplat.reference.cameras import pixel_from_cam
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.initialise import pixels_of
+from clsplat.runs.run import Run
+from clsplat.scenes.data_set import pixels_of
 from clsplat.scenes.scene import Scene, load_scene
+from clsplat.shots import choose_shot
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.training.step import GradientStep, StepProbe
 
@@ -141,3 +146,27 @@ def test_a_panorama_of_another_size_is_named(tmp_path: Path) -> None:
     (folder / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 96 48 96 40\n")
     with pytest.raises(InputError, match="expected its size, 96 48, of a whole panorama"):
         load_scene(folder)
+
+
+def test_frames_are_drawn_through_the_lens_that_the_run_was_trained_with(
+    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert scene.source is not None
+    run, name = tmp_path / "run", scene.views[0].camera.projection
+    train(scene, replace(quiet(2), lenses="native"), run=Run.create(run, replace(quiet(2), lenses="native")))
+
+    def projections(*more: str) -> set[str]:
+        words = ["render", str(run), "--cameras", str(scene.source), "-o", str(tmp_path / "{name}.##.png"), *more]
+        assert main([*words, "--overwrite"]) == 0
+        capsys.readouterr()
+        verb = parse(words)
+        assert isinstance(verb, Render)
+        assert verb.lenses is not None
+        return {camera.projection for camera in choose_shot(verb.cameras, path=verb.path, lenses=verb.lenses).cameras}
+
+    assert projections() == {name}
+    view, drawn = scene.views[0].camera, min(tmp_path.glob("00*.png"))
+    assert read_image(drawn).shape[:2] == (view.height, view.width)
+    assert projections("--lenses", "undistort") == {"perspective" if name == "fisheye" else name}
+    if name == "fisheye":
+        assert projections("--path", "turntable", "--count", "2") == {"perspective"}

@@ -16,8 +16,10 @@ from clsplat.bench import stages as bench_stages
 from clsplat.bench import subject as bench_subject
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
+from clsplat.device.program import Kernel
 from clsplat.errors import InputError
 from clsplat.scenes.scene import Scene, load_scene
+from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.training.density import ModelState, RowPlan
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.pending import VARIABLE, Pending, by_capacity
@@ -165,3 +167,28 @@ def test_the_default_is_the_kind_of_the_device(default_device: Device, monkeypat
     monkeypatch.setenv(VARIABLE, "yes")
     with pytest.raises(InputError, match=f"{VARIABLE}=yes: expected 1, or 0"):
         by_capacity(default_device)
+
+
+def test_launches_come_from_tapes(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all of a step, as long as the model stays."""
+    monkeypatch.setenv(VARIABLE, "1")
+    trainer = bench_stages.trainer_of(bench_subject.synthetic(200, 80, 60), device, RasterizerConfig())
+    made: list[str] = []
+    real = Device.enqueue
+
+    def enqueue(self: Device, kernel: Kernel, *arguments: Any, **options: Any) -> Any:
+        made.append(kernel.name)
+        return real(self, kernel, *arguments, **options)
+
+    monkeypatch.setattr(Device, "enqueue", enqueue)
+    steps = []
+    for _ in range(12):
+        made.clear()
+        trainer.train_step()
+        steps.append(list(made))
+    assert len(steps[2]) > 12
+    assert steps[-3:] == [[]] * 3
+    trainer._set_parameters(upload_gaussians(device, trainer.gaussians()))  # as density control does
+    made.clear()
+    trainer.train_step()
+    assert len(made) > 12

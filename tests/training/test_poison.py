@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from compare import assert_same_bits
+from depths import add_maps
 from golden_frames import checksums
 from pipeline import shaped
 from quick import quick
@@ -22,6 +23,7 @@ from clsplat.device.layout import SPLAT
 from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS
 from clsplat.images.writing import write_image
+from clsplat.scenes.depth import with_depths
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.training import step as step_module
@@ -58,6 +60,14 @@ def masked(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     for path in sorted((folder / "images").iterdir()):
         write_image(folder / "masks" / path.name, mask)
     return load_scene(folder, masks=MASKED.mask_use)
+
+
+@pytest.fixture(scope="module")
+def deep(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """Pictures with depth maps, which know nothing of a quarter of each."""
+    folder = write_scene(tmp_path_factory.mktemp("tiny") / "scene")
+    add_maps(folder)
+    return with_depths(load_scene(folder), DEEP.depth_use)
 
 
 # Memory that nobody has written
@@ -105,8 +115,12 @@ EXPLORING = short(
 """Moves, growth, penalties and noise."""
 
 EXPOSED = short(iterations=16, warmup=(2, 4), appearance="exposure")
+WITH_GRIDS = short(iterations=24, warmup=(2, 4), appearance="grid")
 MASKED = short(iterations=24, warmup=(2, 4), masks="ignore", alpha="transparent")
 """Masks at every size of the warm-up, and the alpha loss."""
+
+DEEP = short(iterations=16, warmup=(2, 4), depth="maps")
+"""Depth maps at every size of the warm-up."""
 
 MANY = short(
     iterations=32,
@@ -120,17 +134,20 @@ MANY = short(
 @pytest.mark.parametrize(
     "how",
     quick(
-        ["at once", "mcmc", "exposure", "masked", "in pieces", "in vectors of 1"],
+        ["at once", "mcmc", "exposure", "grid", "masked", "depths", "in pieces", "in vectors of 1"],
         "at once",
         "mcmc",
         "exposure",
+        "grid",
         "masked",
+        "depths",
     ),
 )
 def test_training_in_poisoned_memory(
     scene: Scene,
     many_points: Scene,
     masked: Scene,
+    deep: Scene,
     default_device: Device,
     monkeypatch: pytest.MonkeyPatch,
     word: str,
@@ -138,8 +155,9 @@ def test_training_in_poisoned_memory(
 ) -> None:
     device = shaped(default_device, 1, 64) if how == "in vectors of 1" else default_device
     pieces = how == "in pieces"
-    config = {"in pieces": MANY, "mcmc": EXPLORING, "exposure": EXPOSED, "masked": MASKED}.get(how, EVERYTHING)
-    scene = masked if how == "masked" else scene
+    settings = {"in pieces": MANY, "mcmc": EXPLORING, "exposure": EXPOSED, "grid": WITH_GRIDS, "masked": MASKED}
+    config = {**settings, "depths": DEEP}.get(how, EVERYTHING)
+    scene = {"masked": masked, "depths": deep}.get(how, scene)
     found = []
     for value in ("", WORDS[word]):
         monkeypatch.setenv("CLSPLAT_POISON", value)

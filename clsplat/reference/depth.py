@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The depth loss and the gradient of nearness by the means: float64 twins of kernels/depth_loss.cl, and of its part in
+project_grad.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+
+
+def depth_loss(nearness: Float64, aims: Float64, weights: Float64, factor: float) -> tuple[float, Float64]:
+    """Eq. (121): factor times the sum of weighted |N - n|, and its gradient by N; all (H, W)."""
+    difference = weights * (nearness - aims)
+    return float(factor * np.abs(difference).sum()), factor * weights * np.sign(difference)
+
+
+def nearness_grad(means: Float64, camera: Camera, d_nearness: Float64) -> Float64:
+    """Eq. (122): the gradient (N, 3) by the means, of that by one over the depth (N,), which is the distance where
+    pixels are rays."""
+    local = means @ camera.rotation.T + camera.translation
+    if camera.kind.flat:
+        along, depth = np.zeros_like(local), local[:, 2]
+        along[:, 2] = 1
+    else:
+        depth = np.linalg.norm(local, axis=1)
+        along = local / depth[:, None]
+    with np.errstate(divide="ignore"):
+        slope = np.where(d_nearness != 0, -d_nearness / np.square(depth), 0.0)
+    return np.asarray((slope[:, None] * along) @ camera.rotation)

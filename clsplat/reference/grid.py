@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bilateral grids of photographs, their gradient and Adam's step: float64 twin of kernels/grid.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clsplat.arrays import Float64
+
+LUMINANCE = np.array([0.299, 0.587, 0.114])
+"""Weights of red, green and blue in the luminance that finds a pixel's level."""
+
+
+def identity(shape: tuple[int, int, int]) -> Float64:
+    """A grid (levels, rows, columns, 3, 4) that changes no colour."""
+    return np.broadcast_to(np.eye(3, 4), (*shape, 3, 4)).copy()
+
+
+def _hats(places: Float64, count: int) -> Float64:
+    """Weights (..., count) of the vertices for each place among them."""
+    weights: Float64 = np.maximum(1 - np.abs(places[..., None] - np.arange(count)), 0)
+    return weights
+
+
+def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, Float64, Float64]:
+    """Weights of each pixel (H, W) for rows, columns and levels, and the levels' derivatives by the luminance."""
+    (height, width, _), (levels, rows, columns) = image.shape, shape
+    down = _hats((np.arange(height) + 0.5) / height * (rows - 1), rows)
+    along = _hats((np.arange(width) + 0.5) / width * (columns - 1), columns)
+    luminance = image @ LUMINANCE
+    level = np.clip(luminance, 0, 1) * (levels - 1)
+    low = np.minimum(np.floor(level), levels - 2)[..., None]
+    slope = (np.arange(levels) == low + 1).astype(np.float64) - (np.arange(levels) == low)
+    inside = ((luminance > 0) & (luminance < 1))[..., None]
+    return down, along, _hats(level, levels), (levels - 1) * inside * slope
+
+
+def apply(image: Float64, grid: Float64) -> Float64:
+    """The image (H, W, 3) with the colours of a photograph of this grid."""
+    down, along, levels, _ = _weights(image, grid.shape[:3])
+    maps = np.einsum("yj,xi,yxl,ljiab->yxab", down, along, levels, grid, optimize=True)
+    seen: Float64 = np.einsum("yxab,yxb->yxa", maps[..., :3], image) + maps[..., 3]
+    return seen
+
+
+def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, Float64]:
+    """Gradients by the image and by the grid, from that by what is seen."""
+    down, along, levels, slopes = _weights(image, grid.shape[:3])
+    whole = np.concatenate([image, np.ones_like(image[..., :1])], axis=-1)
+    by_grid: Float64 = np.einsum("yj,xi,yxl,yxa,yxb->ljiab", down, along, levels, by_seen, whole, optimize=True)
+    maps, risen = (
+        np.einsum("yj,xi,yxl,ljiab->yxab", down, along, each, grid, optimize=True) for each in (levels, slopes)
+    )
+    by_luminance = np.einsum("yxa,yxab,yxb->yx", by_seen, risen, whole)
+    by_image = np.einsum("yxa,yxab->yxb", by_seen, maps[..., :3]) + by_luminance[..., None] * LUMINANCE
+    return by_image, by_grid
+
+
+def variation(grid: Float64) -> float:
+    """The mean squares of the differences between neighbours, summed over the three axes."""
+    return float(sum(np.square(np.diff(grid, axis=axis)).mean() for axis in range(3)))
+
+
+def variation_gradient(grid: Float64) -> Float64:
+    """The gradient of `variation` by the grid."""
+    total = np.zeros_like(grid)
+    for axis in range(3):
+        steps = np.diff(grid, axis=axis)
+        ends = [(1, 0) if each == axis else (0, 0) for each in range(grid.ndim)]
+        total += 2 / steps.size * (np.pad(steps, ends) - np.pad(steps, [end[::-1] for end in ends]))
+    return total
+
+
+def centre(grids: Float64) -> Float64:
+    """The grids (photographs, levels, rows, columns, 3, 4) with a mean that changes no colour."""
+    centred: Float64 = grids - grids.mean(axis=0) + np.eye(3, 4)
+    return centred
+
+
+def step(
+    grid: Float64, first: Float64, second: Float64, by_grid: Float64, visit: int, rate: float
+) -> tuple[Float64, Float64, Float64]:
+    """Grid and moments after Adam's step along by_grid at visit number `visit` (from 1) of the photograph."""
+    first, second = 0.9 * first + 0.1 * by_grid, 0.999 * second + 0.001 * by_grid**2
+    change = rate * (first / (1 - 0.9**visit)) / (np.sqrt(second / (1 - 0.999**visit)) + 1e-15)
+    return grid - change, first, second

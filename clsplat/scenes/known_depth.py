@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Known depths of one view: where they are in its picture, and how near."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import Camera
+from clsplat.files import short_digest
+from clsplat.images.depth_maps import read_map
+from clsplat.scenes.data_set import Lens, pixels_of
+
+NOTHING = 65535
+"""Value of a metric map of whole numbers that some sensors write where they know nothing; 0 is another."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownDepth:
+    """Known depths of a view. points (K, 3) float64 in the world with weights (K,) of 0 to 1; path: a map, of which
+    nearness is scale times its values and offset more, or without a fit one over its values times unit; whole: of
+    whole numbers."""
+
+    points: Float64
+    weights: Float64
+    path: Path | None = None
+    unit: float = 1.0
+    fit: tuple[float, float] | None = None
+    whole: bool = False
+
+    def at(self, camera: Camera, lens: Lens) -> tuple[NDArray[np.int64], Float32, Float32]:
+        """Indices (k,) of the pixels of the camera's size whose depth is known, in rising order, one over it, in 1 /
+        world units, and its weight. lens: of a camera that is no pinhole, and of the map."""
+        if self.path is not None:
+            nearness = self._from_map(camera, lens)
+            found = np.flatnonzero(nearness > 0)
+            return found, nearness.ravel()[found].astype(np.float32), np.ones(len(found), np.float32)
+        rows, columns, inside = pixels_of(self.points, camera, lens)
+        local = self.points[inside] @ camera.rotation.T + camera.translation
+        depth = local[:, 2] if camera.projection == "perspective" else np.linalg.norm(local, axis=1)
+        index, near, weights = rows * camera.width + columns, 1 / depth, self.weights[inside]
+        order = np.lexsort((-near, index))  # of several in a pixel the nearest
+        index, first = np.unique(index[order], return_index=True)
+        kept = order[first]
+        return index, near[kept].astype(np.float32), weights[kept].astype(np.float32)
+
+    def _from_map(self, camera: Camera, lens: Lens) -> Float64:
+        assert self.path is not None
+        values = sampled(read_map(self.path), camera, lens)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self.fit is None:
+                known = (values > 0) & ~(self.whole & (values == NOTHING))
+                return np.where(known, 1 / (values * self.unit), 0.0)
+            return np.where(np.isfinite(values), self.fit[0] * values + self.fit[1], 0.0)
+
+    @property
+    def digest(self) -> str:
+        """A name that no other known depths have."""
+        if self.path is not None:
+            return f"{short_digest(self.path)} {self.unit} {self.fit}"
+        data = np.concatenate([self.points, self.weights[:, None]], axis=1).astype("<f8")
+        return hashlib.blake2b(data.tobytes(), digest_size=16).hexdigest()
+
+
+def sampled(values: Float32, camera: Camera, lens: Lens) -> Float64:
+    """A map (h, w) at the pixels of a camera (H, W), each from the nearest of its values, NaN where it has none. It was
+    taken through the lens, at any size."""
+    height, width = values.shape
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    if camera.projection == "perspective" and not lens.is_pinhole:
+        rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
+        found = lens.img_from_cam(rays.reshape(-1, 3)).reshape(*x.shape, 2)
+        x, y = found[..., 0] * width / lens.width, found[..., 1] * height / lens.height
+    else:
+        x, y = x * width / camera.width, y * height / camera.height
+    with np.errstate(invalid="ignore"):
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    column, row = (np.where(inside, place, 0).astype(np.int64) for place in (x, y))
+    return np.where(inside, values[row, column].astype(np.float64), np.nan)

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Known depths of the training views, as a step compares the render's with them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
+from clsplat.config.depth import DECAY
+from clsplat.config.training import TrainConfig
+from clsplat.scenes.scene import View
+from clsplat.stages.device_camera import padded_size
+from clsplat.stages.loss import DEPTH_PIXEL_BYTES, DepthAims
+
+
+def pixel_bytes(config: TrainConfig) -> int:
+    """Bytes of a pixel on the device, where depths are compared."""
+    return DEPTH_PIXEL_BYTES if config.depth_use else 0
+
+
+def weight_at(config: TrainConfig, step: int) -> float:
+    """Weight of the depth loss in step number `step`."""
+    fall: float = DECAY ** (step / config.iterations)
+    return config.depth_weight * fall
+
+
+class Depths:
+    """Known depths of all training views at one resolution; nothing where the settings ask for none."""
+
+    def __init__(self, config: TrainConfig, views: list[View], extent: float) -> None:
+        self._config, self._views, self._extent = config, views, extent
+        self._held: dict[int, tuple[tuple[int, int], tuple[NDArray[np.int64], Float32, Float32]]] = {}
+
+    def aims(self, view: int, width: int, height: int, step: int) -> DepthAims | None:
+        """The depths that a view's render is compared with, of the step's size; None where none are."""
+        if not self._config.depth_use:
+            return None
+        pixels, nearness, weights = self._known(view, width, height)
+        rows, stride = padded_size(width, height)
+        planes = np.zeros((2, rows, stride), np.float32)
+        at = pixels // width, pixels % width
+        planes[0][at], planes[1][at] = nearness, weights
+        total = float(weights.sum(dtype=np.float64))
+        factor = weight_at(self._config, step) * self._extent / total if total > 0 else 0.0
+        return DepthAims(planes, factor)
+
+    def _known(self, view: int, width: int, height: int) -> tuple[NDArray[np.int64], Float32, Float32]:
+        size, held = (width, height), self._held.get(view)
+        if held is None or held[0] != size:
+            of, nothing = self._views[view], np.empty(0, np.float32)
+            found = None if of.depth is None else of.depth.at(of.camera.resized(*size), of.lens)
+            held = self._held[view] = size, found or (np.empty(0, np.int64), nothing, nothing)
+        return held[1]

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gains of each photograph, learnt with the model: what a step applies, and what a checkpoint holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import only_tried
+from clsplat.images.colour import SRGB, photos_space
+from clsplat.images.exif import exposure_of
+from clsplat.stages.appearance import PIXEL_BYTES, Gains, apply_gains, gain_gradient, step_gains
+from clsplat.training.learnt import loaded, rate_at, saved
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene
+
+CODED = 1 / 2.2
+"""Octaves of a coded value for one of light, about: where gains begin that EXIF tells of photographs that are not
+linear."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGains:
+    """The gains of one view in one step. place: the view's in a batch."""
+
+    device: Device
+    gains: Gains
+    view: int
+    step: int
+    rate: float
+    place: int = 0
+
+    def on(self, device: Device, values: NDArray[np.float32]) -> ViewGains:
+        """The same on another device, by `values`, to apply and to find its gradient."""
+        gains = upload(device, values)
+        return replace(self, device=device, gains=Gains(gains, gains, gains, gains, gains), view=0)
+
+    def values(self) -> NDArray[np.float32]:
+        """The photograph's gains, as `on` takes them."""
+        return self.gains.gains.get_rows(self.view, self.view + 1)
+
+    def apply(self, work: Workspace, image: DeviceArray, width: int, height: int) -> DeviceArray:  # noqa: ARG002
+        """The image, exposed for the photograph."""
+        return apply_gains(self.device, work, self.gains, self.view, image)
+
+    def gradient(
+        self,
+        work: Workspace,
+        image: DeviceArray,  # noqa: ARG002
+        seen: DeviceArray,
+        gradient: DeviceArray,
+        width: int,  # noqa: ARG002
+        height: int,
+    ) -> DeviceArray:
+        """Make the gradient that by the image; sums for `update`, which is tried here, before anything changes."""
+        columns = gain_gradient(self.device, work, self.gains, self.view, seen, gradient, height, self.place)
+        if self.step == 1:
+            with only_tried(self.device):
+                self.update(columns, columns)
+        return columns
+
+    def update(self, columns: DeviceArray, readback: DeviceArray) -> None:
+        """Adam's step."""
+        step_gains(self.device, self.gains, self.view, columns, self.step, self.rate, readback)
+
+
+def _from_mean(told: Sequence[float | None], of: Sequence[float | None]) -> NDArray[np.float64]:
+    """Exposures from the mean of those that are told `of` photographs, NaN where none is."""
+    known = [value for value in of if value is not None]
+    return np.array([np.nan if value is None or not known else value - np.mean(known) for value in told], np.float64)
+
+
+def _rows(names: Sequence[str], logs: NDArray[np.float64]) -> dict[str, Any]:
+    return {name: {"log2_gains": row} for name, row in zip(names, logs.tolist(), strict=True)}
+
+
+class GainsOfAll:
+    """The gains of all training views."""
+
+    def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
+        self._config, self._device, self._scene = config, device, scene
+        self._told = [exposure_of(view.path) for view in scene.train_views]
+        curve = CODED if photos_space(view.path for view in scene.views) == SRGB else 1.0
+        start = curve * np.nan_to_num(_from_mean(self._told, self._told))
+        self._gains = Gains.on(device, np.repeat(start[:, None], 3, axis=1).astype(np.float32))
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes of a pixel on the device."""
+        return PIXEL_BYTES
+
+    def of_views(self, views: Sequence[int], step: int) -> list[ViewGains]:
+        """The gains of the views of a step, the last of which is number `step`."""
+        device, gains = self._device, self._gains
+        numbers, count = range(step - len(views) + 1, step + 1), gains.logs.shape[0]
+        rates = [rate_at(self._config, number, count) for number in numbers]
+        each = enumerate(zip(views, numbers, rates, strict=True))
+        return [ViewGains(device, gains, *values, place) for place, values in each]
+
+    def record(self) -> dict[str, Any]:
+        """The content of appearance.json, by the names of the views.
+
+        Nothing is learnt of held-out photographs. Where EXIF tells their exposure, they get the gains that go with it
+        on average over the training's.
+        """
+        logs, scene = self._gains.logs.get().astype(np.float64), self._scene
+        told = _from_mean(self._told, self._told)
+        known = ~np.isnan(told)
+        spread = np.square(told[known]).sum()
+        slopes = told[known] @ logs[known] / spread if spread > 0 else np.zeros(3)
+        held_out = _from_mean([exposure_of(view.path) for view in scene.test_views], self._told)
+        expected = np.nan_to_num(held_out)[:, None] * slopes
+        return {
+            "kind": self._config.appearance,
+            "photographs": _rows([view.name for view in scene.train_views], logs),
+            "held_out": _rows([view.name for view in scene.test_views], expected),
+        }
+
+    def tables(self) -> dict[str, NDArray[Any]]:
+        """Arrays of appearance.npz: none."""
+        return {}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        gains = self._gains
+        held = {"logs": gains.logs, "first": gains.first, "second": gains.second, "gains": gains.gains}
+        return saved(held)
+
+    def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Take the arrays of a checkpoint. Raises ValueError where that is of other photographs."""
+        names = ("logs", "first", "second", "gains")
+        values = loaded(self._device, arrays, names, self._gains.logs.shape)
+        self._gains = Gains(**values, moved=self._gains.moved)

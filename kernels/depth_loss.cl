@@ -1,0 +1,31 @@
+// The depth loss, the sum of weight |N - aim| over the pixels, of the render's nearness N, and its gradient by N.
+//
+// Owner: A work-item owns a column of TILE rows.
+// Launch: A grid of stride x rows / TILE.
+// Buffers: stops (rows, stride), negative where a pixel does not count; nearness (rows, stride), in 1 / world units;
+//   aims (2, rows, stride): nearness and, 0 where it is not known, weight; factor: of the sum -> gradient: of its
+//   planes (rows, stride) that of this number, 0 where nothing is known; sums (rows / TILE, stride) of weight |N -
+//   aim|.
+// Equations: docs/gradients.md, (121).
+#include "shared/math.h"
+
+__kernel void depth_loss(const int stride, const int height, const int gradient_plane, const int first_sum,
+                         const float factor, __global const int *stops, __global const float *nearness,
+                         __global const float *aims, __global float *gradient, __global float *sums) {
+  const int x = get_global_id(0), block = get_global_id(1);
+  if (x >= stride || block * TILE >= height) return;
+  float sum = 0.0f;
+  const size_t plane = (size_t)stride * height;
+  for (int row = 0; row < TILE; ++row) {
+    const size_t at = (size_t)stride * (block * TILE + row) + x;
+    const float weight = stops[at] >= 0 ? aims[plane + at] : 0.0f;
+    float by_nearness = 0.0f;
+    if (weight > 0.0f) {
+      const float difference = nearness[at] - aims[at];
+      by_nearness = difference > 0.0f ? factor * weight : (difference < 0.0f ? -factor * weight : 0.0f);
+      sum += weight * fabs(difference);
+    }
+    gradient[gradient_plane * plane + at] = by_nearness;
+  }
+  sums[(size_t)first_sum + (size_t)stride * block + x] = sum;
+}

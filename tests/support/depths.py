@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tiny scene with what is known of its depths: tracks of its points, or maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tiny import HEIGHT, WIDTH, cameras, hidden_model
+
+from clsplat.images.writing import write_image
+
+
+def add_tracks(scene: Path, error: float = 0.5) -> None:
+    """Say in points3D.txt that each point is seen by every second image, by turns."""
+    path = scene / "sparse" / "0" / "points3D.txt"
+    rows = []
+    for number, line in enumerate(path.read_text().splitlines()):
+        words = line.split()
+        seen = " ".join(f"{image + 1} 0" for image in range(number % 2, len(cameras()), 2))
+        rows.append(f"{' '.join(words[:7])} {error} {seen}\n")
+    path.write_text("".join(rows))
+
+
+def depth_of(index: int) -> NDArray[np.float64]:
+    """Depth (H, W) of the plane through the middle of the hidden model that faces camera `index`, with a slope and, on
+    its left quarter, nothing."""
+    distance = float(np.linalg.norm(cameras()[index].position - hidden_model().means.mean(axis=0)))
+    x = np.arange(WIDTH)[None, :] + 0.5 + np.zeros((HEIGHT, 1))
+    return np.where(x < WIDTH / 4, 0.0, distance + 0.5 * (x / WIDTH - 0.5))
+
+
+def add_maps(scene: Path, kind: str = ".png", folder: str = "depths") -> None:
+    """Write a map of each picture: .png in thousandths, .exr and .npy as they are."""
+    target = scene / folder
+    target.mkdir()
+    for index in range(len(cameras())):
+        depth = depth_of(index)
+        if kind == ".npy":
+            np.save(target / f"{index:02d}.npy", depth.astype(np.float32))
+        elif kind == ".exr":
+            write_image(target / f"{index:02d}.exr", np.repeat(depth[:, :, None], 3, axis=2).astype(np.float32))
+        else:
+            write_levels(target / f"{index:02d}.png", np.rint(1000 * depth).astype(np.uint16))
+
+
+def write_levels(path: Path, levels: NDArray[np.uint16]) -> None:
+    """Write whole numbers (H, W) of 16 bits."""
+    import OpenImageIO as oiio
+
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), oiio.ImageSpec(levels.shape[1], levels.shape[0], 1, "uint16"))
+    assert output.write_image(levels[:, :, None])
+    output.close()

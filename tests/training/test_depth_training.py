@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth supervision: what it does to a model, and that it repeats to the last byte however training is done."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from depths import add_maps, add_tracks
+from same_bytes import (  # noqa: F401  # undisturbed is a fixture
+    check_in_less_memory,
+    interrupted,
+    model_bytes,
+    undisturbed,
+)
+from tiny import HEIGHT, WIDTH, short, write_scene
+
+from clsplat.api import train
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.images.writing import write_image
+from clsplat.runs import scene_record
+from clsplat.runs.run import Run
+from clsplat.scenes.depth import with_depths
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.depth import Depths, weight_at
+from clsplat.training.health import Incident
+from clsplat.training.pending import VARIABLE
+from clsplat.training.repro import read_bundle, replay, write_bundle
+from clsplat.training.trainer import Trainer
+
+CONFIG = short(iterations=40, depth="points", depth_weight=0.05)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = write_scene(tmp_path_factory.mktemp("tiny") / "scene")
+    add_tracks(made)
+    add_maps(made)
+    return made
+
+
+@pytest.fixture(scope="module")
+def scene(folder: Path) -> Scene:
+    return load_scene(folder)
+
+
+def wrong(trainer: Trainer) -> float:
+    """Weighted mean difference of nearness over the training views."""
+    total = weight = 0.0
+    for index, view in enumerate(trainer.views):
+        aims = trainer.depths.aims(index, view.camera.width, view.camera.height, 1)
+        assert aims is not None
+        camera = trainer.camera(index, view.camera.width, view.camera.height)
+        frame = trainer.rasterizer.forward(trainer.parameters, camera, np.zeros(3, np.float32), nearness=True)
+        assert frame.blended.nearness is not None
+        total += float((aims.planes[1] * np.abs(frame.blended.nearness.get() - aims.planes[0])).sum())
+        weight += float(aims.planes[1].sum())
+    return total / weight
+
+
+@pytest.mark.parametrize("source", ["points", "maps"])
+def test_the_render_comes_nearer_to_what_is_known(scene: Scene, default_device: Device, source: str) -> None:
+    found = {}
+    for weight in (0.0, 20.0):
+        config = short(iterations=40, depth=source, depth_weight=weight, warmup=())
+        trainer = Trainer(with_depths(scene, config.depth_use), config, default_device)
+        for _ in range(40):
+            trainer.train_step()
+        trainer.settle()
+        found[weight] = wrong(trainer)
+    assert found[20.0] < 0.85 * found[0.0]  # the points are wrong by a twentieth themselves
+
+
+def test_the_weight_falls_and_views_count_alike(scene: Scene) -> None:
+    config = TrainConfig(iterations=1000, depth="maps", depth_weight=0.5)
+    assert [weight_at(config, step) for step in (0, 500, 1000)] == pytest.approx([0.5, 0.05, 0.005])
+    views = with_depths(scene, config.depth_use).train_views
+    for size in (48, 24):
+        aims = Depths(config, views, 3.0).aims(0, size, size * 5 // 6, 500)
+        assert aims is not None
+        assert aims.factor * aims.planes[1].sum() == pytest.approx(0.05 * 3.0)
+    blind = [replace(views[0], depth=None)]
+    nothing = Depths(config, blind, 3.0).aims(0, 48, 40, 1)
+    assert nothing is not None
+    assert nothing.factor == 0
+    assert not nothing.planes.any()
+    assert Depths(TrainConfig(), views, 3.0).aims(0, 48, 40, 1) is None
+
+
+def test_without_weight_the_model_is_that_of_today(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    """Blending's gradient has one term more, which is 0: the sums are the same."""
+    plain = model_bytes(scene, short(iterations=40), default_device, tmp_path / "plain")
+    assert model_bytes(scene, replace(CONFIG, depth_weight=0.0), default_device, tmp_path / "depth") == plain
+
+
+def test_an_interruption_gives_the_same_bytes(
+    scene: Scene,
+    default_device: Device,
+    tmp_path: Path,
+    undisturbed: bytes,  # noqa: F811
+) -> None:
+    assert interrupted(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
+
+
+def test_by_capacity_the_same_bytes(
+    scene: Scene,
+    default_device: Device,
+    tmp_path: Path,
+    undisturbed: bytes,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(VARIABLE, "1")
+    assert model_bytes(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
+
+
+@pytest.mark.slow
+def test_in_less_memory_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    check_in_less_memory(scene, replace(CONFIG, depth="maps"), default_device, tmp_path, part=0.6)
+
+
+def test_several_devices_and_one_give_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    config = replace(CONFIG, batch=2)
+    alone = model_bytes(scene, config, default_device, tmp_path / "alone")
+    run = Run.create(tmp_path / "both", config)
+    train(scene, config, device=[default_device, default_device.with_memory_limit(None)], run=run)
+    assert run.model_path.read_bytes() == alone
+
+
+def test_a_bundle_has_the_depths(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    config = short(iterations=20, depth="maps")
+    trainer = Trainer(with_depths(scene, config.depth_use), config, default_device)
+    for _ in range(12):
+        trainer.train_step()
+    trainer.settle()
+    incident = Incident(12, 0, trainer.views[0].name, "loss", 1, "nothing", np.zeros(3, np.float32))
+    bundle = read_bundle(write_bundle(tmp_path, trainer, incident))
+    assert bundle.depth is not None
+    wanted = trainer.depths.aims(0, bundle.camera.width, bundle.camera.height, 12)
+    assert wanted is not None
+    np.testing.assert_array_equal(bundle.depth.planes, wanted.planes)
+    assert bundle.depth.factor == wanted.factor
+    assert not any(replay(bundle, default_device).values())
+
+
+def test_held_out_photographs_are_those_of_the_training(folder: Path, default_device: Device, tmp_path: Path) -> None:
+    """The record of a photograph goes on behind the digest of its file: masks and depths."""
+    (folder / "masks").mkdir()
+    for path in sorted((folder / "images").iterdir()):
+        write_image(folder / "masks" / path.name, np.ones((HEIGHT, WIDTH, 3), np.float32))
+    config = short(iterations=2, depth="maps", masks="ignore")
+    scene = load_scene(folder, masks=config.mask_use)
+    model_bytes(scene, config, default_device, tmp_path / "run")
+    assert scene_record.of_evaluation(Run.open(tmp_path / "run"), scene.test_views) == []
+
+
+def test_other_depths_are_another_scene(folder: Path, default_device: Device, tmp_path: Path) -> None:
+    config = short(iterations=4, depth="maps")
+    model_bytes(load_scene(folder), config, default_device, tmp_path / "run")
+    changed = load_scene(folder)
+    other = replace(config, depth_unit=2e-3, iterations=6)
+    with pytest.raises(InputError):
+        model_bytes(changed, other, default_device, tmp_path / "run", resume=True)
