@@ -55,7 +55,7 @@ __kernel void move_gains(const int count, const int photograph, const int stride
   if (i >= count || readback[READBACK_STOPPED]) return;
   float g = 0.0f;
   if (i / 3 == photograph)
-    for (int x = 0; x < stride; ++x) g += columns[(size_t)stride * (i % 3) + x];
+    for (int x = 0; x < stride; ++x) g = added(g, columns[(size_t)stride * (i % 3) + x]);
   g *= LN2;
   if (!(g * g < INFINITY)) g = 0.0f; // of a view with something that is not finite nothing is learnt
   const float m = fma1(beta1, first[i], (1.0f - beta1) * g), v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));

@@ -11,13 +11,13 @@ import pytest
 from depths import add_maps, add_tracks
 from same_bytes import (  # noqa: F401  # undisturbed is a fixture
     check_in_less_memory,
+    check_on_two_devices,
     interrupted,
     model_bytes,
     undisturbed,
 )
 from tiny import HEIGHT, WIDTH, short, write_scene
 
-from clsplat.api import train
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
@@ -122,12 +122,8 @@ def test_in_less_memory_the_same_bytes(scene: Scene, default_device: Device, tmp
     check_in_less_memory(scene, replace(CONFIG, depth="maps"), default_device, tmp_path, part=0.6)
 
 
-def test_several_devices_and_one_give_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path) -> None:
-    config = replace(CONFIG, batch=2)
-    alone = model_bytes(scene, config, default_device, tmp_path / "alone")
-    run = Run.create(tmp_path / "both", config)
-    train(scene, config, device=[default_device, default_device.with_memory_limit(None)], run=run)
-    assert run.model_path.read_bytes() == alone
+def test_several_devices_and_one_give_the_same_bytes(scene: Scene, default_device: Device) -> None:
+    check_on_two_devices(with_depths(scene, CONFIG.depth_use), CONFIG, default_device, 10)
 
 
 def test_a_bundle_has_the_depths(scene: Scene, default_device: Device, tmp_path: Path) -> None:
