@@ -128,6 +128,7 @@ def brute_force_evaluated(pipeline: Pipeline, lanes: int, items: int, reached: C
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["overlap", "saturating", "many_per_tile", "random_cloud"])
 def test_contributing_pairs_are_those_of_the_reference(default_device: Device, name: str) -> None:
     scene = scenes.NAMED[name]()
@@ -138,6 +139,7 @@ def test_contributing_pairs_are_those_of_the_reference(default_device: Device, n
     assert got > 0
 
 
+@pytest.mark.slow
 def test_contributing_pairs_exactly(default_device: Device) -> None:
     scene = scenes.NAMED["one"]()
     wanted = reference.forward(*scene, BACKGROUND).blended
@@ -145,6 +147,7 @@ def test_contributing_pairs_exactly(default_device: Device) -> None:
     assert counted(Pipeline.run(default_device, scene))[0] == wanted.count.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["overlap", "saturating", "random_cloud"])
 def test_evaluated_pairs_of_a_lone_item_are_those_of_a_brute_force_count(default_device: Device, name: str) -> None:
     pipeline = Pipeline.run(shaped(default_device, 1, 1), scenes.NAMED[name]())
@@ -153,6 +156,7 @@ def test_evaluated_pairs_of_a_lone_item_are_those_of_a_brute_force_count(default
     assert contributing == counted(Pipeline.run(shaped(default_device, 8, 1), scenes.NAMED[name]()))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["overlap", "saturating", "random_cloud", "needles"])
 @pytest.mark.parametrize("items", quick([32, 64, 256], 64))
 def test_evaluated_pairs_of_a_group_are_those_of_the_blocks(default_device: Device, items: int, name: str) -> None:
@@ -193,6 +197,7 @@ def test_limits_are_finite_in_every_shape(shaped_device: Device) -> None:
     assert limits.lanes == shaped_device.shape.lanes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [None, (1, 64)], ids=str)
 def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
     device = profiled.with_shape(lanes=shape[0], items=shape[1]) if shape else profiled
@@ -276,6 +281,7 @@ def test_synthetic_scene_is_the_same_every_time() -> None:
     first.gaussians.check()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_quick")
 def test_json_has_the_contract(capsys: Capture) -> None:
     assert main(["bench", *SMALL, "--json", "--preset", "fast", "--rasterizer.sh-degree-limit", "1"]) == 0
@@ -551,6 +557,7 @@ def test_segments_through_a_box(segment: tuple[tuple[float, float], ...], goes_t
     assert crossed(np.array([[1.0, 1.0, 4.0, 3.0]]), np.array([segment], float)).item() is goes_through
 
 
+@pytest.mark.slow
 @pytest.mark.needs("matplotlib")
 @pytest.mark.usefixtures("_quick")
 def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -622,6 +629,7 @@ def test_preset_in_training(tmp_path: Path, capsys: Capture) -> None:
     assert "--preset fast and --resume" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.needs("matplotlib")
 def test_plot_of_training(tmp_path: Path) -> None:
     run = tmp_path / "run"

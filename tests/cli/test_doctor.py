@@ -46,6 +46,7 @@ def test_variables_are_shown(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -
     assert "CLSPLAT_DRIVER_TIMEOUT=77" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_report_of_a_bug(tmp_path: Path, capsys: Capture) -> None:
     file = tmp_path / "report.json"
     assert main(["selftest", "--device", "0", "--report", str(file)]) == 0

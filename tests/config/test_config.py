@@ -126,6 +126,7 @@ def test_presets_make_sense_for_any_number_of_steps(iterations: int) -> None:
     assert bundled("fast", "paper", iterations) != bundled("fast", "short", iterations)
 
 
+@pytest.mark.slow
 def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> None:
     scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
     short = ["--schedule", "short"]

@@ -36,6 +36,7 @@ OTHERS = {
 SLOW = [pytest.param(how, verb, marks=pytest.mark.slow) for how, verbs in OTHERS.items() for verb in verbs]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("how", "verb"), [*QUICK, *SLOW])
 def test_a_driver_that_fails_in_every_shape(
     how: str, verb: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, standing_device: Device,

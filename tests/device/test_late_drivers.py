@@ -51,6 +51,7 @@ def whole(scene: Path, default_device: Device) -> Gaussians:
     return train_on(load_scene(scene), WITHOUT, device=default_device)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "step"),
     [
@@ -79,6 +80,7 @@ def test_nothing_is_lost(
         assert np.array_equal(getattr(whole, group), getattr(resumed, group)), group
 
 
+@pytest.mark.slow
 def test_an_epoch_that_has_just_begun(
     scene: Path, tmp_path: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:

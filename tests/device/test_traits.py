@@ -46,6 +46,7 @@ def test_a_gpu(scene: Scene, device: Device, monkeypatch: pytest.MonkeyPatch) ->
     assert gpu.calls.writes > usual.calls.writes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pretended", ["no-contraction", "no-exact-division", "allocation=184320", "group=32"])
 def test_the_same_model(scene: Scene, device: Device, pretended: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A multiply-add by the built-in function, division as the driver likes it, where these drivers divide exactly

@@ -229,6 +229,7 @@ def test_nowhere_to_write(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extension", ["exr", "tif", "png", "jpg"])
 def test_the_same_bytes_a_second_later(extension: str, tmp_path: Path) -> None:
     layers = everything() if extension == "exr" else {"rgb": everything()["rgb"]}

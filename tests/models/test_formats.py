@@ -207,6 +207,7 @@ def test_scales_count_as_a_part_of_the_gaussians_largest(tmp_path: Path) -> None
     assert difference.errors(disc, wider)["scale"]["largest"] == pytest.approx(np.expm1(0.5), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WRITTEN)
 @pytest.mark.parametrize("way", ["cut", "flip", "zeros", "ones", "empty"])
 def test_a_spoilt_file_is_one_line_in_bounded_memory(name: str, way: str, tmp_path: Path) -> None:

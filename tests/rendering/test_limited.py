@@ -163,6 +163,7 @@ def test_resumed_under_a_limit(
     assert device.memory.peak <= 0.4 * unlimited[1]
 
 
+@pytest.mark.slow
 def test_absolute_gradients_in_less_memory(scene: Scene, default_device: Device) -> None:
     config = short(random_points=1500, iterations=8, density={"absolute_gradients": True})
     free = with_limit(default_device, None)
@@ -191,6 +192,7 @@ def test_no_buffer_is_over_the_devices_limit_of_one(
 # The needs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("capacity", [None, 3000])
 def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int | None) -> None:
     """Memory of a step, at once and in bands, against what the stages say. They may say more: of the photograph, and

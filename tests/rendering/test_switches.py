@@ -154,6 +154,7 @@ def test_default_is_the_plain_text() -> None:
     assert PRESETS["exact"] == PRESETS["default"] == RasterizerConfig()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     "switch", quick(EXACT_OFF, "square", "pairs by all bits", "vectors", "early stop", "gradient skip", "all")
@@ -169,6 +170,7 @@ def test_exact_switches_change_no_bit(default_device: Device, switch: str, name:
         assert_same_bits(got_gradients[array] + np.float32(0), values + np.float32(0), array)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["off_frustum", "sheaf", "cloud"])
 def test_culling_that_is_off_lists_more_gaussians(default_device: Device, name: str) -> None:
     check_culling(default_device, name, RasterizerConfig(), ((False, True), (True, False), (False, False)))
@@ -226,6 +228,7 @@ def test_exact_switches_in_every_shape(default_device: Device, shape: tuple[int,
     assert_same_bits(got.frame.blended.image.get(), wanted.frame.blended.image.get())
 
 
+@pytest.mark.slow
 def test_switches_that_are_off_do_more_work(default_device: Device) -> None:
     device = shaped(default_device, 8, 1)
     pairs = {
@@ -239,6 +242,7 @@ def test_switches_that_are_off_do_more_work(default_device: Device) -> None:
     assert pairs["rows"] == pairs["pairs by depth"] == pairs["default"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("switch", quick(APPROXIMATE, "3sigma", "fast"))
 def test_approximate_switches(default_device: Device, switch: str, name: str) -> None:

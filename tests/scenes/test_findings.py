@@ -227,6 +227,7 @@ def test_answers_that_do_not_go_together() -> None:
     assert "does not go with the other settings" in answers[0].words
 
 
+@pytest.mark.slow
 def test_auto_takes_what_answers(tmp_path: Path, capfd: Capture) -> None:
     folder = write_scene(tmp_path / "scene", alpha=True)
     short = ("--iterations", "1", "--sh-degree", "0", "--no-report")

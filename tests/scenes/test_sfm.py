@@ -144,6 +144,7 @@ def test_finished_result_is_used_again_and_never_replaced_unasked(scene, photos,
     assert (output / "sparse/0/images.bin").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["gone", "cut"])
 def test_a_result_that_has_changed_since_is_not_used_again(scene, photos, tmp_path, change):
     copy = tmp_path / "scene"

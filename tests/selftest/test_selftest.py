@@ -114,6 +114,7 @@ def test_every_stage_has_an_operation_that_is_broken() -> None:
     assert {stage for _, stage in BROKEN.values()} == set(STAGES) == set(BOUNDS)
 
 
+@pytest.mark.slow
 def test_in_every_shape(shaped_device: Device) -> None:
     results = list(run(shaped_device, quick=True))
     assert [result.stage for result in results] == list(STAGES)
@@ -123,6 +124,7 @@ def test_in_every_shape(shaped_device: Device) -> None:
     assert not any(result.otherwise for result in results)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lanes", [8, 16])
 def test_all_scenes_in_the_shape_of_a_cpu(default_device: Device, lanes: int) -> None:
     results = list(run(shaped(default_device, lanes, 1)))

@@ -48,6 +48,7 @@ def test_projection_and_gradients(device: Device, name: str) -> None:
     assert_gradients(device, scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", scenes.SHAPE_MATTERS)
 def test_gradients_in_every_shape(shaped_device: Device, name: str) -> None:
     assert_gradients(shaped_device, antialiased(name))

@@ -59,11 +59,13 @@ def check(
         assert_same_bits(getattr(got, field), getattr(wanted, field))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(NAMED))
 def test_bands_change_no_bit(default_device: Device, name: str) -> None:
     check(default_device, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", quick(SHAPE_MATTERS, "overlap"))
 def test_in_every_shape(shaped_device: Device, name: str) -> None:
     whole = Pipeline.run(shaped_device, NAMED[name]())
@@ -75,6 +77,7 @@ def test_bands_of_squares_whose_pairs_are_sorted(default_device: Device, name: s
     check(default_device, name, config=BenchSwitches(tile_test="square", depth_sort="pairs", key_bits="all"))
 
 
+@pytest.mark.slow
 def test_absolute_gradients(default_device: Device) -> None:
     check(default_device, "overlap", absolute=True)
 
@@ -93,6 +96,7 @@ def test_bands_begin_and_end_within_a_row_of_tiles(default_device: Device) -> No
     assert all(one + counts[band.end] > capacity for one, band in zip(totals, bands[:-1], strict=False)), "none smaller"
 
 
+@pytest.mark.slow
 def test_a_pixel_that_the_first_gaussian_of_a_band_ends(default_device: Device) -> None:
     """It has a stop of 0 there, which once was taken for padding."""
     config = RasterizerConfig(transmittance_min=0.4)

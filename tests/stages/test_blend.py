@@ -77,6 +77,7 @@ HARD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HARD)
 @pytest.mark.parametrize("items", quick([8, 16, 32, 64, 128, 256], 32, 256))
 def test_a_group_of_any_size_has_the_bits_of_a_lone_item(default_device: Device, items: int, name: str) -> None:
@@ -88,6 +89,7 @@ def test_a_group_of_any_size_has_the_bits_of_a_lone_item(default_device: Device,
     assert_same_bits(group.stops.get(), alone.stops.get())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("items", quick([16, 32, 64, 128, 256], 32, 128))
 def test_the_gradient_of_a_group_of_any_size(default_device: Device, items: int) -> None:
     scene = scenes.many_per_tile()
@@ -110,6 +112,7 @@ def stacked(count: int) -> tuple[Gaussians, Camera]:
     return replace(gaussians, **arrays), camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65, 300])
 def test_the_gradient_by_gaussian(device: Device, count: int) -> None:
     """An item takes every 32nd pair of a tile's list, and the last ones walk to the end of the tile alone."""
@@ -128,6 +131,7 @@ def test_the_gradient_by_gaussian(device: Device, count: int) -> None:
             assert np.linalg.norm(a - b) <= 2e-6 * np.linalg.norm(b)  # as of groups above
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("switch", ["last_contributor", "gradient_skip", "row_skip", "column_skip", "vector_skip"])
 def test_the_gradient_by_gaussian_has_its_bits_with_every_switch(device: Device, switch: str) -> None:
     """A pair beyond a pixel's stop, or a block that an ellipse does not reach, adds zeros alone."""

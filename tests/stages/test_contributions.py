@@ -48,6 +48,7 @@ def test_against_the_reference(device: Device, name: str) -> None:
     assert_as_reference(device, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", scenes.SHAPE_MATTERS)
 def test_in_every_shape(shaped_device: Device, name: str) -> None:
     assert_as_reference(shaped_device, name)
@@ -63,6 +64,7 @@ def test_they_add_up_to_what_is_opaque(shaped_device: Device, size: tuple[int, i
     assert_close(contributions(run).astype(np.float64).sum(), opaque, relative=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absolute", [False, True])
 def test_gradients_keep_their_bits(shaped_device: Device, absolute: bool) -> None:
     run = Pipeline.run(shaped_device, scenes.overlap())
@@ -75,6 +77,7 @@ def test_gradients_keep_their_bits(shaped_device: Device, absolute: bool) -> Non
     assert_same_bits(screen_of_both.gradients.get()[shown], screen.gradients.get()[shown])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absolute", [False, True])
 def test_bands_change_no_bit(default_device: Device, absolute: bool) -> None:
     whole = Pipeline.run(default_device, scenes.overlap())

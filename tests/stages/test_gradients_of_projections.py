@@ -73,7 +73,7 @@ def test_the_twin_by_central_differences(name: str) -> None:
         assert error <= 2e-6 * np.linalg.norm(gradients[group]), group
 
 
-@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize("absolute", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CAMERAS)
 def test_the_kernels_against_the_twin(shaped_device: Device, name: str, absolute: bool) -> None:
     (gaussians, camera), (d_image, exact) = subject(name, 200), wanted(name)

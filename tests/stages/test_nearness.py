@@ -122,6 +122,7 @@ def test_the_twins_slopes(name: str) -> None:
     assert not gradients["sh"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 def test_other_projections(default_device: Device, name: str) -> None:
     gaussians, camera = subject(name, 200)

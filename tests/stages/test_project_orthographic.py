@@ -145,6 +145,7 @@ def assert_same_pictures(got: tuple[RenderResult, ChannelResult], wanted: tuple[
         assert_same_bits(got[1][name], values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{"frustum_cull": False}, {"opacity_cull": False}, {"tile_test": "square"}])
 def test_exact_switches_change_no_bit(default_device: Device, change: dict[str, bool]) -> None:
     gaussians, camera = orthographic(scenes.off_frustum())

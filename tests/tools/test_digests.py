@@ -78,6 +78,7 @@ def test_tables_have_every_driver() -> None:
     assert lines[-2:] == ["| perspective | `c` | `v` |", "| fisheye | `d` | not defined |"]
 
 
+@pytest.mark.slow
 def test_a_child(tmp_path: Path) -> None:
     command = [sys.executable, str(TOOLS / "digests.py"), "child", "0", "8x1", str(tmp_path / "arrays.npz")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

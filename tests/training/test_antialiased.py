@@ -43,6 +43,7 @@ def model_bytes(scene: Scene, config: TrainConfig, device: Device, folder: Path,
     return run.model_path.read_bytes()
 
 
+@pytest.mark.slow
 def test_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Resumed, and by capacity; without the setting they are others."""
     whole = model_bytes(scene, SMOOTH, default_device, tmp_path / "whole")
@@ -69,6 +70,7 @@ def test_no_scale_is_less_than_the_pictures_show(scene: Scene, default_device: D
     assert model.antialiased
 
 
+@pytest.mark.slow
 def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: Capture) -> None:
     run = tmp_path / "run"
     assert main(["train", str(folder), "-o", str(run), "--iterations", "20", "--antialiased"]) == 0

@@ -69,6 +69,7 @@ def test_by_capacity_the_bytes_are_the_same(
         assert_same_state(state(trainer), wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [2, 3])
 def test_the_number_of_devices_changes_no_byte(
     default_device: Device, scene: Scene, config: TrainConfig, batch: int

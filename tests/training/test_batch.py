@@ -63,6 +63,7 @@ def slow(method: Callable[..., Any], seconds: float) -> Callable[..., Any]:
     return call
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", ["neither", "first", "second"])
 def test_halves_of_a_device_train_to_the_bytes_of_the_whole(
     scene: Scene, device: Device, late: str, monkeypatch: pytest.MonkeyPatch
@@ -76,6 +77,7 @@ def test_halves_of_a_device_train_to_the_bytes_of_the_whole(
     assert_same_model(train(scene, TWO, device=devices), wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [

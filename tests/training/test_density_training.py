@@ -209,6 +209,7 @@ MANY = replace(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.6, 0.3])
 def test_in_less_memory_the_same_bytes(share: float, default_device: Device, tmp_path: Path) -> None:
     scene = load_scene(write_scene(tmp_path / "scene", points=False))

@@ -62,6 +62,7 @@ def wrong(trainer: Trainer) -> float:
     return total / weight
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["points", "maps"])
 def test_the_render_comes_nearer_to_what_is_known(scene: Scene, default_device: Device, source: str) -> None:
     found = {}
@@ -122,10 +123,12 @@ def test_in_less_memory_the_same_bytes(scene: Scene, default_device: Device, tmp
     check_in_less_memory(scene, replace(CONFIG, depth="maps"), default_device, tmp_path, part=0.6)
 
 
+@pytest.mark.slow
 def test_several_devices_and_one_give_the_same_bytes(scene: Scene, default_device: Device) -> None:
     check_on_two_devices(with_depths(scene, CONFIG.depth_use), CONFIG, default_device, 10)
 
 
+@pytest.mark.slow
 def test_a_bundle_has_the_depths(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     config = short(iterations=20, depth="maps")
     trainer = Trainer(with_depths(scene, config.depth_use), config, default_device)

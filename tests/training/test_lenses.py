@@ -92,6 +92,7 @@ def test_the_cameras_are_those_of_the_file(scene: Scene) -> None:
         assert (columns == np.floor(exact[:, 0])).all() and (rows == np.floor(exact[:, 1])).all()
 
 
+@pytest.mark.slow
 def test_it_learns_to_the_held_out_views(scene: Scene, default_device: Device) -> None:
     losses: list[float] = []
     steps = quiet(120)
@@ -109,6 +110,7 @@ def test_it_learns_to_the_held_out_views(scene: Scene, default_device: Device) -
     assert result["mean"]["psnr"] > 25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [1, 2])
 def test_a_resumed_run_is_an_uninterrupted_one(
     scene: Scene, default_device: Device, tmp_path: Path, batch: int

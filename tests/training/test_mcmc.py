@@ -73,6 +73,7 @@ def test_growth_reaches_the_cap_halfway() -> None:
     assert wanted(replace(config, max_gaussians=1060), 600, 1000) == 1050, "a twentieth, where that is enough"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.0, 0.5])
 def test_the_dead_move_and_some_are_added(scene: Scene, default_device: Device, spread: float) -> None:
     config = replace(CONFIG, density=replace(CONFIG.density, spread=spread))
@@ -202,6 +203,7 @@ def test_stopping_and_going_on_gives_the_same_bytes(
     assert stopped_at(step, scene, CONFIG, default_device, tmp_path / "run") == undisturbed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.6, 0.3])
 def test_in_less_memory_the_same_bytes(share: float, default_device: Device, tmp_path: Path) -> None:
     scene = load_scene(write_scene(tmp_path / "scene", points=False))
@@ -237,6 +239,7 @@ def test_by_capacity_the_same_bytes(scene: Scene, default_device: Device, monkey
         assert_same_bits(ends[1][name], values, name)
 
 
+@pytest.mark.slow
 def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:
     check_on_two_devices(scene, CONFIG, default_device, CONFIG.iterations // 2)
 

@@ -73,6 +73,7 @@ def assert_alike(one: Result, other: Result) -> None:
 TOO_SMALL = {"none": (), "within": (7,), "twice": (12, 13), "before density control": (15, 25), "last": (40,)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", TOO_SMALL)
 def test_trained_by_capacity_is_trained_with_exact_counts(
     device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, steps: str

@@ -227,6 +227,7 @@ def assert_others_alike(one: Trainer, other: Trainer) -> None:
         assert_same_bits(rows_of(other)[group], values, group)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sparse", [False, True])
 @pytest.mark.parametrize("group", GROUPS)
 def test_broken_parameters_are_not_drawn_and_removed(

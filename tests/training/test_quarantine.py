@@ -344,6 +344,7 @@ def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device:
 # Without the checks
 
 
+@pytest.mark.slow
 def test_kernels_without_checks_have_the_same_bits_and_no_checks(scene: Scene, default_device: Device) -> None:
     """What `tools/bench_guards.py` compares with."""
     trainers = [Trainer(scene, CONFIG, each) for each in (default_device, unguarded(default_device))]

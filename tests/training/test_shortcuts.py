@@ -56,6 +56,7 @@ def test_sparse_steps_leave_the_hidden(scene: Scene, default_device: Device, spa
     assert np.array_equal(trainer.first["means"].get()[-1], moment[-1]) == sparse
 
 
+@pytest.mark.slow
 def test_sh_rest_moves_in_its_steps_alone(scene: Scene, default_device: Device) -> None:
     config = replace(short(warmup=(), density={"every": 0}), optimiser=OptimiserConfig(sh_rest_every=3))
     model = with_one_behind(scene)
@@ -90,6 +91,7 @@ def test_sizes_rise_with_the_frequencies(scene: Scene, default_device: Device, m
     assert all(abs(height - width * HEIGHT / WIDTH) < 1.5 for width, height in sizes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [1, 4, 15, 20, 33])
 def test_stopping_and_going_on_gives_the_same_bytes(
     scene: Scene, default_device: Device, tmp_path: Path, step: int

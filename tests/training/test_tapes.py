@@ -94,7 +94,7 @@ def assert_alike(one: Result, other: Result) -> None:
     assert one[1] == other[1]
 
 
-FAST = ("plain", "exposure", "all")
+FAST = ("plain", "all")
 
 
 @pytest.mark.parametrize(

@@ -125,6 +125,7 @@ def test_it_changes_the_model(scene: Scene, default_device: Device, tmp_path: Pa
     assert model_bytes(scene, replace(CONFIG, thinning=0.0), default_device, tmp_path / "whole") != undisturbed
 
 
+@pytest.mark.slow
 def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
     """Rows that come in parts are thinned by their place in the model."""
     scene = load_scene(write_scene(tmp_path / "scene", points=False))
