@@ -170,6 +170,18 @@ class Camera:
             return self
         return replace(self, translation=self.translation + self.rotation @ origin)
 
+    def moved(self, motion: Float64) -> Camera:
+        """The camera after a motion (6,): a turn about its centre, in radians about the world's axes, and a shift along
+        them. It sees what it would see if the world had made them instead, the shift last: (140) of docs/gradients.md.
+        """
+        turn, shift = np.asarray(motion, np.float64).reshape(2, 3)
+        x, y, z = turn
+        angle, across = float(np.linalg.norm(turn)), np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        by_angle = np.sinc(np.array([angle, angle / 2]) / math.pi)
+        turned = np.eye(3) + by_angle[0] * across + 0.5 * by_angle[1] ** 2 * across @ across
+        rotation = self.rotation @ turned
+        return replace(self, rotation=rotation, translation=self.rotation @ shift - rotation @ self.position)
+
     def before(self, near: float) -> Camera:
         """The same view of a model whose near plane is at `near`: that counts unless the camera has its own."""
         return replace(self, near=near) if self.near == NEAR != near else self

@@ -17,6 +17,9 @@ its rows, or of as many as sixteen, in 32 KiB."""
 LOSS_RING = 16
 """Rows of derivatives that a group of one item keeps: a power of two, at least the window's 11."""
 
+POSE_ROWS = 64
+"""Gaussians whose part in the gradient by a camera's pose is added up one behind the other."""
+
 _TRANSFORM = (
     *(f"R{row}{column}" for row in range(3) for column in range(3)),
     *("T0", "T1", "T2"),
@@ -111,6 +114,7 @@ def header() -> str:
     """The declarations as OpenCL C."""
     lines = [f"#define TILE {TILE}", f"#define LOSS_RING {LOSS_RING}"]
     lines += [f"#define LOSS_COLUMNS {LOSS_COLUMNS}", f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}"]
+    lines.append(f"#define POSE_ROWS {POSE_ROWS}u")
     lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
     layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK, "DEEP": DEEP}
     for prefix, fields in layouts.items():

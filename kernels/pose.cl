@@ -1,0 +1,66 @@
+// The gradient by the camera's pose, from those by the model that the camera sees.
+//
+// Owner: A work-item owns POSE_ROWS Gaussians (pose_rows), then as many of these sums (pose_sums), one behind the
+//   other. Built with one lane: its bits are those of any shape.
+// Launch: One work-item for each POSE_ROWS Gaussians, then for each six of as many sums, until one is left.
+// Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3), and the gradients by
+//   means, by quaternions and by sh_dc (n, 3), of which the rows without tiles are not read -> sums
+//   (ceil(n / POSE_ROWS), 6): by the turn about the world's axes, then by the shift along them.
+// Equations: docs/gradients.md, (140) to (142).
+#include "shared/math.h"
+#include "shared/lanes.h"
+#include "shared/sh.h"
+
+__kernel void pose_rows(const uint n, const int coefficients, __constant float *camera,
+                        __global const uint *tile_counts, __global const float *means,
+                        __global const float *quaternions, __global const float *sh_rest, __global const float *d_means,
+                        __global const float *d_quaternions, __global const float *d_sh_dc, __global float *sums) {
+  const uint block = get_global_id(0), first = block * POSE_ROWS;
+  if (first >= n) return;
+  float turn[3] = {0.0f, 0.0f, 0.0f}, shift[3] = {0.0f, 0.0f, 0.0f};
+  for (size_t i = first; i < min(first + POSE_ROWS, n); ++i) {
+    if (tile_counts[i] == 0) continue;
+    const float x = (means[3 * i] - camera[CAMERA_PX]) - camera[CAMERA_PX_LOW];
+    const float y = (means[3 * i + 1] - camera[CAMERA_PY]) - camera[CAMERA_PY_LOW];
+    const float z = (means[3 * i + 2] - camera[CAMERA_PZ]) - camera[CAMERA_PZ_LOW];
+    const float gx = d_means[3 * i], gy = d_means[3 * i + 1], gz = d_means[3 * i + 2];
+    shift[0] += gx;
+    shift[1] += gy;
+    shift[2] += gz;
+
+    // (142). The gradient by the direction of the view, which is that of the mean's, or all Gaussians' own.
+    const float distance = sqrt(fma1(x, x, fma1(y, y, z * z)));
+#ifdef ORTHOGRAPHIC
+    const float ux = camera[CAMERA_R20], uy = camera[CAMERA_R21], uz = camera[CAMERA_R22];
+#else
+    const float ux = x / distance, uy = y / distance, uz = z / distance;
+#endif
+    const float red = d_sh_dc[3 * i] / SH_CONSTANT, green = d_sh_dc[3 * i + 1] / SH_CONSTANT,
+                blue = d_sh_dc[3 * i + 2] / SH_CONSTANT;
+    __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
+    float weight[16], by[3];
+    for (int k = 1; k < coefficients; ++k, f += 3) weight[k] = fma1(red, f[0], fma1(green, f[1], blue * f[2]));
+    sh_direction_gradient(coefficients, ux, uy, uz, weight, by);
+    // That by the mean turns with the direction, not with the camera.
+    const float across_x = uy * by[2] - uz * by[1], across_y = uz * by[0] - ux * by[2],
+                across_z = ux * by[1] - uy * by[0];
+
+    __global const float *q = quaternions + 4 * i, *g = d_quaternions + 4 * i;
+    turn[0] += fma1(y, gz, -(z * gy)) - across_x +
+               0.5f * (fma1(q[0], g[1], -(q[1] * g[0])) + fma1(q[2], g[3], -(q[3] * g[2])));
+    turn[1] += fma1(z, gx, -(x * gz)) - across_y +
+               0.5f * (fma1(q[0], g[2], -(q[2] * g[0])) + fma1(q[3], g[1], -(q[1] * g[3])));
+    turn[2] += fma1(x, gy, -(y * gx)) - across_z +
+               0.5f * (fma1(q[0], g[3], -(q[3] * g[0])) + fma1(q[1], g[2], -(q[2] * g[1])));
+  }
+  for (int k = 0; k < 3; ++k) sums[6 * block + k] = turn[k], sums[6 * block + 3 + k] = shift[k];
+}
+
+// parts (count, 6) -> sums (ceil(count / POSE_ROWS), 6).
+__kernel void pose_sums(const uint count, __global const float *parts, __global float *sums) {
+  const uint item = get_global_id(0), block = item / 6, first = block * POSE_ROWS;
+  if (first >= count) return;
+  float sum = 0.0f;
+  for (size_t i = first; i < min(first + POSE_ROWS, count); ++i) sum += parts[6 * i + item % 6];
+  sums[item] = sum;
+}

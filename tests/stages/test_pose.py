@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""pose.cl against the float64 twin, and the twin against central differences of whole pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from compare import assert_same_bits
+from pipeline import BACKGROUND, Pipeline
+from scipy.spatial.transform import Rotation
+from test_gradients_of_projections import CAMERAS, direction_of_loss, subject
+
+from clsplat.camera import Camera
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
+from clsplat.device.layout import POSE_ROWS, TILE
+from clsplat.gaussians import Gaussians
+from clsplat.reference import every_pixel
+from clsplat.reference.pose import pose_gradient as reference
+from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
+from clsplat.stages.pose import pose_gradient, pose_rows, sums_of
+
+STEP = 1e-6
+BAND = 3e-4
+
+
+def posed(name: str, count: int) -> tuple[Gaussians, Camera]:
+    """A scene with SH of degree 3 and a camera that is not at the origin."""
+    gaussians, camera = scenes.overlap(count=count) if name == "perspective" else subject(name, count)
+    rng = np.random.default_rng(8)
+    gaussians.sh = rng.normal(0, 0.3, (len(gaussians), 16, 3)).astype(np.float32)
+    return gaussians, camera.moved(np.array([0.02, -0.03, 0.01, 0.1, 0.05, -0.1]))
+
+
+def of_model(gaussians: Gaussians, camera: Camera, d_image: np.ndarray) -> np.ndarray:
+    """The twin's gradient by the pose."""
+    by = every_pixel.render_grad(gaussians, camera, d_image, BACKGROUND).parameters
+    arrays = {name: np.asarray(values, np.float64) for name, values in gaussians.arrays().items()}
+    return reference(arrays["means"], arrays["quaternions"], arrays["sh"], camera, gaussians.sh_degree, by)
+
+
+def on_device(pipeline: Pipeline, d_image: np.ndarray) -> np.ndarray:
+    height, width, _ = d_image.shape
+    planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
+    planes[:, :height, :width] = d_image.transpose(2, 0, 1)
+    rasterizer, model, frame = pipeline.rasterizer, pipeline.gaussians, pipeline.frame
+    gradients = allocate_gaussians(rasterizer.device, model.count, model.coefficients)
+    for array in gradients.arrays.values():
+        array.fill(np.nan)  # rows that are not seen are not read
+    rasterizer.backward(model, frame, upload(rasterizer.device, planes), gradients)
+    sums, device = sums_of(rasterizer.work, model.count), rasterizer.device_of(pipeline.camera)
+    sums.fill(np.nan)
+    pose_rows(device, model, frame.camera_array, frame.projected.tile_counts, gradients, sums)
+    return pose_gradient(device, rasterizer.work, sums).get()[0]
+
+
+@pytest.mark.parametrize("name", ["perspective", *CAMERAS])
+def test_the_twin_by_central_differences(name: str) -> None:
+    gaussians, camera = posed(name, 40)
+    arrays = {group: np.asarray(values, np.float64) for group, values in gaussians.arrays().items()}
+    model = Gaussians(**arrays, near=gaussians.near)
+    d_image = direction_of_loss(model, camera, 2e-4)
+    found = of_model(model, camera, d_image)
+
+    def loss(motion: np.ndarray) -> float:
+        return float((every_pixel.render(model, camera.moved(motion), BACKGROUND).image * d_image).sum())
+
+    slopes = [(loss(axis) - loss(-axis)) / (2 * STEP) for axis in STEP * np.eye(6)]
+    # of 12 digits that a loss of about 100 has, a step of 1e-6 leaves 6
+    assert np.linalg.norm(found - slopes) <= 1e-5 * np.linalg.norm(found)
+
+
+@pytest.mark.parametrize("name", ["perspective", *CAMERAS])
+def test_the_kernels_against_the_twin(shaped_device: Device, name: str) -> None:
+    gaussians, camera = posed(name, 200)
+    d_image = direction_of_loss(gaussians, camera, BAND)
+    wanted = of_model(gaussians, camera, d_image)
+    got = on_device(Pipeline.run(shaped_device, (gaussians, camera)), d_image)
+    for part in (slice(3), slice(3, 6)):
+        assert np.linalg.norm(got[part] - wanted[part]) <= 1e-4 * np.linalg.norm(wanted[part])
+
+
+@pytest.mark.parametrize("count", [1, POSE_ROWS, POSE_ROWS + 1, POSE_ROWS**2 + 1])
+def test_sums_at_the_seams(shaped_device: Device, count: int) -> None:
+    """Every third row is not seen, and not a number."""
+    rng = np.random.default_rng(count)
+    gaussians, camera = scenes.random_cloud(count, 3, 40, 30)
+    seen = np.arange(count) % 3 != 1
+    by = {
+        name: np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), rng.standard_normal(a.shape), np.nan).astype(np.float32)
+        for name, a in gaussians.arrays().items()
+    }
+    model, gradients = (
+        upload_gaussians(shaped_device, gaussians),
+        upload_gaussians(shaped_device, replace(gaussians, **by)),
+    )
+    pipeline = Pipeline.run(shaped_device, (gaussians, camera))
+    work, counts = Workspace(shaped_device), upload(shaped_device, seen.astype(np.uint32))
+    sums = sums_of(work, count)
+    pose_rows(shaped_device, model, pipeline.frame.camera_array, counts, gradients, sums)
+    got = pose_gradient(shaped_device, work, sums).get()[0]
+    arrays = {name: np.asarray(values, np.float64)[seen] for name, values in gaussians.arrays().items()}
+    wide = {name: values[seen].astype(np.float64) for name, values in by.items()}
+    wanted = reference(arrays["means"], arrays["quaternions"], arrays["sh"], camera, gaussians.sh_degree, wide)
+    # the terms are of either sign: the sum of 4000 is 60 times a term, and off by the rounding of partial sums
+    assert np.linalg.norm(got - wanted) <= 2e-6 * np.linalg.norm(wanted)
+
+
+def test_every_shape_has_the_same_bits(device: Device) -> None:
+    gaussians, camera = scenes.random_cloud(300, 3, 40, 30)
+    pipeline = Pipeline.run(device, (gaussians, camera))
+    found = []
+    for other in (device, device.with_shape("1x64")):
+        work, ones = Workspace(other), upload(other, np.ones(300, np.uint32))
+        model, sums = upload_gaussians(other, gaussians), sums_of(work, 300)
+        camera_array = upload(other, pipeline.frame.camera_array.get())
+        pose_rows(other, model, camera_array, ones, model, sums)
+        found.append(pose_gradient(other, work, sums).get())
+    assert_same_bits(found[0], found[1])
+
+
+def test_a_motion_is_a_rotation_and_undoes_itself() -> None:
+    camera = scenes.tilted_camera(40, 30)
+    motion = np.array([0.3, -0.2, 0.5, 1.0, 2.0, -3.0])
+    moved = camera.moved(motion)
+    turned = Rotation.from_rotvec(motion[:3]).as_matrix()
+    np.testing.assert_allclose(moved.rotation, camera.rotation @ turned, atol=1e-15)
+    np.testing.assert_allclose(moved.position, camera.position - turned.T @ motion[3:], atol=1e-14)
+    back = moved.moved(np.array([-0.3, 0.2, -0.5, 0, 0, 0])).moved(np.array([0, 0, 0, *-turned.T @ motion[3:]]))
+    np.testing.assert_allclose(back.rotation, camera.rotation, atol=1e-15)
+    np.testing.assert_allclose(back.position, camera.position, atol=1e-14)
+    still = camera.moved(np.zeros(6))
+    np.testing.assert_allclose(still.rotation, camera.rotation, atol=0)
