@@ -182,6 +182,10 @@ class Camera:
         rotation = self.rotation @ turned
         return replace(self, rotation=rotation, translation=self.rotation @ shift - rotation @ self.position)
 
+    def posed(self, rotation: Float64, translation: Float64) -> Camera:
+        """The same camera with another `cam_from_world`."""
+        return replace(self, rotation=rotation, translation=translation)
+
     def before(self, near: float) -> Camera:
         """The same view of a model whose near plane is at `near`: that counts unless the camera has its own."""
         return replace(self, near=near) if self.near == NEAR != near else self

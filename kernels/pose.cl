@@ -5,13 +5,13 @@
 // Launch: One work-item for each POSE_ROWS Gaussians, then for each six of as many sums, until one is left.
 // Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3), and the gradients by
 //   means, by quaternions and by sh_dc (n, 3), of which the rows without tiles are not read -> sums
-//   (ceil(n / POSE_ROWS), 6): by the turn about the world's axes, then by the shift along them.
+//   (ceil(n / POSE_ROWS), 6), from first_block on: by the turn about the world's axes, then by the shift along them.
 // Equations: docs/gradients.md, (140) to (142).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/sh.h"
 
-__kernel void pose_rows(const uint n, const int coefficients, __constant float *camera,
+__kernel void pose_rows(const uint n, const uint first_block, const int coefficients, __constant float *camera,
                         __global const uint *tile_counts, __global const float *means,
                         __global const float *quaternions, __global const float *sh_rest, __global const float *d_means,
                         __global const float *d_quaternions, __global const float *d_sh_dc, __global float *sums) {
@@ -53,7 +53,8 @@ __kernel void pose_rows(const uint n, const int coefficients, __constant float *
     turn[2] += fma1(x, gy, -(y * gx)) - across_z +
                0.5f * (fma1(q[0], g[3], -(q[3] * g[0])) + fma1(q[1], g[2], -(q[2] * g[1])));
   }
-  for (int k = 0; k < 3; ++k) sums[6 * block + k] = turn[k], sums[6 * block + 3 + k] = shift[k];
+  __global float *own = sums + 6 * (first_block + block);
+  for (int k = 0; k < 3; ++k) own[k] = turn[k], own[3 + k] = shift[k];
 }
 
 // parts (count, 6) -> sums (ceil(count / POSE_ROWS), 6).

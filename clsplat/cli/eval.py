@@ -147,6 +147,7 @@ def _scores(record: dict[str, Any]) -> str:
     names = {
         "psnr": "PSNR {:.2f} dB",
         "psnr_corrected": "colour-corrected {:.2f} dB",
+        "psnr_aligned": "aligned {:.2f} dB",
         "ssim": "SSIM {:.4f}",
         "lpips": "LPIPS {:.4f}",
     }

@@ -304,6 +304,12 @@ class TrainConfig:
     """Learning rate of appearance, as logarithms to base 2 of the gains, or as coefficients of a grid; times the
     root of the photographs' number, and for gains in trainings of fewer than 10,000 steps by as much more as they are
     shorter."""
+    refine_poses: bool = False
+    """Refine the poses of the training views with the model; two are held. The run's refined/ gets the cameras, a
+    COLMAP model, and eval.json the PSNR of held-out views that were aligned with the model. Not with batches."""
+    pose_reach: float = 5.0
+    """Degrees by which a refined pose can turn in a training, about; it can move by as many 57ths of the scene's
+    extent."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -316,6 +322,7 @@ class TrainConfig:
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
             (("thinning",), lambda value: 0 <= value <= 0.9, "0 to 0.9"),
             (("alpha_weight", "depth_weight"), lambda value: 0 <= value < inf, "a finite number, at least 0"),
+            (("pose_reach",), lambda value: 0 < value <= 30, "over 0 and at most 30 degrees"),
             (("depth_unit",), lambda value: 0 < value < inf, "a finite number, more than 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
             (("points_limit",), lambda value: value >= 1, "at least 1"),
@@ -341,6 +348,10 @@ class TrainConfig:
         if self.appearance != "none" and "transparent" in (self.masks, self.alpha):
             raise InputError(
                 f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
+            )
+        if self.refine_poses and self.batch > 1:
+            raise InputError(
+                f"--refine-poses: not with --batch {self.batch}, nor with several devices; expected one view a step"
             )
         if self.depth != "maps" and self.depth_maps != "metric":
             raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
@@ -376,6 +387,8 @@ class TrainConfig:
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
         """The settings for `count` devices: a batch of a view for each, unless it is told. Raises InputError for a
         batch that they cannot share evenly."""
+        if self.refine_poses and count > 1:
+            raise InputError(f"--refine-poses: not with {count} devices, expected one")
         if self.batch == 1 and not explicit:
             return replace(self, batch=count)
         if self.batch % count:

@@ -31,12 +31,14 @@ def evaluate(
     seconds: float | None,
     space: str = "sRGB",
     corrected: bool = False,
+    aligned: Callable[[View], Image] | None = None,
 ) -> dict[str, Any]:
     """Measure every view; returns the content of eval.json.
 
     render: gives a view's image (H, W, 3), float, over `background` (3,), at the size of `view.load()`; save_dir: the
     renders go there as PNG in sRGB, under the view's name. space: the colour space of renders and photographs, in
-    which they are measured. corrected: measure PSNR after an affine fit of colours as well. step, gaussians, seconds
+    which they are measured. corrected: measure PSNR after an affine fit of colours as well; aligned: renders with the
+    view's pose where the model fits best, whose PSNR is measured as well. step, gaussians, seconds
     are passed through. Without views the mean is empty. Pixels that a mask leaves out count in no score
     (`metrics.ssim`), and "counted" is the share of those that do. lpips_missing says why there is no LPIPS, where there
     is none. Raises ClsplatError where a render is not finite, InputError naming a view that is too small, or a space
@@ -61,6 +63,8 @@ def evaluate(
             raise InputError(f"{view.name}: {error}") from None
         if corrected:
             record["psnr_corrected"] = metrics.psnr_corrected(image, truth, counts)
+        if aligned is not None:
+            record["psnr_aligned"] = metrics.psnr(np.asarray(aligned(view)), truth, counts)
         seen = image if counts is None else np.where(counts[:, :, None], image, 0)
         if (perceptual := metrics.lpips(seen, truth)) is not None:
             record["lpips"] = perceptual
@@ -69,7 +73,7 @@ def evaluate(
             path = save_dir / name
             path.parent.mkdir(parents=True, exist_ok=True)
             write_image(path, displayed(image, space))
-    keys = [key for key in ("psnr", "psnr_corrected", "ssim", "lpips") if records and key in records[0]]
+    keys = [key for key in ("psnr", "psnr_corrected", "psnr_aligned", "ssim", "lpips") if records and key in records[0]]
     mean = {key: float(np.mean([record[key] for record in records])) for key in keys}
     result: dict[str, Any] = {"step": step, "gaussians": gaussians, "seconds": seconds, "mean": mean, "views": records}
     if records and (reason := metrics.lpips_missing()):

@@ -9,7 +9,7 @@ from dataclasses import replace
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
-from clsplat.device.layout import TILE, SlotFields
+from clsplat.device.layout import POSE_ROWS, TILE, SlotFields
 from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_plan import Need, Plan, plan
 from clsplat.stages import blend, density, duplicate, loss, project, ranges, sampling, target
@@ -122,4 +122,4 @@ def _frame_need(device: Device, gaussians: int, floats: int, planes: int, config
 
 
 def _plan(device: Device, need: Need) -> Plan:
-    return plan(need, device.budget, device.max_allocation, device.row_alignment)
+    return plan(need, device.budget, device.max_allocation, max(device.row_alignment, POSE_ROWS))

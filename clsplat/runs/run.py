@@ -49,6 +49,7 @@ class Run:
         self.eval_path = path / "eval.json"
         self.appearance_path = path / "appearance.json"
         self.depth_path = path / "depth"
+        self.refined_path = path / "refined"
         self.checkpoints_path = path / "checkpoints"
         self.test_path = path / "test"
 
@@ -275,6 +276,7 @@ def owned_files(path: Path) -> list[Path]:
         "trouble-step-*.npz",
         "test/**/*.png",
         "depth/**/*.png",
+        "refined/*.txt",
         "**/.*" + TEMPORARY_SUFFIX,
     )
     # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
@@ -286,7 +288,7 @@ def owned_files(path: Path) -> list[Path]:
 
 def check_resumed(earlier: Run, config: TrainConfig) -> None:
     """Raise InputError where `config` changes what a run cannot change on its way."""
-    for name in ("sh_degree", "seed", "test_every", "lenses", "appearance", "antialiased"):
+    for name in ("sh_degree", "seed", "test_every", "lenses", "appearance", "antialiased", "refine_poses"):
         was, now = getattr(earlier.config, name), getattr(config, name)
         if was != now:
             raise InputError(f"{earlier.config_path}: {name} is {was} there, a resumed run cannot change it to {now}")

@@ -24,14 +24,16 @@ def pose_rows(
     tile_counts: DeviceArray,
     gradients: DeviceGaussians,
     sums: DeviceArray,
+    first_row: int = 0,
 ) -> None:
-    """Add up what the gradients of these Gaussians say of the camera, in `sums` (ceil(n / POSE_ROWS), 6). device: with
-    the switches of the camera's projection."""
+    """Add up what the gradients of these Gaussians say of the camera, in `sums` (ceil(n / POSE_ROWS), 6) of a model in
+    which `first_row` is their first, a multiple of POSE_ROWS. device: with the switches of the camera's projection."""
     launch_items(
         device,
         device.kernels("pose", LANES=1).pose_rows,
-        sums.shape[0],
+        -(-gaussians.count // POSE_ROWS),
         gaussians.count,
+        first_row // POSE_ROWS,
         gaussians.coefficients,
         camera_array,
         tile_counts,

@@ -39,7 +39,7 @@ from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen
 from clsplat.training.appearance import ViewAppearance
 from clsplat.training.photographs import Photographs
-from clsplat.training.step import GradientStep, Sample, StepProbe, StepRows, ViewRows
+from clsplat.training.step import GradientStep, Sample, StepProbe, StepRows, ViewRows, view_gradients
 
 OWNER_MODELS, REPLICA_MODELS = 5, 2
 """Arrays for each parameter on the first device, parameters, two moments, a view's gradients and their sum, and on the
@@ -200,7 +200,7 @@ class Replica:
         if step.fields.contributions:
             arrays["contributions"] = self._host(place, "contributions", (n,))
         settings = (self.device, self.rasterizer, step.config, step.step, step.rates, step.fields)
-        room = _gradients(self.rasterizer.work, parameters)
+        room = view_gradients(self.rasterizer.work, parameters)
         pixels = (photograph, sample.camera, sample.background)
         appearance = step.appearance.on(self.device, gains) if step.appearance and gains is not None else None
         columns: list[NDArray[Any]] = []
@@ -357,7 +357,7 @@ class Batch:
         probes: Callable[[Sample, GradientStep], StepProbe],
     ) -> Loss:
         """A view on the device that has the model, which here are its parameters and the sums."""
-        gradients = _gradients(self.rasterizer.work, model[0])
+        gradients = view_gradients(self.rasterizer.work, model[0])
         pixels = (self.photographs.bring(sample.view, factor), sample.camera, sample.background)
         return step.run(model, *pixels, probes(sample, step), gradients, reads_loss=True, **sample.known)
 
@@ -377,14 +377,6 @@ class Batch:
             screen = Screen(rows.get("screen", counts), rows.get("contributions"))
             probe.after_rows(ViewRows(start, stop, Projected(rows.get("splats", counts), counts), screen))
         return outcome.loss
-
-
-def _gradients(work: Workspace, parameters: AnyGaussians) -> DeviceGaussians:
-    """Room for a view's gradients of the rows that are on the device at once."""
-    rows = min(parameters.rows, parameters.count) if isinstance(parameters, HostGaussians) else parameters.count
-    shapes = group_shapes(rows, parameters.coefficients)
-    arrays = {group: work.array(f"view_{group}", shape) for group, shape in shapes.items()}
-    return DeviceGaussians(rows, parameters.coefficients, arrays)
 
 
 def _brought(work: Workspace, device: Device, name: str, values: NDArray[Any]) -> DeviceArray:

@@ -21,7 +21,7 @@ from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.child import TrialInterrupted
-from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
+from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError, examples
 from clsplat.evaluation.depths import keep_depths
 from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import Gaussians
@@ -36,6 +36,7 @@ from clsplat.runs.checkpoints import unusable
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
 from clsplat.scenes.cloud import with_points
+from clsplat.scenes.colmap_writing import write_model
 from clsplat.scenes.depth import with_depths
 from clsplat.scenes.initialise import is_colourless, photographed
 from clsplat.scenes.scene import Scene
@@ -43,12 +44,16 @@ from clsplat.stages.loss import Loss
 from clsplat.training import telemetry
 from clsplat.training.batch import Losses
 from clsplat.training.health import RETURNS, WINDOW
+from clsplat.training.poses import aligned
 from clsplat.training.repro import write_bundle
 from clsplat.training.trainer import Trainer
 
 REPORT_EVERY = 10
 """Steps between readings of the loss, for which the host waits; the device goes on with the rest of the step."""
 
+
+FAR_DEGREES, FAR_PART = 5.0, 0.1
+"""Degrees, and part of the scene's extent, beyond which a refined pose is told of."""
 
 Between = Callable[[Trainer, Callable[[], bool]], None]
 """A function called before each step, with the trainer and a function that is True once Ctrl-C was pressed: then it
@@ -238,6 +243,7 @@ class Session:
             gaussians=trainer.parameters.count,
             seconds=self.seconds,
             corrected=trainer.config.appearance != "none",
+            aligned=(lambda view: self.draw(aligned(trainer, view))[0]) if trainer.poses.on and keep else None,
             space=photos_space(view.path for view in trainer.scene.views),
         )
 
@@ -328,6 +334,8 @@ class Session:
             run.save_model(model, photos_space(view.path for view in trainer.scene.views))
             if (appearance := trainer.appearance.record()) is not None:
                 run.write_appearance(appearance, trainer.appearance.tables())
+            if trainer.poses.on:
+                _keep_poses(run, trainer)
             if trainer.scene.test_views:
                 result = self.evaluate(keep=True)
                 run.write_eval(result)
@@ -354,6 +362,22 @@ class Session:
             if trainer.step < last:
                 raise Interrupted(interrupted())
             self.doubt()
+
+
+def _keep_poses(run: Run, trainer: Trainer) -> None:
+    """Write the refined cameras, with those that are held out as they were given; a warning for any that went far."""
+    scene, poses = trainer.scene, trainer.poses
+    refined = {view.name: camera for view, camera in zip(trainer.views, poses.cameras, strict=True)}
+    images = [(view.name, view.lens, refined.get(view.name, view.camera)) for view in scene.views]
+    write_model(run.refined_path, images, scene.points, scene.point_colors)
+    degrees, shifts = poses.motions()
+    far = (degrees > FAR_DEGREES) | (shifts > FAR_PART * scene.extent)
+    if far.any():
+        names = [view.name for view, one in zip(trainer.views, far, strict=True) if one]
+        warnings.warn(
+            f"--refine-poses: {examples(names)}: moved by up to {degrees.max():.1f} degrees and {shifts.max():.3g} "
+            "world units; look at their renders, or leave them out"
+        )
 
 
 def _reached(every: int, steps: range) -> bool:

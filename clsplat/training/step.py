@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 from weakref import ref
 
 import numpy as np
@@ -16,12 +16,13 @@ from clsplat.camera import Camera
 from clsplat.config.exploring import Exploration
 from clsplat.config.thinning import thinning_of
 from clsplat.config.training import TrainConfig
-from clsplat.device.buffers import DeviceArray
+from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.layout import SlotFields
+from clsplat.gaussians import group_shapes
 from clsplat.rendering.rasterizer import Frame, Rasterizer, Room
 from clsplat.stages.adam import adam, updates_sh_rest
-from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, parts
 from clsplat.stages.loss import DepthAims, Loss, loss
 from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen, Slots, project_grad, project_step, step_numbers
@@ -88,6 +89,13 @@ class StepRows(ViewRows):
         return self.model[1]
 
 
+class PoseLook(Protocol):
+    """Takes what the rows of a step's view say of its pose."""
+
+    def add(self, rows: StepRows) -> None:
+        """Add these rows, before they change."""
+
+
 class StepProbe:
     """A look into a step. Each method is called when the kernels of its stage are launched; here none does anything."""
 
@@ -117,7 +125,8 @@ class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in the memory of a rasterizer.
 
     fields: the fields of a slot that the step fills; turn: of `loss`; room: of `Rasterizer.forward`; explore: what the
-    step does beside following the gradient of the loss; appearance: of the view's photograph, where it is learnt.
+    step does beside following the gradient of the loss; appearance: of the view's photograph, where it is learnt;
+    pose: takes the gradient by the view's pose, where there is room for the gradients.
     """
 
     device: Device
@@ -131,6 +140,7 @@ class GradientStep:
     room: Room | None = None
     explore: Exploration | None = None
     appearance: ViewAppearance | None = None
+    pose: PoseLook | None = None
 
     def run(
         self,
@@ -185,6 +195,8 @@ class GradientStep:
                 sh_rest = updates_sh_rest(self.config.optimiser, self.step)
                 arrays = (part[0], frame.camera_array, projected, row_slots, gradients, screen)
                 project_grad(rows.device, *arrays, fields=self.fields, sh_rest=sh_rest, explore=self.explore)
+                if self.pose is not None:
+                    self.pose.add(rows)
             probe.before_rows(rows)
             self.update(rows)
             probe.after_rows(rows)
@@ -221,6 +233,16 @@ class GradientStep:
                 )
         if self.explore is not None:
             noise(self.device, self.explore, rows.parameters, rows.start, readback)
+
+
+def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
+    """Room for a view's gradients of the rows that are on the device at once; zero: as `GradientStep.run` wants it."""
+    rows = min(parameters.rows, parameters.count) if isinstance(parameters, HostGaussians) else parameters.count
+    shapes = group_shapes(rows, parameters.coefficients)
+    arrays = {group: work.array(f"view_{group}", shape) for group, shape in shapes.items()}
+    for array in arrays.values() if zero else ():
+        array.fill(0.0)
+    return DeviceGaussians(rows, parameters.coefficients, arrays)
 
 
 def slot_fields(needs: StatisticsNeeds, *, nearness: bool = False) -> SlotFields:

@@ -59,10 +59,11 @@ from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.pending import Pending
 from clsplat.training.photographs import Photographs
+from clsplat.training.poses import MODELS, Poses, PoseSums
 from clsplat.training.rates import rates_at
 from clsplat.training.resolution import sizes_of
 from clsplat.training.sampling import SamplingFilter
-from clsplat.training.step import GradientStep, Sample, StepProbe, slot_fields
+from clsplat.training.step import GradientStep, Sample, StepProbe, slot_fields, view_gradients
 from clsplat.training.watched import Watched
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ class Trainer:
         self.given = initial
         self.watch = Watch(self.rasterizer.readback, [view.name for view in self.views])
         self.pending = Pending(device, self.watch, self._begin_again)
-        self.pending.on &= self.batch is None  # a batch reads its losses
+        self.pending.on &= self.batch is None and not config.refine_poses  # a batch reads its losses; poses, gradients
         self._start()
 
     def _start(self) -> None:
@@ -128,8 +129,9 @@ class Trainer:
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
+        self.poses = Poses(self.config, self.views, self.scene.extent)
         self.origin, self.near = initial.origin, self.scene.near
-        self._cameras: dict[int, Camera] = {}
+        self._cameras: dict[int, tuple[Camera, Camera]] = {}
         cameras = {view.name: self.local(view.camera) for view in self.views}
         self.sampling = SamplingFilter(self.config, self.device, self.rasterizer.work, cameras)
         self._make_plan(len(initial))
@@ -159,7 +161,8 @@ class Trainer:
                 **models,
             )
 
-        self.plan = plan(self.device) if batch is None else plan(self.device, models=OWNER_MODELS)
+        models = MODELS if self.config.refine_poses else 0 if batch is None else OWNER_MODELS
+        self.plan = plan(self.device, models=models) if models else plan(self.device)
         self.rasterizer.follow(self.plan)
         self.photographs.follow(self.plan.photographs)
         if batch is not None:
@@ -233,10 +236,16 @@ class Trainer:
         def run(turn: int, room: Room | None) -> Loss:
             sample = samples[0]
             appearance = next(iter(appearances), None)
-            step = GradientStep(*settings, turn=turn, room=room, explore=explore, appearance=appearance)
+            moves = self.poses.moves(sample.view, number)
+            pose = PoseSums(self.rasterizer, self.parameters.count) if moves else None
+            with_view: dict[str, Any] = {"explore": explore, "appearance": appearance, "pose": pose}
+            step = GradientStep(*settings, turn=turn, room=room, **with_view)
+            gradients = view_gradients(self.rasterizer.work, self.parameters, zero=True) if moves else None
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
-            result = step.run(model, *pixels, probe, reads_loss=reads_loss, **sample.known)
+            result = step.run(model, *pixels, probe, gradients, reads_loss=reads_loss, **sample.known)
+            if pose is not None:
+                self.poses.move(sample.view, number, pose.gradient())
             self.sampling.apply(self.parameters)
             return result
 
@@ -446,10 +455,12 @@ class Trainer:
         return camera.from_origin(self.origin).before(self.near)
 
     def camera(self, view: int, width: int, height: int) -> Camera:
-        """A training view's camera at the size of its photograph, the same object while that stays."""
-        camera = self._cameras.get(view)
-        if camera is None or (camera.width, camera.height) != (width, height):
-            camera = self._cameras[view] = self.local(self.views[view].camera.resized(width, height))
+        """A training view's camera at the size of its photograph, the same object while that and its pose stay."""
+        of, camera = self._cameras.get(view, (None, None))
+        if camera is None or of is not self.poses.cameras[view] or (camera.width, camera.height) != (width, height):
+            of = self.poses.cameras[view]
+            camera = self.local(of.resized(width, height))
+            self._cameras[view] = of, camera
         return camera
 
     def gaussians(self) -> Gaussians:
@@ -477,7 +488,7 @@ class Trainer:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
         arrays |= {f"{kind}/{group}": model[group].get() for kind, model in self.models().items() for group in GROUPS}
-        return arrays | self.sampling.arrays() | self.appearance.arrays()
+        return arrays | self.sampling.arrays() | self.appearance.arrays() | self.poses.arrays()
 
     def restart(self) -> None:
         """Begin again, at the rates that `watch.patience` allows."""
@@ -520,6 +531,7 @@ class Trainer:
         try:
             self.sampling.load(checkpoint.named("sampling/"), self.parameters.count)
             self.appearance.load(checkpoint.named("appearance/"))
+            self.poses.load(checkpoint.named("poses/"))
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
 

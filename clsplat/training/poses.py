@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses of training views, learnt with the model, and of held-out views, found for a model as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray
+from clsplat.device.launch import only_tried
+from clsplat.device.layout import PLAIN_SLOTS
+from clsplat.errors import InputError
+from clsplat.images.alpha import background_colour
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.scenes.scene import View
+from clsplat.stages.pose import pose_gradient, pose_rows, sums_of
+from clsplat.training.photographs import kept_pixels
+from clsplat.training.step import GradientStep, StepProbe, StepRows, view_gradients
+
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+LEAST = 0.01
+"""Part of the rate that is left at the last step."""
+MODELS = 4
+"""Arrays for each parameter on the device: parameters, two moments, a view's gradients."""
+ALIGNING, ALIGNED = 40, 1.0
+"""Steps in which the pose of a held-out view is found, and degrees by which it can turn in them, about."""
+
+
+def fallen(reach: float, part: float, visits: float) -> float:
+    """The rate of a visit that comes after this part of all: it falls exponentially, and all together are `reach`."""
+    mean = (1 - LEAST) / -np.log(LEAST)
+    return float(reach / max(visits * mean, 1.0) * LEAST**part)
+
+
+def _descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64:
+    """Adam's step (6,) at rate 1, at visit number `visit` (from 1); the moments (6,) change in place."""
+    first += (1 - BETA1) * (by - first)
+    second += (1 - BETA2) * (by**2 - second)
+    mean, square = first / (1 - BETA1**visit), second / (1 - BETA2**visit)
+    step: Float64 = -mean / (np.sqrt(square) + EPSILON)
+    return step
+
+
+@dataclass(eq=False)
+class PoseSums:
+    """The gradient by the pose of a step's view: `add` is given its rows, in order."""
+
+    rasterizer: Rasterizer
+    count: int
+    _sums: DeviceArray | None = field(default=None, init=False)
+
+    def add(self, rows: StepRows) -> None:
+        """Add up what these rows say. Kernels that come later are tried here, before anything changes."""
+        assert rows.gradients is not None, "asked for where poses are refined"
+        work = self.rasterizer.work
+        if self._sums is None:
+            self._sums = sums_of(work, self.count)
+            with only_tried(rows.device):
+                pose_gradient(rows.device, work, self._sums)
+        of_view = (rows.camera_array, rows.projected.tile_counts, rows.gradients)
+        pose_rows(rows.device, rows.parameters, *of_view, self._sums, rows.start)
+
+    def gradient(self) -> Float64:
+        """The gradient (6,) by the motion of `Camera.moved`; waits for the device."""
+        assert self._sums is not None, "a model has rows"
+        found: Float64 = pose_gradient(self.rasterizer.device, self.rasterizer.work, self._sums).get()[0].astype(float)
+        return found
+
+
+class Poses:
+    """The cameras of the training views, which move where poses are refined.
+
+    Adam has moments for each view. Two views stay as they are, the first and the one that is farthest from it: they
+    keep the model's place and size.
+    """
+
+    def __init__(self, config: TrainConfig, views: Sequence[View], extent: float) -> None:
+        self.on, self.cameras = config.refine_poses, [view.camera for view in views]
+        self._config, self._scale = config, np.repeat([1.0, extent], 3)
+        self._given = list(self.cameras)
+        self.held: tuple[int, ...] = ()
+        if not self.on:
+            return
+        if len(views) < 3:
+            raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two are held")
+        places = np.array([camera.position for camera in self.cameras])
+        distances = np.linalg.norm(places - places[0], axis=1)
+        self.held = (0, int(distances.argmax()) or len(views) - 1)
+        self._start = min(500, config.iterations // 10)
+        self._first, self._second = np.zeros((2, len(views), 6))
+        self._visits = np.zeros(len(views), np.int64)
+
+    def moves(self, view: int, step: int) -> bool:
+        """True if the view's pose is refined in this step."""
+        return self.on and step > self._start and view not in self.held
+
+    def rate(self, step: int) -> float:
+        """Radians of a step, falling exponentially: over all visits of a view they are about `pose_reach`."""
+        steps = self._config.iterations - self._start
+        reach, part = np.radians(self._config.pose_reach), (step - self._start) / steps
+        return fallen(reach, part, steps / len(self.cameras))
+
+    def move(self, view: int, step: int, gradient: Float64) -> None:
+        """Adam's step of a view's pose; none for a gradient that is not finite."""
+        by = gradient * self._scale  # shifts in parts of the extent
+        if not np.isfinite(by).all():
+            return
+        self._visits[view] += 1
+        down = _descend(self._first[view], self._second[view], by, int(self._visits[view]))
+        self.cameras[view] = self.cameras[view].moved(self.rate(step) * self._scale * down)
+
+    def motions(self) -> tuple[Float64, Float64]:
+        """Degrees by which each view has turned, and world units by which it has moved."""
+        pairs = list(zip(self._given, self.cameras, strict=True))
+        cosines = [(np.trace(a.rotation @ b.rotation.T) - 1) / 2 for a, b in pairs]
+        degrees: Float64 = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+        return degrees, np.array([np.linalg.norm(a.position - b.position) for a, b in pairs])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        if not self.on:
+            return {}
+        rotations = np.array([camera.rotation for camera in self.cameras])
+        translations = np.array([camera.translation for camera in self.cameras])
+        moments = {"poses/first": self._first, "poses/second": self._second, "poses/visits": self._visits}
+        return {"poses/rotations": rotations, "poses/translations": translations, **moments}
+
+    def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Take the arrays of a checkpoint. Raises ValueError where that is of other views."""
+        if not self.on:
+            return
+        values = {}
+        for name, own in self.arrays().items():
+            value = arrays.get(name.removeprefix("poses/"))
+            if value is None or value.shape != own.shape or value.dtype != own.dtype or not np.isfinite(value).all():
+                raise ValueError(f"has no {name} of shape {own.shape}")
+            values[name.removeprefix("poses/")] = value
+        poses = zip(self._given, values["rotations"], values["translations"], strict=True)
+        self.cameras = [given.posed(rotation, translation) for given, rotation, translation in poses]
+        self._first, self._second = values["first"].copy(), values["second"].copy()
+        self._visits = values["visits"].copy()
+
+
+@dataclass(frozen=True, eq=False)
+class _Look(GradientStep):
+    """A step that changes nothing of the model."""
+
+    def update(self, rows: StepRows) -> None:
+        """Leave the rows as they are."""
+
+
+def aligned(trainer: Any, view: View) -> Camera:
+    """The camera of a held-out view, moved to where the model as it is fits its photograph best, from where it is.
+
+    trainer: a `Trainer`. The model is held, so that this says how good it is apart from where its world has drifted.
+    """
+    config, rasterizer, model = trainer.config, trainer.rasterizer, trainer.parameters
+    photograph = np.ascontiguousarray(view.load_masked())
+    kept, background = kept_pixels(photograph), np.array(background_colour(config.background), np.float32)
+    room, scale = view_gradients(rasterizer.work, model), np.repeat([1.0, trainer.scene.extent], 3)
+    first, second = np.zeros(6), np.zeros(6)
+    camera = best = view.camera
+    least = np.inf
+    for step in range(1, ALIGNING + 1):
+        sums = PoseSums(rasterizer, model.count)
+        look = _Look(trainer.device, rasterizer, config, 1, trainer.rates(), PLAIN_SLOTS, pose=sums)
+        pixels = (photograph, trainer.local(camera), background)
+        loss, _ = look.run((model,), *pixels, StepProbe(), room, reads_loss=True, kept=kept).read()
+        if loss < least:
+            best, least = camera, loss
+        by = sums.gradient() * scale
+        rate = fallen(np.radians(ALIGNED), step / ALIGNING, ALIGNING)
+        camera = camera.moved(rate * scale * _descend(first, second, by, step))
+    return best

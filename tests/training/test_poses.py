@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses that are refined in training: they come back, two are held, bytes, and what a run has of them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from same_bytes import check_in_less_memory, interrupted, model_bytes
+from tiny import short, write_scene
+
+from clsplat.api import train
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.training.poses import Poses, aligned
+from clsplat.training.trainer import Trainer
+
+CONFIG = short(iterations=40, refine_poses=True)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
+
+
+@pytest.fixture(scope="module")
+def scene(folder: Path) -> Scene:
+    return load_scene(folder)
+
+
+def disturbed(scene: Scene, degrees: float, shift: float) -> Scene:
+    """The scene with training poses turned and shifted at random, but for the two that are held."""
+    rng = np.random.default_rng(3)
+    held = {scene.train_views[index].name for index in Poses(CONFIG, scene.train_views, scene.extent).held}
+
+    def off(view: View) -> View:
+        turn, move = (each / np.linalg.norm(each) for each in rng.standard_normal((2, 3)))
+        motion = np.concatenate([np.radians(degrees) * turn, shift * scene.extent * move])
+        kept = view.name in held or view.split == "test"
+        return view if kept else replace(view, camera=view.camera.moved(motion))
+
+    return replace(scene, views=[off(view) for view in scene.views])
+
+
+def pixels_off(found: Camera, true: Camera, points: np.ndarray) -> float:
+    """Mean distance in pixels between the images of points: a turn stands for a shift in some part."""
+    images = []
+    for camera in (found, true):
+        x, y, z = (points @ camera.rotation.T + camera.translation).T
+        images.append(np.stack([camera.fx * x / z, camera.fy * y / z], axis=1))
+    return float(np.linalg.norm(images[0] - images[1], axis=1).mean())
+
+
+@pytest.mark.slow
+def test_poses_come_back(scene: Scene, default_device: Device) -> None:
+    """At 48 x 40 pixels, where a degree is a pixel, from some pixels to under one."""
+    off = disturbed(scene, 3.0, 0.03)
+    trainer = Trainer(off, replace(CONFIG, iterations=600, pose_reach=10.0), default_device)
+    held = [off.train_views[index] for index in trainer.poses.held]
+
+    def away() -> float:
+        pairs = zip(trainer.poses.cameras, scene.train_views, strict=True)
+        return float(np.mean([pixels_off(camera, view.camera, scene.points) for camera, view in pairs]))
+
+    before = away()
+    while trainer.step < trainer.config.iterations:
+        trainer.train_step()
+    assert before > 1.5
+    assert away() < 0.3 * before
+    assert len(held) == 2
+    for view, index in zip(held, trainer.poses.held, strict=True):
+        assert trainer.poses.cameras[index] is view.camera
+    moved = trainer.poses.motions()[0] > 0
+    assert moved.sum() == len(moved) - 2
+
+
+def test_a_held_out_view_is_aligned(scene: Scene, default_device: Device) -> None:
+    """From two pixels off to under a third of one, with the model as it was."""
+    trainer = Trainer(scene, replace(CONFIG, iterations=300, refine_poses=False), default_device)
+    while trainer.step < trainer.config.iterations:
+        trainer.train_step()
+    before = trainer.gaussians().arrays()
+    view = scene.test_views[0]
+    away = replace(view, camera=view.camera.moved(np.array([0.02, 0.02, 0.02, 0, 0, 0])))
+    found = aligned(trainer, away)
+    still = {name: np.array_equal(values, before[name]) for name, values in trainer.gaussians().arrays().items()}
+    assert all(still.values()), still
+    assert pixels_off(away.camera, view.camera, scene.points) > 1
+    assert pixels_off(found, view.camera, scene.points) < 0.33
+
+
+def test_an_interruption_gives_the_same_bytes(
+    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
+) -> None:
+    """At step 10, when every view but those that are held has moved."""
+    assert interrupted(scene, CONFIG, default_device, tmp_path) == undisturbed
+
+
+def test_moving_poses_make_another_model(
+    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
+) -> None:
+    assert model_bytes(scene, replace(CONFIG, refine_poses=False), default_device, tmp_path) != undisturbed
+
+
+@pytest.mark.slow
+def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
+    scene = load_scene(write_scene(tmp_path / "scene", points=False))
+    check_in_less_memory(scene, replace(CONFIG, random_points=1500), default_device, tmp_path)
+
+
+def test_poison_changes_no_byte(
+    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CLSPLAT_POISON", "1")
+    assert model_bytes(scene, CONFIG, default_device, tmp_path / "poisoned") == undisturbed
+
+
+def test_what_a_run_has_of_them(folder: Path, scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    """refined/ is a COLMAP model of the same pictures, in which training views have moved and held-out ones not."""
+    run = Run.create(tmp_path / "run", CONFIG)
+    train(scene, CONFIG, device=default_device, run=run)
+    result = json.loads(run.eval_path.read_text())
+    assert result["mean"]["psnr_aligned"] >= result["mean"]["psnr"] - 0.05  # the loss is not the PSNR alone
+    again = load_scene(
+        shutil.copytree(run.refined_path, tmp_path / "again" / "sparse").parent, images=folder / "images"
+    )
+    assert [view.name for view in again.views] == [view.name for view in scene.views]
+    np.testing.assert_array_equal(again.points, scene.points)
+    for found, given in zip(again.views, scene.views, strict=True):
+        same = np.allclose(found.camera.rotation, given.camera.rotation, atol=1e-12)
+        assert same == (given.split == "test" or given.name in (scene.train_views[0].name, _second(scene)))
+        assert (found.camera.fx, found.camera.cx) == (given.camera.fx, given.camera.cx)
+    assert set(run.refined_path.iterdir()) <= {
+        run.refined_path / f"{stem}.txt" for stem in ("cameras", "images", "points3D")
+    }
+
+
+def _second(scene: Scene) -> str:
+    return scene.train_views[Poses(CONFIG, scene.train_views, scene.extent).held[1]].name
+
+
+def test_settings_that_make_no_sense(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    for config, text in (
+        (replace(CONFIG, batch=2), "--refine-poses: not with --batch 2, "),
+        (replace(CONFIG, pose_reach=0.0), "--pose-reach 0.0: expected over 0"),
+    ):
+        with pytest.raises(InputError, match=text):
+            config.check()
+    with pytest.raises(InputError, match="--refine-poses: not with 2 devices"):
+        CONFIG.on_devices(2, explicit=False)
+    few = replace(scene, views=[*scene.train_views[:2], *scene.test_views])
+    with pytest.raises(InputError, match="--refine-poses: 2 training views, expected 3 or more"):
+        Trainer(few, CONFIG, default_device)
+    run = Run.create(tmp_path / "run", replace(CONFIG, iterations=3))
+    train(scene, run.config, device=default_device, run=run)
+    with pytest.raises(InputError, match="refine_poses is True there"):
+        train(scene, replace(CONFIG, refine_poses=False), device=default_device, run=run, resume=True)
+
+
+def test_rates_are_the_reach_in_all() -> None:
+    config = TrainConfig(iterations=7000, refine_poses=True, pose_reach=5.0)
+    views = load_like(35)
+    poses = Poses(config, views, 1.0)
+    visited = [poses.rate(step) for step in range(501, 7001) if step % 35 == 0]
+    assert np.degrees(sum(visited)) == pytest.approx(5.0, rel=0.02)  # a sum for an integral
+    assert not poses.moves(1, 500)
+    assert poses.moves(1, 501)
+    assert not poses.moves(0, 501)
+
+
+def load_like(count: int) -> list[View]:
+    """Views of which only the cameras are asked for."""
+    from scenes import tilted_camera
+
+    return [View(f"{k}.png", tilted_camera(8, 8), Path(), "train", None) for k in range(count)]  # type: ignore[arg-type]
