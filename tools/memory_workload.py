@@ -194,6 +194,7 @@ def methods(device: Device) -> None:
     _train(device, replace(short, appearance="exposure", masks="ignore"), 5, VIEW)
     _train(device, replace(short, appearance="grid"), 3, VIEW)
     _train(device, replace(short, masks="transparent"), 5, VIEW)
+    _train(device, replace(short, refine_poses=True, iterations=3), 3, VIEW, views=3)  # one is not held
     _train(device, replace(short, depth="points"), 3, VIEW)
     edges = replace(PAPER.density, growth="budget", max_gaussians=60, long_axis=True, edge_views=1)
     _train(device, replace(short, thinning=0.3, density=edges), 3, VIEW)
@@ -204,13 +205,13 @@ def methods(device: Device) -> None:
         _train(device, short, 3, view)
 
 
-def _train(device: Device, config: TrainConfig, channels: int, view: Camera) -> None:
+def _train(device: Device, config: TrainConfig, channels: int, view: Camera, views: int = 1) -> None:
     pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
     if channels == 3:
         pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
     if channels == 5:
         pixels[:, :, 4] = pixels[:, :, 4] > 0.3
-    trainer = Trainer(scene_of(view, pixels), config, device, cloud(18, VIEW, 5, degree=0))
+    trainer = Trainer(scene_of(view, pixels, views), config, device, cloud(18, VIEW, 5, degree=0))
     trainer.pending.on = config is AHEAD
     if config is AHEAD:
         rooms = iter((0, 2000, 1))
@@ -222,8 +223,8 @@ def _train(device: Device, config: TrainConfig, channels: int, view: Camera) -> 
         raise SystemExit(f"the training went wrong: losses {losses}")
 
 
-def scene_of(view: Camera, pixels: NDArray[np.float32]) -> Scene:
-    """One view, its picture in memory at any size."""
+def scene_of(view: Camera, pixels: NDArray[np.float32], views: int = 1) -> Scene:
+    """A view, once or more often, its picture in memory at any size."""
 
     class Picture(_Picture):
         def load_masked(self, width: int | None = None, height: int | None = None) -> NDArray[np.float32]:
@@ -232,8 +233,9 @@ def scene_of(view: Camera, pixels: NDArray[np.float32]) -> Scene:
     lens = Lens("PINHOLE", view.width, view.height, (view.fx, view.fy, view.cx, view.cy))
     means = cloud(18, VIEW, 5, degree=0).means.astype(np.float64)
     depth = KnownDepth(means, np.ones(len(means)))  # for trainings that compare depths
-    picture = Picture("0.png", view, Path("0.png"), "train", lens, depth=depth, pixels=pixels)
-    return Scene("tiny", [picture], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (-np.ones(3), np.ones(3)))
+    names = [f"{number}.png" for number in range(views)]
+    pictures = [Picture(name, view, Path(name), "train", lens, depth=depth, pixels=pixels) for name in names]
+    return Scene("tiny", list(pictures), np.zeros((0, 3)), np.zeros((0, 3), np.float32), (-np.ones(3), np.ones(3)))
 
 
 def sorts(device: Device) -> None:

@@ -35,6 +35,7 @@ BUILT_WITH: dict[str, dict[str, object]] = {
     "appearance": {"LANES": 1},
     "grid": {"LANES": 1},
     "noise": {"LANES": 1},
+    "pose": {"LANES": 1},
     "project_rays": {"LANES": 1, "RAYS": 1},
     "sampling": {"LANES": 1},
 }

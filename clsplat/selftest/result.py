@@ -21,8 +21,10 @@ APPEARANCE: dict[str, tuple[str, ...]] = {"none": (), "exposure": ("appearance",
 """Stages of what is learnt of each photograph, which training needs beside TRAINING, by the setting."""
 DEPTH = ("depth",)
 """Stages of known depths, which training needs where they are compared."""
+POSES = ("pose",)
+"""Stages of poses, which training needs where they are refined."""
 TRAINING = (*FORWARD, *BACKWARD)
-STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *MASKS, *BACKWARD, "appearance", "grid", *DEPTH)
+STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *MASKS, *BACKWARD, "appearance", "grid", *DEPTH, *POSES)
 INDICES = ("project", "duplicate", "sort", "ranges")
 """Stages by whose counts and lists the next ones find their way."""
 
@@ -46,6 +48,7 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "appearance": (1024, "202 found; beta2 in float32 is 1e-5 off in 1 - beta2, 84 ulp, and a picture is added up"),
     "grid": (1024, "227 found; as appearance"),
     "depth": (1024, "as blend_grad"),
+    "pose": (1024, "as appearance; terms of either sign are added up"),
 }
 """Ulp that a stage may be off, and why. Each bound is the error found where every operation is rounded as in IEEE 754,
 with room for a GPU whose divisions and roots are not. A wrong operation is off by thousands."""

@@ -31,6 +31,7 @@ from clsplat.selftest.grid_stage import of_grid
 from clsplat.selftest.harness import WHITEN, Array, Bench, Outcome, cropped, joined
 from clsplat.selftest.mask_stages import MASKS
 from clsplat.selftest.picture_stages import PICTURES
+from clsplat.selftest.pose_stage import of_pose
 from clsplat.selftest.scenes import evenly, keys, padded
 from clsplat.stages.adam import adam
 from clsplat.stages.blend import blend, blend_grad
@@ -455,4 +456,5 @@ RUN: dict[str, Callable[[Bench], Outcome]] = {
     "appearance": of_appearance,
     "grid": of_grid,
     "depth": of_depth,
+    "pose": of_pose,
 }

@@ -34,6 +34,7 @@ from clsplat.selftest.result import (
     DEPTH,
     FORWARD,
     MASKS,
+    POSES,
     RAYS,
     STAGES,
     TRAINING,
@@ -79,6 +80,8 @@ BROKEN = {
     "density: stays && wanted && !large": ("stays && wanted && large", "statistics"),
     "appearance: fma1(seen[at], g, sum)": ("fma1(seen[at], g, g)", "appearance"),
     "appearance: moved[i] - 3.0f * sum": ("moved[i] + 3.0f * sum", "appearance"),
+    "pose: uy * by[2] - uz * by[1]": ("uy * by[2] + uz * by[1]", "pose"),
+    "pose: 0.5f * (fma1(q[0], g[3]": ("0.25f * (fma1(q[0], g[3]", "pose"),
     "grid: risen[k] = b - a": ("risen[k] = a - b", "grid"),
     "grid: h * (level - (float)l)": ("h * level", "grid"),
 }
@@ -88,7 +91,7 @@ BROKEN = {
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
     monkeypatch.setenv(BREAK, change)
-    groups = (FORWARD, CHANNELS, DEEP, RAYS, MASKS, BACKWARD, *APPEARANCE.values(), DEPTH)
+    groups = (FORWARD, CHANNELS, DEEP, RAYS, MASKS, BACKWARD, *APPEARANCE.values(), DEPTH, POSES)
     group = next(stages for stages in groups if last in stages)
     before = () if group is FORWARD else FORWARD
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
