@@ -58,10 +58,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scene", type=Path)
-    for name, value in (("width", 120), ("photos", 40), ("points", 5000), ("iterations", 7000), ("seed", 0)):
-        parser.add_argument(f"--{name}", type=int, default=value)
-    for name, value in (("degrees", 0.5), ("percent", 1.0), ("reach", TrainConfig.pose_reach)):
-        parser.add_argument(f"--{name}", type=float, default=value)
+    for flag, value in (
+        *(("--width", 120), ("--photos", 40), ("--points", 5000), ("--iterations", 7000), ("--seed", 0)),
+        *(("--degrees", 0.5), ("--percent", 1.0), ("--reach", TrainConfig.pose_reach)),
+    ):
+        parser.add_argument(flag, type=type(value), default=value)
     options = parser.parse_args()
     if options.scene is None:
         path = options.folder / "scene"

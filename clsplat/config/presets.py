@@ -50,9 +50,10 @@ def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> Train
     """Settings that `clsplat train --preset --schedule --iterations` start from.
 
     fast trains less. Pictures are a quarter of the size for a fourteenth of the steps and half the size until two
-    sevenths. There are fewer Gaussians; those that add less than a tenth of a pixel to every view are dropped. The
-    rates are those of the short schedule, those of means, scales and rotations up to four times higher. The higher SH
-    bands are updated in every second step (docs/decisions/0015-the-fast-preset.md).
+    sevenths. There are fewer Gaussians, as splits are along the longest axis, and those that add less than a tenth of
+    a pixel to every view are dropped. The rates are those of the short schedule, those of means, scales and rotations
+    up to four times higher. The higher SH bands are updated in every second step
+    (docs/decisions/0015-the-fast-preset.md).
     """
     config = scheduled(schedule or ("short" if preset == "fast" else "paper"), iterations)
     config = replace(config, rasterizer=PRESETS[preset])
@@ -69,5 +70,5 @@ def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> Train
             quaternions_rate=2 * optimiser.quaternions_rate,
             sh_rest_every=2,
         ),
-        density=replace(config.density, gradient_threshold=3e-4, min_contribution=0.1),
+        density=replace(config.density, gradient_threshold=3e-4, min_contribution=0.1, long_axis=True),
     )

@@ -122,7 +122,7 @@ class DensityConfig:
     and resets; max-screen-radius moves Gaussians, from the start."""
     long_axis: bool = False
     """Split what is densified along its longest axis, small or large, into two that lie on it (Improved-GS); there are
-    no clones then. Not with growth mcmc."""
+    no clones then. With growth mcmc nothing is split."""
     edge_views: int = 0
     """With growth budget: training views that are looked at before each densification. What is over gradient-threshold
     is then drawn at random, each as likely as what it adds to the photographs' edges there (Improved-GS); 0: the
@@ -193,10 +193,6 @@ class DensityConfig:
             raise InputError(
                 f"--density.edge-views {self.edge_views}: chooses what a budget is spent on, expected --density.growth "
                 "budget too"
-            )
-        if self.long_axis and self.growth == "mcmc":
-            raise InputError(
-                "--density.long-axis: nothing is split with --density.growth mcmc, expected another growth"
             )
         if self.growth == "mcmc" and (self.prune_at or self.prune_every):
             found = "prune-at" if self.prune_at else "prune-every"

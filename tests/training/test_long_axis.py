@@ -129,7 +129,6 @@ def test_it_grows_by_splits_alone(scene: Scene, default_device: Device) -> None:
     [
         ({"edge_views": 2}, "--density.edge-views 2"),
         ({"edge_views": -1}, "--density.edge-views -1"),
-        ({"long_axis": True, "growth": "mcmc", "max_gaussians": 9}, "--density.long-axis"),
     ],
 )
 def test_settings_that_are_never_used(settings: dict[str, object], name: str) -> None:
