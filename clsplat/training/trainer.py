@@ -240,10 +240,12 @@ class Trainer:
             pose = PoseSums(self.rasterizer, self.parameters.count) if moves else None
             with_view: dict[str, Any] = {"explore": explore, "appearance": appearance, "pose": pose}
             step = GradientStep(*settings, turn=turn, room=room, **with_view)
-            gradients = view_gradients(self.rasterizer.work, self.parameters, zero=True) if moves else None
+            known = sample.known
+            if moves:
+                known["gradients"] = view_gradients(self.rasterizer.work, self.parameters, zero=True)
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
-            result = step.run(model, *pixels, probe, gradients, reads_loss=reads_loss, **sample.known)
+            result = step.run(model, *pixels, probe, reads_loss=reads_loss, **known)
             if pose is not None:
                 self.poses.move(sample.view, number, pose.gradient())
             self.sampling.apply(self.parameters)

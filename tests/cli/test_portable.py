@@ -353,6 +353,7 @@ LOCALES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("locale", LOCALES)
 def test_paths_of_any_letters_in_any_locale(locale: str, tmp_path: Path) -> None:
     folder = tmp_path / LETTERS

@@ -200,6 +200,7 @@ def test_a_dry_run_writes_nothing(shot: list[str], tmp_path: Path, capsys: Captu
     assert not folder.exists()
 
 
+@pytest.mark.slow
 def test_several_devices_share_the_frames(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     assert render(shot, tmp_path / "one") == 0
     assert render(shot, tmp_path / "all", "--device", "all") == 0

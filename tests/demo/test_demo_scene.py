@@ -63,6 +63,7 @@ def test_every_object_is_textured(surfaces):
         assert np.median(patches.std(axis=(1, 3))) > 0.01, type(surface).__name__
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(6))
 def test_rays_meet_the_surface_where_its_texture_says(surfaces, index):
     surface = surfaces[index]

@@ -165,9 +165,8 @@ def test_what_failed_in_every_shape_is_tried_anew(
     assert known.entries(device)[standing_device.shape.label].failed == ""
 
 
-@pytest.mark.parametrize(
-    ("how", "name"), [("launch", "gather_rows"), pytest.param("abort", "NO_SH_REST", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("how", "name"), [("launch", "gather_rows"), ("abort", "NO_SH_REST")])
 def test_training_goes_on_after_a_late_failure(
     how: str, name: str, standing: Standing, scene: Path, tmp_path: Path, standing_device: Device, capsys: Capture,
     monkeypatch: pytest.MonkeyPatch,

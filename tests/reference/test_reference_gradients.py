@@ -109,6 +109,7 @@ def test_every_parameter_by_central_differences(overlap: tuple[Objective, Arrays
     assert_close(gradients[name], slopes, absolute=1e-9, name=name)
 
 
+@pytest.mark.slow
 def test_sh_of_degree_3_by_central_differences(overlap: tuple[Objective, Arrays]) -> None:
     """Every coefficient of two Gaussians, then random directions through all of them."""
     objective, gradients = overlap

@@ -46,6 +46,7 @@ def test_scan_of_as_many_as_the_device_says(shaped_device: Device, most: int, co
     assert total.get()[0] == values[:count].sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("most", "count"), SEAMS)
 def test_sorts_of_as_many_as_the_device_says(shaped_device: Device, most: int, count: int) -> None:
     keys = np.random.default_rng(most).integers(0, 1 << 17, most).astype(np.uint32)
@@ -103,6 +104,7 @@ def test_a_pass_with_room_is_the_exact_one(shaped_device: Device, name: str, spa
     assert_same_bits(slots, Rasterizer(shaped_device).pair_gradients(exact, gradient).values.get())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cause", ["one pair too many", "a refused element", "an earlier stop"])
 def test_a_pass_that_stops_changes_nothing(shaped_device: Device, cause: str) -> None:
     rasterizer, held, exact = drawn(shaped_device, "cloud")

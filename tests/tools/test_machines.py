@@ -106,6 +106,7 @@ def test_one_that_fails_fails_the_run_and_the_others_are_run(capsys: pytest.Capt
     assert "never" not in printed
 
 
+@pytest.mark.slow
 def test_one_that_hangs_is_ended_with_its_children(tmp_path: Path) -> None:
     here = tmp_path / "child"
     child = f"import pathlib, time; time.sleep(4); pathlib.Path({str(here)!r}).touch()"

@@ -109,6 +109,7 @@ def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> 
     assert "crashed while running 'test_aborts.py::test_it[3]'" in done.stdout
 
 
+@pytest.mark.slow
 def test_what_hangs_ends_and_is_named(tool: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "test_hangs.py").write_text("import time\ndef test_it():\n    time.sleep(1000)\n")
     done = run(tool, tmp_path, "-o", "faulthandler_timeout=1")

@@ -150,6 +150,7 @@ def test_a_panorama_of_another_size_is_named(tmp_path: Path) -> None:
         load_scene(folder)
 
 
+@pytest.mark.slow
 def test_frames_are_drawn_through_the_lens_that_the_run_was_trained_with(
     scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -244,6 +244,7 @@ def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_devic
     check_on_two_devices(scene, CONFIG, default_device, CONFIG.iterations // 2)
 
 
+@pytest.mark.slow
 def test_every_driver_trains_alike(device: Device, default_device: Device, scene: Scene) -> None:
     """In one shape of the kernels, to the bit."""
     ends = []

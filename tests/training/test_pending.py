@@ -85,6 +85,7 @@ def test_trained_by_capacity_is_trained_with_exact_counts(
     assert_alike(exact, other)
 
 
+@pytest.mark.slow
 def test_a_group_s_shape_has_the_same_bytes_by_capacity(
     device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

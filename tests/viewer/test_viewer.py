@@ -107,6 +107,7 @@ def test_addresses_of_this_machine() -> None:
     assert not any(Address(host).local for host in ("0.0.0.0", "::", "192.168.1.2", "example.org"))
 
 
+@pytest.mark.slow
 def test_it_listens_on_this_machine_alone(url: str) -> None:
     port = int(url.rsplit(":", 1)[1])
     with socket.create_connection(("127.0.0.1", port), timeout=10):
@@ -117,6 +118,7 @@ def test_it_listens_on_this_machine_alone(url: str) -> None:
             pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
     ["/etc/passwd", "//etc/passwd", "/../../../../../etc/passwd", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd", "/model.ply",
