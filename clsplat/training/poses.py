@@ -4,22 +4,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
-from clsplat.camera import Camera
+from clsplat.camera import NO_ROTATION, Camera
 from clsplat.config.training import TrainConfig
-from clsplat.device.buffers import DeviceArray
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.errors import InputError
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.scenes.scene import View
+from clsplat.scenes.scene import Scene, View
+from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.stages.pose import pose_gradient, pose_rows, sums_of
 from clsplat.training.photographs import kept_pixels
 from clsplat.training.step import GradientStep, StepProbe, StepRows, view_gradients
@@ -50,27 +52,27 @@ def _descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float6
 
 @dataclass(eq=False)
 class PoseSums:
-    """The gradient by the pose of a step's view: `add` is given its rows, in order."""
+    """The gradient by the pose of a step's view, of a model of `count` rows; `add` is given all of them, in order."""
 
-    rasterizer: Rasterizer
+    work: Workspace
     count: int
-    _sums: DeviceArray | None = field(default=None, init=False)
+    _begun: tuple[Device, DeviceArray] | None = field(default=None, init=False)
 
     def add(self, rows: StepRows) -> None:
-        """Add up what these rows say. Kernels that come later are tried here, before anything changes."""
+        """Add up the rows' parts. Kernels that come later are tried here, before anything changes."""
         assert rows.gradients is not None, "asked for where poses are refined"
-        work = self.rasterizer.work
-        if self._sums is None:
-            self._sums = sums_of(work, self.count)
+        if self._begun is None:
+            self._begun = rows.device, sums_of(self.work, self.count)
             with only_tried(rows.device):
-                pose_gradient(rows.device, work, self._sums)
+                pose_gradient(rows.device, self.work, self._begun[1])
         of_view = (rows.camera_array, rows.projected.tile_counts, rows.gradients)
-        pose_rows(rows.device, rows.parameters, *of_view, self._sums, rows.start)
+        pose_rows(rows.device, rows.parameters, *of_view, self._begun[1], rows.start)
 
     def gradient(self) -> Float64:
         """The gradient (6,) by the motion of `Camera.moved`; waits for the device."""
-        assert self._sums is not None, "a model has rows"
-        found: Float64 = pose_gradient(self.rasterizer.device, self.rasterizer.work, self._sums).get()[0].astype(float)
+        assert self._begun is not None, "a model has rows"
+        device, sums = self._begun
+        found: Float64 = pose_gradient(device, self.work, sums).get()[0].astype(np.float64)
         return found
 
 
@@ -142,6 +144,9 @@ class Poses:
             if value is None or value.shape != own.shape or value.dtype != own.dtype or not np.isfinite(value).all():
                 raise ValueError(f"has no {name} of shape {own.shape}")
             values[name.removeprefix("poses/")] = value
+        turned = values["rotations"]
+        if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > NO_ROTATION:
+            raise ValueError("has poses/rotations that are none")
         poses = zip(self._given, values["rotations"], values["translations"], strict=True)
         self.cameras = [given.posed(rotation, translation) for given, rotation, translation in poses]
         self._first, self._second = values["first"].copy(), values["second"].copy()
@@ -156,12 +161,28 @@ class _Look(GradientStep):
         """Leave the rows as they are."""
 
 
-def aligned(trainer: Any, view: View) -> Camera:
-    """The camera of a held-out view, moved to where the model as it is fits its photograph best, from where it is.
+class InTraining(Protocol):
+    """A model in training, as far as this goes: a `Trainer`."""
 
-    trainer: a `Trainer`. The model is held, so that this says how good it is apart from where its world has drifted.
-    """
-    config, rasterizer, model = trainer.config, trainer.rasterizer, trainer.parameters
+    config: TrainConfig
+    device: Device
+    rasterizer: Rasterizer
+    parameters: AnyGaussians
+    scene: Scene
+
+    def rates(self) -> dict[str, float]:
+        """Learning rates at the step."""
+        ...
+
+    def local(self, camera: Camera) -> Camera:
+        """A camera in the world as one for the model."""
+        ...
+
+
+def aligned(trainer: InTraining, view: View) -> Camera:
+    """The camera of a held-out view, moved from where it is to where the model fits its photograph best. The model
+    stays as it is: its world may have drifted."""
+    config, rasterizer, model = replace(trainer.config, thinning=0.0), trainer.rasterizer, trainer.parameters
     photograph = np.ascontiguousarray(view.load_masked())
     kept, background = kept_pixels(photograph), np.array(background_colour(config.background), np.float32)
     room, scale = view_gradients(rasterizer.work, model), np.repeat([1.0, trainer.scene.extent], 3)
@@ -169,7 +190,7 @@ def aligned(trainer: Any, view: View) -> Camera:
     camera = best = view.camera
     least = np.inf
     for step in range(1, ALIGNING + 1):
-        sums = PoseSums(rasterizer, model.count)
+        sums = PoseSums(rasterizer.work, model.count)
         look = _Look(trainer.device, rasterizer, config, 1, trainer.rates(), PLAIN_SLOTS, pose=sums)
         pixels = (photograph, trainer.local(camera), background)
         loss, _ = look.run((model,), *pixels, StepProbe(), room, reads_loss=True, kept=kept).read()

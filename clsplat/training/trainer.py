@@ -237,7 +237,7 @@ class Trainer:
             sample = samples[0]
             appearance = next(iter(appearances), None)
             moves = self.poses.moves(sample.view, number)
-            pose = PoseSums(self.rasterizer, self.parameters.count) if moves else None
+            pose = PoseSums(self.rasterizer.work, self.parameters.count) if moves else None
             with_view: dict[str, Any] = {"explore": explore, "appearance": appearance, "pose": pose}
             step = GradientStep(*settings, turn=turn, room=room, **with_view)
             known = sample.known

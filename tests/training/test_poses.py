@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -145,6 +146,24 @@ def test_what_a_run_has_of_them(folder: Path, scene: Scene, default_device: Devi
 
 def _second(scene: Scene) -> str:
     return scene.train_views[Poses(CONFIG, scene.train_views, scene.extent).held[1]].name
+
+
+@pytest.mark.parametrize(
+    ("name", "spoilt", "text"),
+    [
+        ("rotations", lambda array: 2 * array, "has poses/rotations that are none"),
+        ("visits", lambda array: array[1:], "has no poses/visits of shape"),
+        ("first", lambda array: array * np.nan, "has no poses/first of shape"),
+    ],
+)
+def test_a_checkpoint_that_is_damaged(
+    scene: Scene, default_device: Device, name: str, spoilt: Callable[[np.ndarray], np.ndarray], text: str
+) -> None:
+    poses = Trainer(scene, CONFIG, default_device).poses
+    arrays = {key.removeprefix("poses/"): values for key, values in poses.arrays().items()}
+    poses.load(arrays)
+    with pytest.raises(ValueError, match=text):
+        poses.load({**arrays, name: spoilt(arrays[name])})
 
 
 def test_settings_that_make_no_sense(scene: Scene, default_device: Device, tmp_path: Path) -> None:
