@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
+from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
 from clsplat.stages.blend import Blended
 from clsplat.stages.device_camera import padded_size
@@ -72,5 +73,6 @@ def _target(
         defines["ALPHA"] = True
     kernels = device.kernels("target", **defines)
     sizes = (width, height, channels, stride, rows * stride)
-    launch_grid(device, kernels.target, (stride, rows), *sizes, source, background, planes, *render)
+    across = stride // TILE if device.shape.lanes > 1 else stride
+    launch_grid(device, kernels.target, (across, rows), *sizes, source, background, planes, *render)
     return planes
