@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import statistics
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -72,10 +73,10 @@ def bench(
         drawn = (part.lists, frame.projected.splats, frame.background, subject.camera)
         added, looked_at = count_pairs(rasterizer.device, rasterizer.work, *drawn)
         contributing, evaluated = contributing + added, evaluated + looked_at
-    frame_ms, in_frame, by_wall = _measure(device, draw, repeat)
+    frame_ms, frame_host, in_frame, by_wall = _measure(device, draw, repeat)
     frame_calls = calls_of(device, draw)
     say("training step", None)
-    iteration_ms, in_step, _ = _measure(device, trainer.train_step, repeat)
+    iteration_ms, iteration_host, in_step, _ = _measure(device, trainer.train_step, repeat)
     iteration_calls = calls_of(device, trainer.train_step)
 
     stages = {name: record for name, record in in_frame.items() if name in FORWARD}
@@ -105,6 +106,8 @@ def bench(
         "timer": "wall" if by_wall else "events",
         "frame_ms": frame_ms,
         "iteration_ms": iteration_ms,
+        "frame_host_ms": frame_host,
+        "iteration_host_ms": iteration_host,
         "frame_calls": asdict(frame_calls),
         "iteration_calls": asdict(iteration_calls),
         "stages": table,
@@ -120,16 +123,26 @@ def calls_of(device: Device, work: Callable[[], object]) -> Calls:
     return device.calls.since(before)
 
 
-def _measure(device: Device, work: Callable[[], object], repeat: int) -> tuple[float, dict[str, StageRecord], bool]:
-    """Wall time in ms with nothing recorded; the stages; True if their times are of the wall, as the driver's events
-    give none. Medians over `repeat` rounds: plain, with events, and waiting at the seams of the stages."""
+def _measure(
+    device: Device, work: Callable[[], object], repeat: int
+) -> tuple[float, float, dict[str, StageRecord], bool]:
+    """Wall time in ms with nothing recorded, and this thread's processor time then; the stages; True if their times are
+    of the wall, as the driver's events give none. Medians over `repeat` rounds: plain, with events, and waiting at the
+    seams of the stages."""
     for _ in range(2):
         work()
     walls: list[float] = []
+    hosts: list[float] = []
+
+    def counted() -> None:
+        start = time.thread_time()
+        work()
+        hosts.append(1e3 * (time.thread_time() - start))
+
     by_events: list[dict[str, StageRecord]] = []
     by_waiting: list[dict[str, StageRecord]] = []
     for _ in range(repeat):
-        walls.append(device.timed(work)[1])
+        walls.append(device.timed(counted)[1])
         for records, wait in ((by_events, False), (by_waiting, True)):
             with device.recorder.recording(wait=wait) as stages:
                 work()
@@ -142,7 +155,7 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> tuple[f
         kernels = {kernel: statistics.median(run.get(kernel, 0.0) for run in times) for kernel in record.kernels}
         total = statistics.median(waits if by_wall else [sum(run.values()) for run in times])
         medians[name] = replace(record, kernels=kernels, ms=total, wall_ms=statistics.median(waits))
-    return statistics.median(walls), medians, by_wall
+    return statistics.median(walls), statistics.median(hosts), medians, by_wall
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +242,8 @@ def table(result: dict[str, Any]) -> str:
     note = "ms by events" if result["timer"] == "events" else "ms by wall time: the driver's events have none"
     times = f"frame {result['frame_ms']:.2f} ms, training step {result['iteration_ms']:.2f} ms"
     load = f"load average {result['load_average'] or 0:.1f}"
-    counts = [("queue", *(name.replace("_", " ") for name in result["frame_calls"]))]
-    for what, key in (("frame", "frame_calls"), ("training step", "iteration_calls")):
-        counts.append((what, *(str(count) for count in result[key].values())))
+    counts = [("queue", *(name.replace("_", " ") for name in result["frame_calls"]), "host ms")]
+    for what, key in (("frame", "frame"), ("training step", "iteration")):
+        host = f"{result[f'{key}_host_ms']:.2f}"
+        counts.append((what, *(str(count) for count in result[f"{key}_calls"].values()), host))
     return "\n".join([*lines, "", *aligned(counts), "", f"{times}: medians of {result['repeat']}; {note}; {load}"])

@@ -107,10 +107,12 @@ class Kernel:
     tried: the forms of launch (`launch.form_of`) of which it is known that the driver can do them. With the first of
     them the types of the kernel's scalars have been told to OpenCL's wrapper, as each would else cost 10 microseconds
     a launch.
+    spare: kernel objects of tapes that are gone, for others (`tape.Tape`).
     """
 
     def __init__(self, variant: Variant, program: cl.Program, kernel: Any) -> None:
         self.variant, self.program = variant, program
+        self.spare: list[Any] = []
         self.name: str = kernel.function_name
         self.cl_kernel = kernel
         self.tried: set[str] = set()

@@ -61,8 +61,8 @@ class Tape:
 
     entries: functions that put them on the queue, each with its kernel, if it is a launch; calls: the counts of them;
     anew: what sets an argument that is given anew, and its place; reads: the entries that copy to the host. A launch
-    has a kernel object of its own, whose other arguments stay set. That keeps no buffer alive: whoever has the tape
-    lets go of it where a buffer may go.
+    has a kernel object of its own, whose other arguments stay set, and leaves it to other tapes: the wrapper takes 0.2
+    ms and more to make one. That keeps no buffer alive: whoever has the tape lets go of it where a buffer may go.
     """
 
     def __init__(self) -> None:
@@ -70,8 +70,13 @@ class Tape:
         self.calls = Calls()
         self.anew: list[tuple[Callable[[int, Any], None], int]] = []
         self.reads: list[Callable[[], Any]] = []
+        self._owned: list[tuple[Kernel, cl.Kernel]] = []
         self._described: list[tuple[object, ...]] = []
         self._numbers: list[float] = []
+
+    def __del__(self) -> None:
+        for kernel, own in self._owned:
+            kernel.spare.append(own)
 
     def add_fill(self, fill: Callable[[], Any], *description: object) -> None:
         """Append a fill."""
@@ -93,7 +98,9 @@ class Tape:
         values: Sequence[Any],
     ) -> None:
         """Append a launch that has just been made."""
-        own, description = cl.Kernel(kernel.program, kernel.name), []
+        own = kernel.spare.pop() if kernel.spare else cl.Kernel(kernel.program, kernel.name)
+        self._owned.append((kernel, own))
+        description = []
         for index, value in enumerate(values):
             own.set_arg(index, typed(value))
             if given := isinstance(value, (Anew, AnewWord)):

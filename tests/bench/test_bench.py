@@ -293,6 +293,7 @@ def test_json_has_the_contract(capsys: Capture) -> None:
     assert all("ms" in stage for stage in result["stages"].values())
     assert result["frame_calls"]["launches"] < result["iteration_calls"]["launches"]
     assert result["iteration_calls"]["blocking_reads"] == 1
+    assert result["frame_host_ms"] > 0 and 0 < result["iteration_host_ms"] < 1e4
     assert {"contributing", "evaluated"} <= set(result["pairs"])
     assert 0 < result["pairs"]["contributing"] <= result["pairs"]["evaluated"]
     assert result["limit"]["pairs_per_second"] > 0
@@ -308,8 +309,8 @@ def test_table(capsys: Capture) -> None:
     assert {line.split()[0] for line in lines if line} >= FRAME | STEP
     assert "synthetic: 400 Gaussians" in "\n".join(lines)
     queue = [line.split() for line in lines if line.startswith(("queue", "training step  "))]
-    assert queue[0][-4:] == ["blocking", "writes", "blocking", "reads"]
-    assert queue[1][-2:] == ["0", "1"]
+    assert queue[0][-6:] == ["blocking", "writes", "blocking", "reads", "host", "ms"]
+    assert queue[1][-3:-1] == ["0", "1"]
 
 
 @pytest.mark.usefixtures("_quick")

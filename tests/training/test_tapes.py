@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tiny import short, write_scene
 
 from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.tape import CHECK, Tape
 from clsplat.device.tape import VARIABLE as TAPES
@@ -25,6 +26,7 @@ from clsplat.images.writing import write_image
 from clsplat.scenes.depth import with_depths
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.stages import project
+from clsplat.stages.scan import scan
 from clsplat.training.pending import VARIABLE
 from clsplat.training.trainer import Trainer
 
@@ -146,3 +148,19 @@ def test_another_word_than_those_is_refused(
     monkeypatch.setenv(TAPES, "yes")
     with pytest.raises(InputError, match=f"{TAPES}=yes: expected 1, 0 or check"):
         Trainer(load_scene(folder), PLAIN, default_device)
+
+
+def test_kernel_objects_go_from_tape_to_tape(default_device: Device) -> None:
+    """Making one takes longer than many launches."""
+    work, owned = Workspace(default_device), []
+    numbers = upload(default_device, np.arange(100, dtype=np.uint32))
+    out, total = work.array("out", (100,), np.uint32), work.array("total", (1,), np.uint32)
+    for _ in range(3):
+        _, tape = default_device.record(lambda: scan(default_device, work, numbers, out, total))
+        assert tape is not None
+        owned.append({own.int_ptr for _, own in tape._owned})
+        total.fill(0)
+        default_device.replay(tape)
+        assert total.get()[0] == 4950
+        del tape
+    assert owned[0] == owned[1] == owned[2] != set()
