@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,7 +28,11 @@ from clsplat.stages.pose import pose_gradient, pose_rows, sums_of
 from clsplat.training.photographs import kept_pixels
 from clsplat.training.step import GradientStep, StepProbe, StepRows, view_gradients
 
-BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+BETA1, BETA2 = 0.9, 0.99
+FLATTEST, TINY = 1e-2, 1e-30
+"""Least second moment along an axis: that part of the largest one, and what stands for nothing at all."""
+SWEEPS, ROUNDING = 8, 1e-16
+"""Of Jacobi's rotations: passes over all pairs, and what counts as zero beside the diagonal."""
 LEAST = 0.01
 """Part of the rate that is left at the last step."""
 MODELS = 4
@@ -41,12 +47,35 @@ def fallen(reach: float, part: float, visits: float) -> float:
     return float(reach / max(visits * mean, 1.0) * LEAST**part)
 
 
-def _descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64:
-    """Adam's step (6,) at rate 1, at visit number `visit` (from 1); the moments (6,) change in place."""
+def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
+    """Eigenvalues (n,) of a symmetric matrix (n, n), and the eigenvectors as rows, by cyclic Jacobi rotations (Golub
+    and Van Loan, section 8.5): LAPACK has other bits on another processor."""
+    a, axes = matrix.copy(), np.eye(len(matrix))
+    for _ in range(SWEEPS):
+        for p, q in combinations(range(len(a)), 2):
+            off = float(a[p, q])
+            if abs(off) <= ROUNDING * max(abs(float(a[p, p])), abs(float(a[q, q]))):
+                continue
+            half = (float(a[q, q]) - float(a[p, p])) / (2 * off)
+            tangent = math.copysign(1.0, half) / (abs(half) + math.sqrt(half * half + 1.0))
+            cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
+            sine = tangent * cosine
+            for rows in (a, a.T, axes):
+                one, other = rows[p].copy(), rows[q].copy()
+                rows[p], rows[q] = cosine * one - sine * other, sine * one + cosine * other
+    return np.diagonal(a).copy(), axes
+
+
+def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64:
+    """Adam's step (6,) at rate 1 along the axes of the gradients' second moments, at visit number `visit` (from 1); the
+    moments (6,) and (6, 6) change in place. docs/gradients.md, (143)."""
     first += (1 - BETA1) * (by - first)
-    second += (1 - BETA2) * (by**2 - second)
-    mean, square = first / (1 - BETA1**visit), second / (1 - BETA2**visit)
-    step: Float64 = -mean / (np.sqrt(square) + EPSILON)
+    second += (1 - BETA2) * (by[:, None] * by - second)
+    mean = first / (1 - BETA1**visit)
+    squares, axes = axes_of(second / (1 - BETA2**visit))
+    least = max(FLATTEST * squares.max(), TINY)
+    along = (axes * mean).sum(axis=1) / np.sqrt(np.maximum(squares, least))
+    step: Float64 = -(axes.T * along).sum(axis=1)
     return step
 
 
@@ -96,7 +125,7 @@ class Poses:
         distances = np.linalg.norm(places - places[0], axis=1)
         self.held = (0, int(distances.argmax()) or len(views) - 1)
         self._start = min(500, config.iterations // 10)
-        self._first, self._second = np.zeros((2, len(views), 6))
+        self._first, self._second = np.zeros((len(views), 6)), np.zeros((len(views), 6, 6))
         self._visits = np.zeros(len(views), np.int64)
 
     def moves(self, view: int, step: int) -> bool:
@@ -115,7 +144,7 @@ class Poses:
         if not np.isfinite(by).all():
             return
         self._visits[view] += 1
-        down = _descend(self._first[view], self._second[view], by, int(self._visits[view]))
+        down = descend(self._first[view], self._second[view], by, int(self._visits[view]))
         self.cameras[view] = self.cameras[view].moved(self.rate(step) * self._scale * down)
 
     def motions(self) -> tuple[Float64, Float64]:
@@ -186,7 +215,7 @@ def aligned(trainer: InTraining, view: View) -> Camera:
     photograph = np.ascontiguousarray(view.load_masked())
     kept, background = kept_pixels(photograph), np.array(background_colour(config.background), np.float32)
     room, scale = view_gradients(rasterizer.work, model), np.repeat([1.0, trainer.scene.extent], 3)
-    first, second = np.zeros(6), np.zeros(6)
+    first, second = np.zeros(6), np.zeros((6, 6))
     camera = best = view.camera
     least = np.inf
     for step in range(1, ALIGNING + 1):
@@ -198,5 +227,5 @@ def aligned(trainer: InTraining, view: View) -> Camera:
             best, least = camera, loss
         by = sums.gradient() * scale
         rate = fallen(np.radians(ALIGNED), step / ALIGNING, ALIGNING)
-        camera = camera.moved(rate * scale * _descend(first, second, by, step))
+        camera = camera.moved(rate * scale * descend(first, second, by, step))
     return best

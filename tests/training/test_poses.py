@@ -21,7 +21,7 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, View, load_scene
-from clsplat.training.poses import Poses, aligned
+from clsplat.training.poses import Poses, aligned, axes_of, descend
 from clsplat.training.trainer import Trainer
 
 CONFIG = short(iterations=40, refine_poses=True)
@@ -193,6 +193,33 @@ def test_rates_are_the_reach_in_all() -> None:
     assert not poses.moves(1, 500)
     assert poses.moves(1, 501)
     assert not poses.moves(0, 501)
+
+
+def test_axes_are_those_of_lapack() -> None:
+    rng = np.random.default_rng(0)
+    for scale in (1.0, 1e-12, 1e9):
+        rows = rng.standard_normal((6, 6)) * np.geomspace(1, 1e-5, 6)
+        matrix = scale * (rows @ rows.T)
+        values, axes = axes_of(matrix)
+        # what rounding is of the largest value
+        np.testing.assert_allclose(np.sort(values), np.linalg.eigvalsh(matrix), rtol=0, atol=1e-14 * values.max())
+        np.testing.assert_allclose(axes.T * values @ axes, matrix, rtol=0, atol=1e-14 * values.max())
+        np.testing.assert_allclose(axes @ axes.T, np.eye(6), rtol=0, atol=1e-14)
+    values, _ = axes_of(np.zeros((6, 6)))
+    assert not values.any()
+
+
+def test_steps_turn_with_the_axes() -> None:
+    """However the six motions are mixed, the step is the same motion; the first one has length 1."""
+    rng = np.random.default_rng(1)
+    turn, _ = np.linalg.qr(rng.standard_normal((6, 6)))
+    moments = [(np.zeros(6), np.zeros((6, 6))) for _ in range(2)]
+    for visit in range(1, 30):
+        by = rng.standard_normal(6) * [1, 2, 3, 0.1, 0.5, 30]
+        one, other = (descend(*own, given, visit) for own, given in zip(moments, (by, turn @ by), strict=True))
+        np.testing.assert_allclose(other, turn @ one, rtol=0, atol=1e-10)  # the axes' own rounding, times some hundred
+        assert visit > 1 or np.linalg.norm(one) == pytest.approx(1)
+    assert not descend(np.zeros(6), np.zeros((6, 6)), np.zeros(6), 1).any()
 
 
 def load_like(count: int) -> list[View]:
