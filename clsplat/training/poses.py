@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 from typing import Any, Protocol
 
 import numpy as np
@@ -31,7 +29,18 @@ from clsplat.training.step import GradientStep, StepProbe, StepRows, view_gradie
 BETA1, BETA2 = 0.9, 0.99
 FLATTEST, TINY = 1e-2, 1e-30
 """Least second moment along an axis: that part of the largest one, and what stands for nothing at all."""
-SWEEPS, ROUNDING = 8, 1e-16
+PAIRS = [
+    np.array(pairs)
+    for pairs in (
+        ((0, 2, 4), (1, 3, 5)),
+        ((0, 1, 3), (2, 4, 5)),
+        ((0, 1, 2), (3, 5, 4)),
+        ((0, 1, 2), (4, 3, 5)),
+        ((0, 1, 3), (5, 2, 4)),
+    )
+]
+"""The 15 pairs of six motions, three at a time."""
+SWEEPS, ROUNDING = 6, 1e-16
 """Of Jacobi's rotations: passes over all pairs, and what counts as zero beside the diagonal."""
 LEAST = 0.01
 """Part of the rate that is left at the last step."""
@@ -48,21 +57,18 @@ def fallen(reach: float, part: float, visits: float) -> float:
 
 
 def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
-    """Eigenvalues (n,) of a symmetric matrix (n, n), and the eigenvectors as rows, by cyclic Jacobi rotations (Golub
-    and Van Loan, section 8.5): LAPACK has other bits on another processor."""
-    a, axes = matrix.copy(), np.eye(len(matrix))
-    for _ in range(SWEEPS):
-        for p, q in combinations(range(len(a)), 2):
-            off = float(a[p, q])
-            if abs(off) <= ROUNDING * max(abs(float(a[p, p])), abs(float(a[q, q]))):
-                continue
-            half = (float(a[q, q]) - float(a[p, p])) / (2 * off)
-            tangent = math.copysign(1.0, half) / (abs(half) + math.sqrt(half * half + 1.0))
-            cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
-            sine = tangent * cosine
-            for rows in (a, a.T, axes):
-                one, other = rows[p].copy(), rows[q].copy()
-                rows[p], rows[q] = cosine * one - sine * other, sine * one + cosine * other
+    """Eigenvalues (6,) of a symmetric matrix (6, 6), and the eigenvectors as rows, by Jacobi rotations of three pairs
+    at a time (Golub and Van Loan, section 8.5): LAPACK has other bits on another processor."""
+    a, axes = matrix.copy(), np.eye(6)
+    for p, q in SWEEPS * PAIRS:
+        off, ends = a[p, q], (a[p, p], a[q, q])
+        turns = np.abs(off) > ROUNDING * np.maximum(*np.abs(ends))
+        half = (ends[1] - ends[0]) / np.where(turns, 2 * off, 1.0)
+        tangent = np.where(turns, np.copysign(1.0, half) / (np.abs(half) + np.sqrt(half * half + 1.0)), 0.0)
+        cosine = 1.0 / np.sqrt(tangent * tangent + 1.0)
+        cosine, sine = cosine[:, None], (tangent * cosine)[:, None]
+        for rows in (a, a.T, axes):
+            rows[p], rows[q] = cosine * rows[p] - sine * rows[q], sine * rows[p] + cosine * rows[q]
     return np.diagonal(a).copy(), axes
 
 
