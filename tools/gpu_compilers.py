@@ -98,6 +98,12 @@ def clang() -> str:
     return found
 
 
+def compilers() -> str:
+    """The versions of clang and ptxas, in words."""
+    version = re.search(r"clang version (\S+)", _run([clang(), "--version"]).stdout)
+    return f"clang {version[1] if version else CLANG}, ptxas {NVIDIA}"
+
+
 @cache
 def nvidia(name: str) -> str:
     """The path of ptxas or nvdisasm, in the cache folder; downloaded by pip where it is not. Raises NoCompilerError."""

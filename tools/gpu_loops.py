@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from gpu_assembly import CLASSES, Loop
 from gpu_compilers import Built
-from gpu_rules import BY_ITEM, BY_PAIR, Rule, Run
+from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, Rule, Run
 
 from clsplat.errors import ClsplatError
 
@@ -36,7 +36,7 @@ def rules_of(kernel: str) -> tuple[Rule, ...]:
     """The rules of a kernel. Raises UnknownLoopError."""
     if kernel not in BY_PAIR and kernel not in BY_ITEM:
         raise UnknownLoopError(f"{kernel}: no kernel of BY_PAIR or BY_ITEM in tools/gpu_rules.py")
-    return BY_PAIR.get(kernel) or BY_ITEM[kernel]
+    return (BY_PAIR.get(kernel) or BY_ITEM[kernel]) + EVERYWHERE
 
 
 def _same(one: Loop, other: Loop, lines: Sequence[str]) -> bool:
@@ -69,7 +69,7 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
     used: set[Rule] = set()
     once = _share(built.whole, lines, parts, run, used)
 
-    def visit(outer: Loop) -> None:
+    def visit(outer: Loop, outer_rounds: float) -> None:
         for loop in outer.inner:
             if loop.size <= 1 and not loop.inner:  # a jump to itself behind the end
                 continue
@@ -79,12 +79,13 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
                 continue
             used.update(matching)
             twins = [each for each in outer.inner if matching[0].opens(each, lines) and _same(each, loop, lines)]
-            factor = matching[0].rounds(run) / _unrolled(loop, matching[0], twins)
+            times = outer_rounds if matching[0].inner else 1
+            factor = times * matching[0].rounds(run) / _unrolled(loop, matching[0], twins)
             for kind, count in _share(loop, lines, parts, run, used).items():
                 rounds[kind] += factor * count  # type: ignore[assignment]
-            visit(loop)
+            visit(loop, factor)
 
-    visit(built.whole)
+    visit(built.whole, 1)
     if unknown:
         raise UnknownLoopError(
             f"{built.kernel} for {built.target} in groups of {run.items}: no rule of tools/gpu_rules.py, or more than "
@@ -95,11 +96,13 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
 
 def unused_rules(used: Mapping[str, Iterable[Rule]]) -> list[str]:
     """Rules that no loop has, in words. used: by kernel, those of its loops on every target and in every shape."""
+    found = {kernel: set(rules) for kernel, rules in used.items()}
+    somewhere = set().union(*found.values()).intersection(EVERYWHERE)
     return [
         f"{kernel}: no loop of it is that of the rule `{rule.text}` in tools/gpu_rules.py"
-        for kernel, rules in used.items()
+        for kernel, rules in found.items()
         for rule in rules_of(kernel)
-        if rule not in set(rules)
+        if rule not in rules | somewhere
     ]
 
 

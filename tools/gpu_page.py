@@ -61,7 +61,7 @@ def kernel_table(rows: Sequence[Any]) -> str:
     ]
     for row in rows:
         built = row.built
-        if (built.target, f"1x{row.source.items}") != (TARGET, SHAPE):
+        if (built.target, row.source.shape) != (TARGET, SHAPE):
             continue
         told = row.told()
         loops = [sum(loop["instructions"].values()) for loop in told["loops"]]
@@ -231,14 +231,37 @@ def fill_in(page: str, tables: Mapping[str, str]) -> str:
     return page
 
 
-def write_page(
-    rows: Sequence[Any], intel: Sequence[IntelBuilt], predictions: Predictions, frames: Sequence[Mapping[str, Any]]
-) -> None:
-    """Write the tables into the page, and the plot beside it. intel: empty leaves Intel's table as it is."""
+def _trained_and_picture(frames: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], str]:
+    """The frames of training, the largest last, and the name of the one that is drawn alone."""
     trained = [frame for frame in frames if not frame.get("picture")]
+    return trained, next(frame["name"] for frame in frames if frame.get("picture"))
+
+
+def missed_goals(predictions: Predictions, frames: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The goals that the predictions miss, in words."""
+    trained, picture = _trained_and_picture(frames)
+    largest = trained[-1]["name"]
+    step, shown = (sum(predictions[SHAPE, GPU, name].values(), Stage()).both for name in (largest, picture))
+    found = []
+    if step > WANTED:
+        found.append(f"{largest}, {SHAPE}, {GPU}: {step:.1f} ms a step predicted, expected at most {WANTED}")
+    if shown * FRAMES_WANTED > 1000:
+        found.append(f"{picture}, {SHAPE}, {GPU}: {1000 / shown:.0f} a second, expected at least {FRAMES_WANTED}")
+    return found
+
+
+def tables_of(
+    rows: Sequence[Any],
+    predictions: Predictions,
+    frames: Sequence[Mapping[str, Any]],
+    compilers: str,
+    intel: Sequence[IntelBuilt] = (),
+) -> dict[str, str]:
+    """The page's tables by name. compilers: their versions; intel: empty for no table of Intel's."""
+    trained, picture = _trained_and_picture(frames)
     names, largest = [frame["name"] for frame in trained], trained[-1]["name"]
-    picture = next(frame["name"] for frame in frames if frame.get("picture"))
     tables = {
+        "compilers": compilers,
         "kernels": kernel_table(rows),
         "pairs": pair_table(rows),
         "frames": frame_table(frames),
@@ -249,7 +272,20 @@ def write_page(
     }
     if intel:
         tables["intel"] = intel_table(intel)
+    return tables
+
+
+def stale_tables(page: str, tables: Mapping[str, str]) -> list[str]:
+    """The names of tables that are not the page's, or none where other compilers made it. Raises ClsplatError where the
+    page has no place for one."""
+    stale = [name for name, text in tables.items() if fill_in(page, {name: text}) != page]
+    return [] if "compilers" in stale else stale
+
+
+def write_page(tables: Mapping[str, str], predictions: Predictions, frames: Sequence[Mapping[str, Any]]) -> None:
+    """Write the tables into the page, and the plot beside it."""
     atomic_write(PAGE, fill_in(PAGE.read_text("utf-8"), tables).encode())
+    largest = _trained_and_picture(frames)[0][-1]["name"]
     bars = {
         gpu.name: {part: stage.both for part, stage in parts_of(predictions[SHAPE, gpu.name, largest]).items()}
         for gpu in GPUS

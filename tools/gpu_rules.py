@@ -107,6 +107,7 @@ class Rule:
     function: a part of the head of the function that the line is in, where others have such a line too.
     part: not a loop but a branch: the share of its loop's rounds in which a wave takes it; the line is inside.
     mark: instructions of a class that a round has, such as ("shared", 2): a loop with more is unrolled so many times.
+    inner: rounds are those for each round of the loop around it, not in all.
     """
 
     text: str
@@ -115,6 +116,7 @@ class Rule:
     function: str = ""
     part: bool = False
     mark: tuple[str, int] | None = None
+    inner: bool = False
 
     def matches(self, number: int, lines: Sequence[str]) -> bool:
         """True if the line of this number, from 1 on, is such a line."""
@@ -132,6 +134,17 @@ _HEADS = ("static ", "GROUP __kernel", "__kernel", "RARE ")
 """Beginnings of the head of a function."""
 
 
+EVERYWHERE: tuple[Rule, ...] = (
+    Rule(
+        "ROUNDS for (uint step = 1; step < ITEMS; step *= 2)",
+        lambda run: math.log2(run.items),
+        ends=("barrier(CLK_LOCAL_MEM_FENCE);",),
+        function=" group_exclusive_scan(",
+        mark=("shared", 3),
+        inner=True,
+    ),
+)
+"""Loops that any kernel may have, of functions that kernels share."""
 _BEFORE_PAIRS = (
     Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # pairs beyond
     Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile

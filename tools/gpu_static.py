@@ -12,10 +12,10 @@ every kernel, as `check_memory.py` builds them. clang 19 makes NVIDIA's and AMD'
 assembled by ptxas, of a package that pip fetches once into the cache folder. Division and sqrt are rounded correctly.
 
 Instructions for a pair of a tile and a Gaussian are those of all waves of a group, from its loops (`gpu_rules.py`).
---intel has a table of Intel's own compiler, which says less (`gpu_intel.py`). --check holds the ceilings below; --page
-writes docs/gpu-static.md, with the times that `gpu_model.py` predicts. Exit status 0: as expected, 1: a ceiling is
-broken, or a loop or a rule is without the other, or a compiler
-refuses a kernel, 2: a compiler is missing.
+--intel has a table of Intel's own compiler, which says less (`gpu_intel.py`). --page writes docs/gpu-static.md, with
+the times that `gpu_model.py` predicts; --check holds the ceilings below, the page's goals, and the page against what it
+would be now. Exit status 0: as expected, 1: a ceiling is broken or a goal is missed, the page is of older kernels, a
+loop or a rule is without the other, or a compiler refuses a kernel, 2: a compiler is missing.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from gpu_assembly import CLASSES
-from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, clang, compile_source, nvidia
+from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, clang, compile_source, compilers, nvidia
 from gpu_devices import ARCHITECTURES, GPUS, occupancy
 from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
 from gpu_model import Stage, predict
-from gpu_page import write_page
+from gpu_page import PAGE, Predictions, missed_goals, stale_tables, tables_of, write_page
 from gpu_rules import BY_PAIR, WALK, Rule, Run
 from measuring import reporting, require
 
@@ -51,6 +51,7 @@ WALKS = ("1x32g", "1x64g")
 """Shapes with another form of blending's gradient alone."""
 FRAMES = Path(__file__).with_name("gpu_frames.json")
 CHECKED = (("1x64", "1x32g"), ("sm_89", "gfx1100"))
+"""Shapes and targets of which the ceilings are held."""
 NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
 """Kernel files of which nothing may lie in stack memory or be spilled, on sm_89."""
 NO_SCRATCH = ("blend", "blend_grad")
@@ -237,7 +238,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--all", action="store_true", help="every kernel with every define, not a training step's")
     parser.add_argument("--loops", action="store_true", help="print the loops of each kernel")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--check", action="store_true", help="hold the ceilings")
+    parser.add_argument("--check", action="store_true", help="hold the ceilings, the goals and the page")
     parser.add_argument("--page", action="store_true", help="write the tables and the plot of docs/gpu-static.md")
     parser.add_argument("--intel", action="store_true", help="Intel's GPUs in place of --targets")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once")
@@ -246,8 +247,10 @@ def run(arguments: list[str]) -> int:
     trained = [frame for frame in frames if not frame.get("picture")]
     if options.page:
         return make_page(frames, options.jobs)
-    shapes = CHECKED[0] if options.check else options.shapes.split(",")
-    targets = CHECKED[1] if options.check else TARGETS if options.targets == "all" else options.targets.split(",")
+    if options.check:
+        return check(frames, options.jobs)
+    shapes = options.shapes.split(",")
+    targets = TARGETS if options.targets == "all" else options.targets.split(",")
     for shape in shapes:
         require(shape in SHAPES + WALKS, f"--shapes {shape}: expected one of {', '.join(SHAPES + WALKS)}")
     for target in targets:
@@ -256,9 +259,8 @@ def run(arguments: list[str]) -> int:
     rows: list[Row] = []
     for shape in shapes:
         asked = ask_package("all", shape) if options.all else ask_package("step", shape, trained[-1:])[0]
-        stems = ["blend_grad"] if options.check and shape in WALKS else wanted
         sources = {
-            source: kernels for source, kernels in sources_of(asked).items() if not stems or source.stem in stems
+            source: kernels for source, kernels in sources_of(asked).items() if not wanted or source.stem in wanted
         }
         if options.intel:
             built = compiled_for_intel(sources, options.jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
@@ -272,19 +274,37 @@ def run(arguments: list[str]) -> int:
     else:
         print("\n".join(loops_of(rows) if options.loops else table(rows)))
     for row in rows:
-        if row.unknown and not options.check:
+        if row.unknown:
             note(row.unknown)
-    if not options.check:
-        return 0
-    found = broken(rows)
-    print("\n".join(["", *(found or ["every ceiling holds"])]))
+    return 0
+
+
+def check(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
+    """Print the rows that have ceilings, and what is broken, missed or stale."""
+    rows, predictions = counted(frames, jobs)
+    shapes, targets = CHECKED
+    held = [row for row in rows if row.source.shape in shapes and row.built.target in targets]
+    found = broken(held) + missed_goals(predictions, frames)
+    tables = tables_of(rows, predictions, frames, compilers())
+    if stale := stale_tables(PAGE.read_text("utf-8"), tables):
+        found.append(f"{PAGE.name}: of older kernels in {', '.join(stale)}; python tools/gpu_static.py --page")
+    print("\n".join([*table(held), "", *(found or ["every ceiling holds, and the page is today's"])]))
     return int(bool(found))
 
 
 def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
-    """Count and predict everything, and write the page."""
+    """Count and predict everything, and write the page; without ocloc, Intel's table stays as it is."""
+    rows, predictions = counted(frames, jobs)
+    sources = dict.fromkeys(row.source for row in rows if row.source.stem in NO_STACK and not row.source.by_gaussian)
+    intel = compiled_for_intel(list(sources), jobs, note) if ocloc() else []
+    write_page(tables_of(rows, predictions, frames, compilers(), intel), predictions, frames)
+    return 0
+
+
+def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], Predictions]:
+    """The rows of a step's kernels in every shape for every target, and the stages of each frame on every GPU. Raises
+    UnknownLoopError for a loop without a rule and a rule without a loop."""
     rows: list[Row] = []
-    sources_for_intel: list[Source] = []
     used: dict[str, set[Rule]] = {}
     predictions: dict[tuple[str, str, str], dict[str, Stage]] = {}
     for shape in SHAPES:
@@ -294,20 +314,18 @@ def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
         rows += found
         for row in found:
             used.setdefault(row.built.kernel, set()).update(row.rules)
-        sources_for_intel += [source for source in sources if source.stem in NO_STACK]
         for gpu in GPUS:
             built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
             for frame, step in zip(frames, steps, strict=True):
                 predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
+    trained = [frame for frame in frames if not frame.get("picture")]
     for shape in WALKS:
-        sources = sources_of(ask_package("step", shape, frames[-1:])[0])
+        sources = sources_of(ask_package("step", shape, trained[-1:])[0])
         walks = {source: kernels for source, kernels in sources.items() if source.by_gaussian}
         rows += compiled(walks, TARGETS, jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
     if unused := unused_rules(used):
         raise UnknownLoopError("; ".join(unused))
-    intel = compiled_for_intel(sources_for_intel, jobs, note) if ocloc() else []
-    write_page(rows, intel, predictions, frames)
-    return 0
+    return rows, predictions
 
 
 def note(text: str) -> None:

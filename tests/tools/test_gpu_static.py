@@ -21,7 +21,7 @@ from gpu_devices import Gpu, occupancy, waves_at_a_time
 from gpu_intel import read_intel
 from gpu_loops import UnknownLoopError, cost_of, rules_of, unused_rules
 from gpu_model import Stage, predict
-from gpu_rules import BY_ITEM, BY_PAIR, WALK, Rule, Run
+from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, WALK, Rule, Run
 from gpu_static import FRAMES, MOST_A_PAIR, MOST_BY_GAUSSIAN, NO_STACK, Row, broken, sources_of
 
 from clsplat.device.source import kernel_root, kernel_source
@@ -263,6 +263,15 @@ def test_loops_of_one_rule(loops: tuple[Loop, ...], shared: float) -> None:
     assert cost.rounds["shared"] == shared
 
 
+def test_rounds_within_rounds() -> None:
+    lines = ["kernel", "for (outer)", "for (scan)", "for (scan)"]
+    rules = (Rule("for (outer)", lambda run: 3), Rule("for (scan)", lambda run: 5, inner=True, mark=("shared", 1)))
+    outer = loop_of(2, 0)
+    outer.inner.append(loop_of(3, 1))
+    cost = cost_of(built(Loop([], set(), [outer, loop_of(4, 1)])), lines, rules, Run(32))
+    assert cost.rounds["shared"] == 3 * 5 + 5  # in the loop, and behind it
+
+
 def test_a_line_of_one_function() -> None:
     lines = ["static inline float first(void) {", "  for (each)", "GROUP __kernel void second(void) {", "  for (each)"]
     rules = (
@@ -274,15 +283,18 @@ def test_a_line_of_one_function() -> None:
 
 
 def test_rules_that_no_loop_has_are_told() -> None:
-    used = {"scan_chunks": BY_ITEM["scan_chunks"][:1]}
+    used = {"scan_chunks": (*BY_ITEM["scan_chunks"][:1], *EVERYWHERE)}
     (told,) = unused_rules(used)
     assert told.startswith("scan_chunks: no loop of it is that of the rule `for (uint base = begin;")
-    assert unused_rules({"scan_chunks": BY_ITEM["scan_chunks"]}) == []
+    used = {"scan_chunks": (*BY_ITEM["scan_chunks"], *EVERYWHERE), "target": ()}
+    assert unused_rules(used) == []  # of a rule for every kernel, one has the loop
+    used["scan_chunks"] = BY_ITEM["scan_chunks"]
+    assert [told.partition(":")[0] for told in unused_rules(used)] == ["scan_chunks", "target"]
 
 
 def test_rules_are_of_lines_that_kernels_have() -> None:
     texts = {path.stem: kernel_source(path.stem).splitlines() for path in kernel_root().glob("*.cl")}
-    for kernel, rules in [*BY_PAIR.items(), *BY_ITEM.items(), ("blend_grad", WALK)]:
+    for kernel, rules in [*BY_PAIR.items(), *BY_ITEM.items(), ("blend_grad", WALK), ("scan_sums", EVERYWHERE)]:
         (lines,) = [text for text in texts.values() if any(re.match(rf"(.* )?{kernel}\(", line) for line in text)]
         for rule in rules:
             assert any(rule.matches(number, lines) for number in range(1, len(lines) + 1)), (kernel, rule.text)
@@ -333,6 +345,27 @@ def test_ceilings() -> None:
     assert len(broken([*good, row("blend", spills=4, target="gfx1100")])) == 1
     assert broken([*good, row("blend", unknown="a loop")]) == ["a loop"]
     assert "sort_radix: no kernel file of a step" in broken(good[:-1])[0]
+
+
+@pytest.mark.parametrize(("most", "told"), [(12, 0), (11.9, 2)])
+def test_goals(monkeypatch: pytest.MonkeyPatch, most: float, told: int) -> None:
+    monkeypatch.setattr(gpu_page, "WANTED", most)
+    monkeypatch.setattr(gpu_page, "FRAMES_WANTED", 1000 / most)
+    frames: list[dict[str, Any]] = [{"name": "small"}, {"name": "large"}, {"name": "drawn", "picture": True}]
+    stages = {"small": {"blend": Stage(100)}, "large": {"blend": Stage(5), "loss": Stage(3, 4)}}
+    predictions = {("1x64", "RTX 4090", name): each for name, each in {**stages, "drawn": stages["large"]}.items()}
+    missed = gpu_page.missed_goals(predictions, frames)
+    assert len(missed) == told
+    assert not told or missed[0] == "large, 1x64, RTX 4090: 12.0 ms a step predicted, expected at most 11.9"
+
+
+def test_a_page_of_older_kernels_is_told() -> None:
+    page = "<!-- compilers -->\nclang 1\n<!-- end -->\n<!-- kernels -->\n| 7 |\n<!-- end -->\n"
+    assert gpu_page.stale_tables(page, {"compilers": "clang 1", "kernels": "| 7 |"}) == []
+    assert gpu_page.stale_tables(page, {"compilers": "clang 1", "kernels": "| 8 |"}) == ["kernels"]
+    assert gpu_page.stale_tables(page, {"compilers": "clang 2", "kernels": "| 8 |"}) == []  # other compilers
+    with pytest.raises(ClsplatError, match="has no place for the table pairs"):
+        gpu_page.stale_tables(page, {"pairs": ""})
 
 
 def test_without_clang(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
