@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every table of docs/quality.md, from one command that can be interrupted: finished rows are kept by commit.
 
-    python tools/quality_table.py SCENES -o FOLDER [--only growth,antialiasing] [--seeds 2] [--iterations 7000]
-        [--resolution 0] [--list]
+    python tools/quality_table.py SCENES -o FOLDER [--only growth,antialiasing] [--rows 'fox *,bonsai mcmc*']
+        [--seeds 2] [--iterations 7000] [--resolution 0] [--list]
 
 SCENES has fox, banana, sceaux_castle, snowmiku, bonsai and lego_blender_400; a row whose scene is missing is left out,
 and said. Each training has a folder below FOLDER/COMMIT-ITERATIONS-RESOLUTION, in which it goes on where it stopped;
@@ -14,6 +14,7 @@ name: remove that folder after a further change.
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import json
 import subprocess
 import sys
@@ -62,6 +63,8 @@ HALVES = {
     "mcmc": ("--density.growth", "mcmc"),
 }
 """Rows of the growth table that get half of the Gaussians."""
+FEWEST = ("bonsai", 290_000)
+"""A scene whose mcmc is measured with this many Gaussians too, a third of what the short schedule ends with."""
 
 
 def growth_rows() -> list[Row]:
@@ -72,7 +75,9 @@ def growth_rows() -> list[Row]:
         ends = (f"{scene} default", f"{scene} short")
         for name, more in HALVES.items():
             rows.append(Row(f"{scene} {name}", scene, ("--schedule", "short", *more), half_of=ends))
-    return rows
+    scene, most = FEWEST
+    settings = ("--schedule", "short", *HALVES["mcmc"], "--density.max-gaussians", str(most))
+    return [*rows, Row(f"{scene} mcmc {most // 1000}k", scene, settings)]
 
 
 def antialiasing_rows() -> list[Row]:
@@ -207,6 +212,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--only", default=",".join(names), help=f"of {', '.join(names)}")
+    parser.add_argument("--rows", default="*", help="patterns of rows' names, and what these need")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--resolution", type=int, default=0)
@@ -217,6 +223,11 @@ def main(arguments: list[str]) -> int:
         known = ", ".join(names)
         print(f"quality_table: --only {unknown[0]}: no such table, expected some of {known}", file=sys.stderr)
         return 2
+    patterns = given.rows.split(",")
+    every = [row.name for name in wanted if name in TRAININGS for row in TRAININGS[name]()]
+    if strange := [each for each in patterns if each != "*" and not fnmatch.filter(every, each)]:
+        print(f"quality_table: --rows {strange[0]}: no such row; --list prints them", file=sys.stderr)
+        return 2
     text = ""
     folder = given.output / f"{commit()}-{given.iterations}-{given.resolution or 'full'}"
     book = None if given.list else Book(given.scenes, folder, given.seeds, given.iterations, given.resolution)
@@ -225,6 +236,8 @@ def main(arguments: list[str]) -> int:
         rows = TRAININGS[table]() if table in TRAININGS else []
         there = [row for row in rows if (given.scenes / row.scene).is_dir()]
         for row in rows:
+            if not any(fnmatch.fnmatchcase(row.name, pattern) for pattern in patterns):
+                continue
             if row not in there:
                 print(f"quality_table: {row.name} is left out: no {given.scenes / row.scene}", file=sys.stderr)
             elif book is None:
@@ -235,7 +248,7 @@ def main(arguments: list[str]) -> int:
             if table in TOOLS:
                 print(f"{table}: {' '.join(TOOLS[table])}")
             continue
-        body = book.printed(table) if table in TOOLS else "\n".join([header(there), *lines, ""]) if there else ""
+        body = book.printed(table) if table in TOOLS else "\n".join([header(there), *lines, ""]) if lines else ""
         text += f"## {table}\n\n{body}\n"
         atomic_write(book.folder / "quality.md", text.encode())
     print(text, end="")

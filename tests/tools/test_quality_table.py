@@ -80,3 +80,19 @@ def test_a_table_that_is_not_known(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_a_scene_that_is_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert quality_table.main([str(tmp_path), "-o", str(tmp_path / "work"), "--only", "antialiasing", "--list"]) == 0
     assert "lego is left out: no " in capsys.readouterr().err
+
+
+def test_only_the_rows_that_are_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(quality_table, "_clsplat", FakeClsplat())
+    for scene in quality_table.SCENES:
+        (tmp_path / scene).mkdir()
+    where = [str(tmp_path), "-o", str(tmp_path / "work"), "--only", "growth", "--seeds", "1"]
+    assert quality_table.main([*where, "--rows", "fox mcmc,bonsai mcmc ???k"]) == 0
+    rows = [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()[4:] if line]
+    assert rows == ["| fox mcmc", "| bonsai mcmc 290k"]
+    trained = {path.stem for path in (tmp_path / "work").rglob("*.json") if path.parent.name == "growth"}
+    assert trained == {"fox-default-0", "fox-short-0", "fox-mcmc-0", "bonsai-mcmc-290k-0"}  # and what they are half of
+    assert quality_table.main([*where, "--rows", "fax *"]) == 2
+    assert capsys.readouterr().err.endswith("--rows fax *: no such row; --list prints them\n")
