@@ -186,6 +186,11 @@ class Camera:
         """The same camera with another `cam_from_world`."""
         return replace(self, rotation=rotation, translation=translation)
 
+    def refocused(self, by: Float64) -> Camera:
+        """The same view through another lens: by (4,) is added to ln fx, ln fy, cx and cy."""
+        wider, higher = np.exp(np.asarray(by[:2], np.float64)).tolist()
+        return replace(self, fx=self.fx * wider, fy=self.fy * higher, cx=self.cx + by[2], cy=self.cy + by[3])
+
     def before(self, near: float) -> Camera:
         """The same view of a model whose near plane is at `near`: that counts unless the camera has its own."""
         return replace(self, near=near) if self.near == NEAR != near else self

@@ -1,12 +1,14 @@
-// The gradient by the camera's pose, from those by the model that the camera sees.
+// The gradient by the camera's pose, from those by the model that the camera sees, and sums of that by its lens.
 //
-// Owner: A work-item owns POSE_ROWS Gaussians (pose_rows), then as many of these sums (pose_sums), one behind the
-//   other. Built with one lane: its bits are those of any shape.
-// Launch: One work-item for each POSE_ROWS Gaussians, then for each six of as many sums, until one is left.
+// Owner: A work-item owns POSE_ROWS Gaussians (pose_rows, lens_rows), then as many of these sums (pose_sums), one
+//   behind the other. Built with one lane: its bits are those of any shape.
+// Launch: One work-item for each POSE_ROWS Gaussians, then for each of the `width` columns of as many sums, until one
+//   row is left.
 // Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3), and the gradients by
 //   means, by quaternions and by sh_dc (n, 3), of which the rows without tiles are not read -> sums
 //   (ceil(n / POSE_ROWS), 6), from first_block on: by the turn about the world's axes, then by the shift along them.
-// Equations: docs/gradients.md, (140) to (142).
+//   by_lens (n, 4) of project_grad.cl -> sums (ceil(n / POSE_ROWS), 4).
+// Equations: docs/gradients.md, (140) to (142), (144).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/sh.h"
@@ -57,11 +59,22 @@ __kernel void pose_rows(const uint n, const uint first_block, const int coeffici
   for (int k = 0; k < 3; ++k) own[k] = turn[k], own[3 + k] = shift[k];
 }
 
-// parts (count, 6) -> sums (ceil(count / POSE_ROWS), 6).
-__kernel void pose_sums(const uint count, __global const float *parts, __global float *sums) {
-  const uint item = get_global_id(0), block = item / 6, first = block * POSE_ROWS;
+__kernel void lens_rows(const uint n, const uint first_block, __global const uint *tile_counts,
+                        __global const float *by_lens, __global float *sums) {
+  const uint block = get_global_id(0), first = block * POSE_ROWS;
+  if (first >= n) return;
+  float own[4] = {0.0f, 0.0f, 0.0f, 0.0f};
+  for (size_t i = first; i < min(first + POSE_ROWS, n); ++i)
+    if (tile_counts[i] > 0)
+      for (int k = 0; k < 4; ++k) own[k] += by_lens[4 * i + k];
+  for (int k = 0; k < 4; ++k) sums[4 * (first_block + block) + k] = own[k];
+}
+
+// parts (count, width) -> sums (ceil(count / POSE_ROWS), width).
+__kernel void pose_sums(const uint count, const uint width, __global const float *parts, __global float *sums) {
+  const uint item = get_global_id(0), block = item / width, first = block * POSE_ROWS;
   if (first >= count) return;
   float sum = 0.0f;
-  for (size_t i = first; i < min(first + POSE_ROWS, count); ++i) sum += parts[6 * i + item % 6];
+  for (size_t i = first; i < min(first + POSE_ROWS, count); ++i) sum += parts[width * i + item % width];
   sums[item] = sum;
 }

@@ -9,14 +9,15 @@
 // Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE);
 //   tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project.cl -> screen (n, 2): of the
 //   mean on the image, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): what each adds to the image,
-//   sums of its blending weights over all pixels. project_grad: gradients of the parameters, of the same shapes, in
+//   sums of its blending weights over all pixels. With LENS by_lens (n, 4): what each says of the logs of the camera's
+//   focal lengths and of its principal point, per pixel. project_grad: gradients of the parameters, of the same shapes, in
 //   loss per unit of each. Rows of Gaussians that are not visible are left as they are. project_step, built with ADAM:
 //   the parameters and their moments `first` and `second`, of the same shapes; `readback` (READBACK_SIZE) counts, and
 //   the scalars are those of Step, one a group where they differ. The gradient of a Gaussian that is not visible is
 //   zero, or with SPARSE its row stays as it is. After a pass that has stopped (duplicate.cl) nothing changes. With
 //   PENALTIES the gradient has that of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
-// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91). With RAYS
-//   docs/cameras.md, (22) to (28); with ORTHOGRAPHIC (20).
+// Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
+//   (145). With RAYS docs/cameras.md, (22) to (28); with ORTHOGRAPHIC (20).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -86,6 +87,9 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
                                __global float *screen,
 #ifdef CONTRIBUTIONS
                                __global float *contributions,
+#endif
+#ifdef LENS
+                               __global float *by_lens,
 #endif
 #ifdef PENALTIES
                                const float opacity_weight, const float scale_weight,
@@ -214,6 +218,10 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 
   // (59) to (61): log scales, the turn in the Gaussian's own frame, and what the Jacobian takes of the gradient.
   floatL d_size = (floatL)(0.0f), along_u = d_size, along_v = d_size, turned[3];
+#ifdef LENS
+  Lanes lens[4];
+  lens[0].all = lens[1].all = d_size;
+#endif
   FOR_AXES(k) {
     const int l = (k + 1) % 3, n = (k + 2) % 3;
     const floatL nu = p.s[k] * wu[k], nv = p.s[k] * wv[k];
@@ -235,6 +243,10 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
     along_u = fmaL(tu, depth, along_u);
     along_v = fmaL(tv, depth, along_v);
+#ifdef LENS // (144): a focal length is a factor of a row of M
+    lens[0].all = fmaL(l11 * tu, p.s[k] * p.b1[k], lens[0].all);
+    lens[1].all = fmaL(fmaL(l12, tu, l22 * tv), p.s[k] * p.b2[k], lens[1].all);
+#endif
     const floatL apart = scale_difference(GATHER(log_scales, 3, l) - GATHER(log_scales, 3, n), p.s[l], p.s[n]);
     const floatL au = apart * wu[l], av = apart * wv[l], sum = p.s[l] + p.s[n];
     turned[k] = fmaL(fmaL(uu, au, uv * av), sum * wu[n], fmaL(uv, au, vv * av) * (sum * wv[n]));
@@ -267,6 +279,9 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   const float d_z = fma1(turn_x, p.t.e1[2], fma1(turn_y, p.t.e2[2], -(shrink * p.f[2])));
 #elif defined(ORTHOGRAPHIC) // the image is linear in x and y, and in nothing else
   const floatL d_x = p.jx * d_mx, d_y = p.jy * d_my, d_z = (floatL)(0.0f)LESS_NEAR(p.z);
+#ifdef LENS
+  const floatL beyond_x = (floatL)(0.0f), beyond_y = beyond_x;
+#endif
 #else
   // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, J moves with
   // z alone.
@@ -275,14 +290,27 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   const float hand = camera[CAMERA_HAND];
   const floatL by_j02 = fmaL(l11, along_u, -(hand * (p.jy / p.jx) * across_x));
   const floatL by_j12 = fmaL(l12, along_u, fmaL(l22, along_v, -(hand * (p.jx / p.jy) * across_y)));
+#else
+  const floatL by_j02 = l11 * along_u, by_j12 = fmaL(l12, along_u, l22 * along_v);
+#endif
   const floatL d_j02 = rx == p.rx ? by_j02 : (floatL)(0.0f);
   const floatL d_j12 = ry == p.ry ? by_j12 : (floatL)(0.0f);
-#else
-  const floatL d_j02 = rx == p.rx ? l11 * along_u : (floatL)(0.0f);
-  const floatL d_j12 = ry == p.ry ? fmaL(l12, along_u, l22 * along_v) : (floatL)(0.0f);
+#ifdef LENS // (145): a clamped ratio is a place on the image, which stays where it is
+  const floatL beyond_x = (by_j02 - d_j02) / p.z, beyond_y = (by_j12 - d_j12) / p.z;
 #endif
   const floatL d_x = p.jx * (d_mx - d_j02 / p.z), d_y = p.jy * (d_my - d_j12 / p.z);
   const floatL d_z = -fmaL(d_x, rx, fmaL(d_y, ry, d_size / p.z)) LESS_NEAR(p.z);
+#endif
+
+#ifdef LENS
+#ifdef COMPENSATED
+  lens[0].all += compensated ? m_g : (floatL)(0.0f);
+  lens[1].all += compensated ? m_g : (floatL)(0.0f);
+#endif
+  lens[0].all = fmaL(p.jx * p.x, d_mx, fmaL(p.jx * p.z * p.rx, beyond_x, lens[0].all));
+  lens[1].all = fmaL(p.jy * p.y, d_my, fmaL(p.jy * p.z * p.ry, beyond_y, lens[1].all));
+  lens[2].all = d_mx + beyond_x;
+  lens[3].all = d_my + beyond_y;
 #endif
 
   // Colour, (38) to (40): a channel that is clamped has no gradient; the basis depends on the mean through the view
@@ -348,6 +376,9 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #ifdef CONTRIBUTIONS
     contributions[i] = m[SLOT_WEIGHT].lane[lane];
 #endif
+#ifdef LENS
+    for (int k = 0; k < 4; ++k) by_lens[4 * i + k] = lens[k].lane[lane];
+#endif
   }
   return 1;
 }
@@ -357,10 +388,15 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #else
 #define WEIGHTS
 #endif
-#ifdef CONTRIBUTIONS
-#define VIEW_ARRAYS screen, contributions WEIGHTS
+#ifdef LENS
+#define LENS_ROWS , by_lens
 #else
-#define VIEW_ARRAYS screen WEIGHTS
+#define LENS_ROWS
+#endif
+#ifdef CONTRIBUTIONS
+#define VIEW_ARRAYS screen, contributions LENS_ROWS WEIGHTS
+#else
+#define VIEW_ARRAYS screen LENS_ROWS WEIGHTS
 #endif
 
 #ifndef ADAM
@@ -375,6 +411,10 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 #ifdef CONTRIBUTIONS
                            ,
                            __global float *contributions
+#endif
+#ifdef LENS
+                           ,
+                           __global float *by_lens
 #endif
 #ifdef PENALTIES
                            ,

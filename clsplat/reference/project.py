@@ -310,6 +310,52 @@ def colour_grad(
     return basis, d_value, (d_directions - directions * radial) / distances  # (38), (40)
 
 
+def _jacobian_grad(
+    geometry: _Geometry, camera: Camera, d_covariances: Float64, by_log_opacity: Float64 | None
+) -> tuple[Float64, Float64, Float64]:
+    """Eqs. (31), (32): dL/dM (N, 2, 3), the Gaussians' R S (N, 3, 3), dL/dJ (N, 2, 3). by_log_opacity (N,): where
+    opacities are compensated."""
+    gxx, gxy, gyy = d_covariances.T
+    d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
+    if by_log_opacity is not None:
+        d_covariance += _compensation_grad(geometry, by_log_opacity)
+    d_half = 2 * d_covariance @ geometry.half
+    factor = geometry.rotations * geometry.scales[:, None, :]
+    return d_half, factor, d_half @ (camera.rotation @ factor).transpose(0, 2, 1)
+
+
+def lens_grad(
+    means: Float64,
+    quaternions: Float64,
+    log_scales: Float64,
+    camera: Camera,
+    projected: Projected,
+    d_means2d: Float64,
+    d_covariances: Float64,
+    d_opacities: Float64,
+    *,
+    antialiased: bool = False,
+) -> Float64:
+    """Eqs. (144), (145): gradient (4,) by ln fx, ln fy, cx and cy of a flat camera. Arguments as of `project_grad`."""
+    assert camera.kind.flat
+    rows = np.flatnonzero(projected.visible)
+    geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
+    by_log_opacity = d_opacities[rows] * projected.opacities[rows] if antialiased else None
+    _, _, d_jacobian = _jacobian_grad(geometry, camera, d_covariances[rows], by_log_opacity)
+    perspective = camera.projection == "perspective"
+    z = geometry.p[:, 2] if perspective else np.ones(len(rows))
+    by_log_focal, by_centre = [], []
+    for axis, focal in enumerate((camera.fx, camera.fy)):
+        along, lean = d_jacobian[:, axis, axis], d_jacobian[:, axis, 2]
+        free = geometry.unclamped[:, axis]
+        places = focal * geometry.p[:, axis] / z * d_means2d[rows, axis]
+        follows = np.where(free, geometry.jacobian[:, axis, 2] * lean, 0.0)
+        by_log_focal.append((places + geometry.jacobian[:, axis, axis] * along + follows).sum())
+        beyond = np.where(~free & perspective, lean / z, 0.0)
+        by_centre.append((d_means2d[rows, axis] + beyond).sum())
+    return np.array([*by_log_focal, *by_centre])
+
+
 def project_grad(
     means: Float64,
     quaternions: Float64,
@@ -337,15 +383,8 @@ def project_grad(
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
     x, y, z = geometry.p.T
-
-    gxx, gxy, gyy = d_covariances[rows].T
-    d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
-    if antialiased:
-        d_covariance += _compensation_grad(geometry, d_opacities[rows] * projected.opacities[rows])
-    d_half = 2 * d_covariance @ geometry.half  # (31)
-
-    factor = geometry.rotations * geometry.scales[:, None, :]
-    d_jacobian = d_half @ (camera.rotation @ factor).transpose(0, 2, 1)  # (32)
+    by_log_opacity = d_opacities[rows] * projected.opacities[rows] if antialiased else None
+    d_half, factor, d_jacobian = _jacobian_grad(geometry, camera, d_covariances[rows], by_log_opacity)
     d_factor = (geometry.jacobian @ camera.rotation).transpose(0, 2, 1) @ d_half  # (32)
     d_log_scales = (d_factor * factor).sum(axis=1)  # (33)
     d_quaternions = quaternion_grad(quaternions[rows], d_factor * geometry.scales[:, None, :])

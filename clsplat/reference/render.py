@@ -14,7 +14,7 @@ from clsplat.camera import Camera
 from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.reference.blend import Blended, BlendGradients, blend, blend_grad
 from clsplat.reference.depth import nearness_grad
-from clsplat.reference.project import Projected, covariance_grad, project, project_grad
+from clsplat.reference.project import Projected, covariance_grad, lens_grad, project, project_grad
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -93,3 +93,24 @@ def render_grad(
     )
     by_parameter["means"] = by_parameter["means"] + nearness_grad(arrays["means"], camera, screen.nearness)
     return Gradients(**vars(screen), parameters=by_parameter, visible=projected.visible)
+
+
+def render_lens_grad(
+    gaussians: Gaussians, camera: Camera, d_image: Float64, background: Sequence[float] | Float64 = BLACK
+) -> Float64:
+    """Gradient (4,) of a loss with dL/dimage = d_image (H, W, 3) by the lens, as `Camera.refocused` changes it."""
+    arrays, camera = parameters(gaussians), camera.before(gaussians.near)
+    projected = project(**arrays, camera=camera, sh_degree=gaussians.sh_degree, antialiased=gaussians.antialiased)
+    screen = blend_grad(projected, camera.width, camera.height, background, d_image)
+    by_covariance = covariance_grad(projected.conics, screen.conics)
+    return lens_grad(
+        arrays["means"],
+        arrays["quaternions"],
+        arrays["log_scales"],
+        camera,
+        projected,
+        screen.means2d,
+        by_covariance,
+        screen.opacities,
+        antialiased=gaussians.antialiased,
+    )

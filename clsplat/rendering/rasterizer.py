@@ -242,12 +242,14 @@ class Rasterizer:
         gradients: DeviceGaussians,
         *,
         fields: SlotFields = PLAIN_SLOTS,
+        by_lens: DeviceArray | None = None,
     ) -> Screen:
-        """Fill the visible rows of `gradients`; returns what density control has of the view, as `fields` wants it."""
+        """Fill the visible rows of `gradients`, and of by_lens (`project_grad`); returns what density control has of
+        the view, as `fields` wants it."""
         slots = self.pair_gradients(frame, image_gradient, fields=fields)
         screen = self.screen(gaussians.count, fields)
         arrays = (gaussians, frame.camera_array, frame.projected, slots, gradients, screen)
-        project_grad(self.device_of(frame.camera), *arrays, fields=fields)
+        project_grad(self.device_of(frame.camera), *arrays, fields=fields, by_lens=by_lens)
         return screen
 
     def screen(self, count: int, fields: SlotFields) -> Screen:

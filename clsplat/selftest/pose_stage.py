@@ -1,18 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The self-test's stage of poses: the gradient by a camera's pose."""
+"""The self-test's stages of poses and lenses: the gradients by a camera's pose and by its lens."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from clsplat.device.buffers import DeviceArray, upload
 from clsplat.reference.pose import pose_gradient as reference
+from clsplat.reference.project import lens_grad
+from clsplat.reference.render import parameters
 from clsplat.selftest.harness import Array, Bench, Outcome
+from clsplat.selftest.made_up import MadeUpSlots
 from clsplat.selftest.scenes import evenly
-from clsplat.stages.device_gaussians import DeviceGaussians
-from clsplat.stages.pose import pose_gradient, pose_rows, sums_of
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
+from clsplat.stages.pose import LENS, lens_rows, pose_rows, sum_of, sums_of
+from clsplat.stages.project import Screen, project_grad
 
 MADE_UP = ("means", "quaternions", "sh_dc")
+ROOM = {"screen": 2, "by_lens": LENS}
 
 
 def of_pose(bench: Bench) -> Outcome:
@@ -29,7 +36,7 @@ def of_pose(bench: Bench) -> Outcome:
     def launch() -> DeviceArray:
         sums = sums_of(bench.work, model.count)
         pose_rows(device, model, bench.camera_array, bench.projected.tile_counts, gradients, sums)
-        return pose_gradient(device, bench.work, sums)
+        return sum_of(device, bench.work, sums)
 
     def take(sums: DeviceArray) -> list[Array]:
         return [sums.get()[0]]
@@ -43,3 +50,29 @@ def of_pose(bench: Bench) -> Outcome:
     wanted = reference(given["means"], given["quaternions"], given["sh"], bench.camera, degree, by)
     (got,) = outcome.arrays
     return outcome.compared({"turn": (got[:3], wanted[:3]), "shift": (got[3:], wanted[3:])})
+
+
+def of_lens(bench: Bench) -> Outcome:
+    """From slots that are made up."""
+    device, model, made = bench.device, bench.model, MadeUpSlots.of(bench)
+
+    def launch() -> DeviceArray:
+        gradients = allocate_gaussians(device, model.count, model.coefficients)
+        screen, by_lens = (
+            bench.work.array(name, (model.count, width)) for name, width in (("screen", 2), ("lens", LENS))
+        )
+        view = (bench.camera_array, bench.projected, made.slots, gradients, Screen(screen))
+        project_grad(device, model, *view, by_lens=by_lens)
+        sums = sums_of(bench.work, model.count, LENS)
+        lens_rows(device, bench.projected.tile_counts, by_lens, sums)
+        return sum_of(device, bench.work, sums)
+
+    def take(sums: DeviceArray) -> list[Array]:
+        return [sums.get()[0]]
+
+    _, outcome = bench.twice(launch, take)
+    given = parameters(bench.frozen.gaussians)
+    of_view: dict[str, Any] = {name: given[name] for name in ("means", "quaternions", "log_scales")}
+    wanted = lens_grad(camera=bench.camera, **of_view, **made.on_image(bench))
+    (got,) = outcome.arrays
+    return outcome.compared({"focal lengths": (got[:2], wanted[:2]), "principal point": (got[2:], wanted[2:])})

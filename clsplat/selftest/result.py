@@ -23,8 +23,10 @@ DEPTH = ("depth",)
 """Stages of known depths, which training needs where they are compared."""
 POSES = ("pose",)
 """Stages of poses, which training needs where they are refined."""
+LENSES = ("lens",)
+"""The same of lenses."""
 TRAINING = (*FORWARD, *BACKWARD)
-STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *MASKS, *BACKWARD, "appearance", "grid", *DEPTH, *POSES)
+STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *MASKS, *BACKWARD, "appearance", "grid", *DEPTH, *POSES, *LENSES)
 INDICES = ("project", "duplicate", "sort", "ranges")
 """Stages by whose counts and lists the next ones find their way."""
 
@@ -49,6 +51,7 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "grid": (1024, "227 found; as appearance"),
     "depth": (1024, "as blend_grad"),
     "pose": (1024, "as appearance; terms of either sign are added up"),
+    "lens": (1024, "19 found; as pose"),
 }
 """Ulp that a stage may be off, and why. Each bound is the error found where every operation is rounded as in IEEE 754,
 with room for a GPU whose divisions and roots are not. A wrong operation is off by thousands."""

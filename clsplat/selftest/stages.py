@@ -16,7 +16,7 @@ from clsplat.config.marking import MarkRules
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.launch import launch_items
-from clsplat.device.layout import READBACK, SLOT, SLOT_PLAIN, SPLAT, TILE
+from clsplat.device.layout import READBACK, SPLAT, TILE
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference import adam as reference_adam
 from clsplat.reference import blend as reference_blend
@@ -29,9 +29,10 @@ from clsplat.selftest.appearance_stage import of_appearance
 from clsplat.selftest.depth_stage import of_depth
 from clsplat.selftest.grid_stage import of_grid
 from clsplat.selftest.harness import WHITEN, Array, Bench, Outcome, cropped, joined
+from clsplat.selftest.made_up import COLOUR, MadeUpSlots, slot_sums
 from clsplat.selftest.mask_stages import MASKS
 from clsplat.selftest.picture_stages import PICTURES
-from clsplat.selftest.pose_stage import of_pose
+from clsplat.selftest.pose_stage import of_lens, of_pose
 from clsplat.selftest.scenes import evenly, keys, padded
 from clsplat.stages.adam import adam
 from clsplat.stages.blend import blend, blend_grad
@@ -39,12 +40,10 @@ from clsplat.stages.density import DensityStatistics, Marker, add_statistics, ne
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.duplicate import Pairs, count, duplicate
 from clsplat.stages.loss import loss
-from clsplat.stages.project import Projected, Screen, Slots, project, project_grad, project_step
+from clsplat.stages.project import Projected, Screen, project, project_grad, project_step
 from clsplat.stages.ranges import tile_lists
 from clsplat.stages.sort import bitonic_sort, radix_sort
 
-MOMENTS = slice(SLOT.index("G"), SLOT.index("GVV") + 1)
-COLOUR = slice(SLOT.index("RED"), SLOT.index("BLUE") + 1)
 """Fields of a slot."""
 
 
@@ -232,7 +231,7 @@ def _blend_grad(bench: Bench) -> Outcome:
 
     given = upload(device, planes)
     _, outcome = bench.twice(lambda: launch(given), lambda slots: [slots.get()])
-    got = _slot_sums(bench, launch(upload(device, exact)).get())
+    got = slot_sums(bench, launch(upload(device, exact)).get())
     background = bench.frozen.background.astype(np.float64)
     wanted = reference_blend.blend_grad(splats, camera.width, camera.height, background, _pixels(bench, exact))
     shown = splats.visible
@@ -244,15 +243,6 @@ def _blend_grad(bench: Bench) -> Outcome:
         "colour": (got[shown, COLOUR], wanted.colors[shown]),
     }
     return outcome.compared(parts)
-
-
-def _slot_sums(bench: Bench, slots: Array) -> Float64:
-    """(n, 9) sums of each Gaussian's slots in float64."""
-    sums = np.zeros((bench.model.count, SLOT_PLAIN))
-    np.add.at(
-        sums, bench.lists.gaussian_from_sorted.get(), slots[bench.lists.slot_from_sorted.get()].astype(np.float64)
-    )
-    return sums
 
 
 def _moments(splats: reference_project.Projected, wanted: reference_blend.BlendGradients) -> Float64:
@@ -272,14 +262,12 @@ def _project_grad(bench: Bench) -> Outcome:
     here."""
     device, n = bench.device, bench.model.count
     coefficients = bench.model.coefficients
-    values = evenly(33, (bench.counted.pairs, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)
-    slots = Slots(upload(device, values), bench.counted.first_slots)
-    visible = bench.visible
+    made, visible = MadeUpSlots.of(bench), bench.visible
 
     def launch() -> tuple[DeviceGaussians, Screen]:
         gradients = allocate_gaussians(device, n, coefficients, zero=True)
         screen = Screen(bench.work.array("screen", (n, 2)))
-        project_grad(device, bench.model, bench.camera_array, bench.projected, slots, gradients, screen)
+        project_grad(device, bench.model, bench.camera_array, bench.projected, made.slots, gradients, screen)
         return gradients, screen
 
     def take(results: tuple[DeviceGaussians, Screen]) -> list[Array]:
@@ -287,33 +275,15 @@ def _project_grad(bench: Bench) -> Outcome:
 
     _, outcome = bench.twice(launch, take)
     *by_group, on_image = outcome.arrays
-    sums = _slot_sums(bench, values)
-    splats = bench.splats()
-    l11, l12, l22 = (WHITEN * splats.whitening).T
-    _, u, v, uu, uv, vv = sums[:, MOMENTS].T
-    d_means = -np.stack([l11 * u, l12 * u + l22 * v], axis=1) / WHITEN**2
-    half = 0.5 / WHITEN**4
-    entries = [l11 * l11 * uu, l11 * (l12 * uu + l22 * uv), l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv]
-    d_covariances = half * np.stack(entries, axis=1)
-    model = parameters(bench.frozen.gaussians)
-    degree = bench.frozen.gaussians.sh_degree
-    true = reference_project.project(**model, camera=bench.camera, sh_degree=degree, antialiased=False)
-    wanted = reference_project.project_grad(
-        **model,
-        camera=bench.camera,
-        sh_degree=degree,
-        antialiased=False,
-        projected=true,
-        d_means2d=d_means,
-        d_covariances=d_covariances,
-        d_opacities=sums[:, SLOT.index("G")] / np.where(visible, true.opacities, 1.0),
-        d_colors=sums[:, COLOUR],
-    )
+    of_view: dict[str, Any] = {"camera": bench.camera, "sh_degree": bench.frozen.gaussians.sh_degree}
+    of_view |= {**made.on_image(bench), "d_colors": made.sums[:, COLOUR]}
+    of_view |= parameters(bench.frozen.gaussians)
+    wanted = reference_project.project_grad(**of_view)
     got = dict(zip(GROUPS, by_group, strict=True))
     parts = {name: (got[name][visible], wanted[name][visible]) for name in got if name in wanted}
     sh = np.concatenate([got["sh_dc"][:, None], got["sh_rest"]], axis=1)
     parts["SH"] = (sh[visible], wanted["sh"][visible])
-    parts["means on the image"] = (on_image, d_means[visible])
+    parts["means on the image"] = (on_image, made.d_means(bench)[visible])
     return outcome.compared(parts)
 
 
@@ -372,9 +342,7 @@ def _steps_off(bench: Bench, config: OptimiserConfig, made: Mapping[str, Mapping
     """Elements of the model that `project_step` moves otherwise than Adam in float64 by the gradients of
     `project_grad`."""
     device, step, (n, coefficients) = bench.device, 7, (bench.model.count, bench.model.coefficients)
-    values = evenly(33, (bench.counted.pairs, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)
-    slots = Slots(upload(device, values), bench.counted.first_slots)
-    view = (bench.camera_array, bench.projected, slots)
+    view = (bench.camera_array, bench.projected, MadeUpSlots.of(bench).slots)
     gradients, screen = (
         allocate_gaussians(device, n, coefficients, zero=True),
         Screen(bench.work.array("screen", (n, 2))),
@@ -457,4 +425,5 @@ RUN: dict[str, Callable[[Bench], Outcome]] = {
     "grid": of_grid,
     "depth": of_depth,
     "pose": of_pose,
+    "lens": of_lens,
 }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches pose.cl: the gradient by the pose of the camera that a step's view has."""
+"""Launches pose.cl: the gradient by the pose and the lens of the camera that a step's view has."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ from clsplat.device.layout import POSE_ROWS
 from clsplat.device.profile import stage
 from clsplat.stages.device_gaussians import DeviceGaussians
 
+POSE, LENS = 6, 4
+"""Numbers of a pose: a turn and a shift; and of a lens: logs of its focal lengths, and its principal point."""
 
-def sums_of(work: Workspace, count: int) -> DeviceArray:
-    """Room for the sums of `count` Gaussians: `pose_rows` fills it, with one row for each POSE_ROWS of them."""
-    return work.array("pose_rows", (-(-count // POSE_ROWS), 6))
+
+def sums_of(work: Workspace, count: int, numbers: int = POSE) -> DeviceArray:
+    """Room for the sums of `count` Gaussians by a pose or by a lens: `pose_rows` or `lens_rows` fills it, with one row
+    for each POSE_ROWS of them."""
+    return work.array(f"rows_of_{numbers}", (-(-count // POSE_ROWS), numbers))
 
 
 @stage("pose")
@@ -44,12 +48,23 @@ def pose_rows(
 
 
 @stage("pose")
-def pose_gradient(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
-    """The sum (1, 6) of all sums (m, 6): by the turn and the shift of `Camera.moved`."""
-    kernel, level = device.kernels("pose", LANES=1).pose_sums, 0
+def lens_rows(
+    device: Device, tile_counts: DeviceArray, by_lens: DeviceArray, sums: DeviceArray, first_row: int = 0
+) -> None:
+    """The same of these Gaussians' own gradients (n, LENS) by the lens (`project_grad`), in `sums`."""
+    (n,) = tile_counts.shape
+    kernel = device.kernels("pose", LANES=1).lens_rows
+    launch_items(device, kernel, -(-n // POSE_ROWS), n, first_row // POSE_ROWS, tile_counts, by_lens, sums)
+
+
+@stage("pose")
+def sum_of(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
+    """The sum (1, numbers) of all sums (m, numbers): by the turn and the shift of `Camera.moved`, or by the lens as
+    `Camera.refocused` has it."""
+    kernel, numbers, level = device.kernels("pose", LANES=1).pose_sums, sums.shape[1], 0
     while sums.shape[0] > 1:
         level += 1
-        fewer = work.array(f"pose_sums_{level}", (-(-sums.shape[0] // POSE_ROWS), 6))
-        launch_items(device, kernel, fewer.size, sums.shape[0], sums, fewer)
+        fewer = work.array(f"sums_of_{numbers}_{level}", (-(-sums.shape[0] // POSE_ROWS), numbers))
+        launch_items(device, kernel, fewer.size, sums.shape[0], numbers, sums, fewer)
         sums = fewer
     return sums

@@ -166,12 +166,15 @@ def project_grad(
     fields: SlotFields = PLAIN_SLOTS,
     sh_rest: bool = True,
     explore: Exploration | None = None,
+    by_lens: DeviceArray | None = None,
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` from the pairs' slots,
-    which have `fields`; explore: its penalties are added."""
+    which have `fields`; explore: its penalties are added; by_lens (n, 4): gets what each says of the lens of a flat
+    camera."""
     weights, build = penalty_weights(explore), _build(device)
     defines = {**_defines(gaussians, slots, fields, sh_rest=sh_rest), **build.defines}
     defines |= {"PENALTIES": True} if weights else {}
+    defines |= {} if by_lens is None else {"LENS": True}
     n = gaussians.count
     launch_items(
         device,
@@ -181,6 +184,7 @@ def project_grad(
         *(model[group] for model in (gaussians, gradients) for group in GROUPS),
         screen.gradients,
         *([screen.contributions] if fields.contributions else []),
+        *([] if by_lens is None else [by_lens]),
         *weights,
     )
 

@@ -22,7 +22,7 @@ from clsplat.images.alpha import background_colour
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.scenes.scene import Scene, View
 from clsplat.stages.device_gaussians import AnyGaussians
-from clsplat.stages.pose import pose_gradient, pose_rows, sums_of
+from clsplat.stages.pose import pose_rows, sum_of, sums_of
 from clsplat.training.photographs import kept_pixels
 from clsplat.training.step import GradientStep, StepProbe, StepRows, view_gradients
 
@@ -99,7 +99,7 @@ class PoseSums:
         if self._begun is None:
             self._begun = rows.device, sums_of(self.work, self.count)
             with only_tried(rows.device):
-                pose_gradient(rows.device, self.work, self._begun[1])
+                sum_of(rows.device, self.work, self._begun[1])
         of_view = (rows.camera_array, rows.projected.tile_counts, rows.gradients)
         pose_rows(rows.device, rows.parameters, *of_view, self._begun[1], rows.start)
 
@@ -107,7 +107,7 @@ class PoseSums:
         """The gradient (6,) by the motion of `Camera.moved`; waits for the device."""
         assert self._begun is not None, "a model has rows"
         device, sums = self._begun
-        found: Float64 = pose_gradient(device, self.work, sums).get()[0].astype(np.float64)
+        found: Float64 = sum_of(device, self.work, sums).get()[0].astype(np.float64)
         return found
 
 

@@ -82,6 +82,8 @@ BROKEN = {
     "appearance: moved[i] - 3.0f * sum": ("moved[i] + 3.0f * sum", "appearance"),
     "pose: uy * by[2] - uz * by[1]": ("uy * by[2] + uz * by[1]", "pose"),
     "pose: 0.5f * (fma1(q[0], g[3]": ("0.25f * (fma1(q[0], g[3]", "pose"),
+    "pose: own[k] += by_lens[4 * i + k]": ("own[k] -= by_lens[4 * i + k]", "lens"),
+    "project_grad: lens[2].all = d_mx": ("lens[2].all = d_my", "lens"),
     "grid: risen[k] = b - a": ("risen[k] = a - b", "grid"),
     "grid: h * (level - (float)l)": ("h * level", "grid"),
 }

@@ -21,7 +21,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference import every_pixel
 from clsplat.reference.pose import pose_gradient as reference
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
-from clsplat.stages.pose import pose_gradient, pose_rows, sums_of
+from clsplat.stages.pose import pose_rows, sum_of, sums_of
 
 STEP = 1e-6
 BAND = 3e-4
@@ -54,7 +54,7 @@ def on_device(pipeline: Pipeline, d_image: np.ndarray) -> np.ndarray:
     sums, device = sums_of(rasterizer.work, model.count), rasterizer.device_of(pipeline.camera)
     sums.fill(np.nan)
     pose_rows(device, model, frame.camera_array, frame.projected.tile_counts, gradients, sums)
-    return pose_gradient(device, rasterizer.work, sums).get()[0]
+    return sum_of(device, rasterizer.work, sums).get()[0]
 
 
 @pytest.mark.parametrize("name", ["perspective", *CAMERAS])
@@ -101,7 +101,7 @@ def test_sums_at_the_seams(shaped_device: Device, count: int) -> None:
     work, counts = Workspace(shaped_device), upload(shaped_device, seen.astype(np.uint32))
     sums = sums_of(work, count)
     pose_rows(shaped_device, model, pipeline.frame.camera_array, counts, gradients, sums)
-    got = pose_gradient(shaped_device, work, sums).get()[0]
+    got = sum_of(shaped_device, work, sums).get()[0]
     arrays = {name: np.asarray(values, np.float64)[seen] for name, values in gaussians.arrays().items()}
     wide = {name: values[seen].astype(np.float64) for name, values in by.items()}
     wanted = reference(arrays["means"], arrays["quaternions"], arrays["sh"], camera, gaussians.sh_degree, wide)
@@ -118,7 +118,7 @@ def test_every_shape_has_the_same_bits(device: Device) -> None:
         model, sums = upload_gaussians(other, gaussians), sums_of(work, 300)
         camera_array = upload(other, pipeline.frame.camera_array.get())
         pose_rows(other, model, camera_array, ones, model, sums)
-        found.append(pose_gradient(other, work, sums).get())
+        found.append(sum_of(other, work, sums).get())
     assert_same_bits(found[0], found[1])
 
 
