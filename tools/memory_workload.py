@@ -195,7 +195,14 @@ def methods(device: Device) -> None:
     _train(device, replace(short, appearance="grid"), 3, VIEW)
     _train(device, replace(short, masks="transparent"), 5, VIEW)
     # One view is not held; sums of more than POSE_ROWS Gaussians take two kernels.
-    _train(device, replace(short, refine_poses=True, iterations=3), 3, VIEW, views=3, count=POSE_ROWS + 1)
+    _train(
+        device,
+        replace(short, refine_poses=True, refine_lenses=True, iterations=3),
+        3,
+        VIEW,
+        views=3,
+        count=POSE_ROWS + 1,
+    )
     _train(device, replace(short, depth="points"), 3, VIEW)
     edges = replace(PAPER.density, growth="budget", max_gaussians=60, long_axis=True, edge_views=1)
     _train(device, replace(short, thinning=0.3, density=edges), 3, VIEW)

@@ -2,14 +2,16 @@
 """A fisheye capture of 190 degrees against pinhole photographs of the same scene, each trained as it is.
 
     .venv/bin/python tools/quality_fisheye.py FOLDER [--iterations 2000] [--photos 40] [--width 120] [--seed 0]
-        [--threshold 1]
+        [--threshold 1] [--finer 1]
 
 Both captures are made by the demo's ray caster from the same places: one through Kannala and Brandt's lens, one through
-a pinhole with as many pixels a radian on the axis. Both models are measured on the same held-out pinhole pictures, and
-on those pixels alone that a fisheye has too, which is all. Writes FOLDER/fisheye, FOLDER/pinhole and FOLDER/views.png:
-truth, fisheye's model, pinhole's, and the fisheye's own held-out picture. The loss is a mean over pixels, and density
-control counts in half images: in a fisheye's larger picture the same blur has a smaller gradient, and fewer Gaussians
-grow; --threshold makes up for it. The last line is what the fisheye loses, dB.
+a pinhole with as many pixels a radian on the axis, or --finer times fewer. Both models are measured on the same
+held-out pinhole pictures, and on those pixels alone that a fisheye has too, which is all; then on the inner and the
+outer half of them, where a pinhole has up to 1 / cos^3 of the angle as many pixels for the same part of the scene.
+Writes FOLDER/fisheye and FOLDER/pinhole, each with model.ply, which is taken again where it is there, and
+FOLDER/views.png: truth, fisheye's model, pinhole's, and the fisheye's own held-out picture. The loss is a mean over
+pixels, and density control counts in half images: in a fisheye's larger picture the same blur has a smaller gradient,
+and fewer Gaussians grow; --threshold makes up for it.
 """
 
 from __future__ import annotations
@@ -108,9 +110,13 @@ def write_scene(folder: Path, surfaces: list[Surface], views: list[Camera]) -> P
 
 
 def trained(folder: Path, config: TrainConfig, device: Device) -> Gaussians:
-    """The model of a scene, trained through its own lens."""
+    """The model of a scene, trained through its own lens, or the one that is there."""
     scene = load_scene(folder, lenses="native", test_every=HELD_OUT)
+    path = folder / "model.ply"
+    if path.exists():
+        return Gaussians.load(path)
     model = train(scene, config, device=device)
+    model.save(path)
     print(f"{folder.name}: {len(scene.train_views)} photographs, {len(model):,} Gaussians", flush=True)
     return model
 
@@ -125,12 +131,12 @@ def main() -> None:
     parser.add_argument(
         "--threshold", type=float, default=1.0, help="factor of the fisheye's threshold of density control"
     )
+    parser.add_argument("--finer", type=float, default=1.0, help="factor of the fisheye's pixels a radian")
     options = parser.parse_args()
     surfaces = still_life()
     bake(surfaces, options.seed)
     pinholes = cameras(options.photos, options.width, options.width * 3 // 4, options.seed)
-    # as many pixels a radian on the axis
-    side = round(fisheye_of(pinholes[0], 1000).fx ** -1 * 1000 * pinholes[0].fx)
+    side = round(options.finer * pinholes[0].fx * 1000 / fisheye_of(pinholes[0], 1000).fx)
     fisheyes = [fisheye_of(camera, side) for camera in pinholes]
     device, config = open_device(), TrainConfig(iterations=options.iterations, seed=options.seed, report=False)
     renderer, models = Renderer(device), {}
@@ -139,13 +145,18 @@ def main() -> None:
         density = replace(config.density, gradient_threshold=factor * config.density.gradient_threshold)
         own_config = replace(config, density=density)
         models[name] = trained(write_scene(options.folder / name, surfaces, views), own_config, device)
-    scores: dict[str, list[float]] = {name: [] for name in models}
+    one = pinholes[0]
+    across, down = (np.abs(np.arange(size) + 0.5 - size / 2) for size in (one.width, one.height))
+    away = np.hypot(*np.meshgrid(across, down))
+    parts = {"whole": away >= 0, "inner half": away <= np.median(away), "outer half": away > np.median(away)}
+    scores: dict[tuple[str, str], list[float]] = {(name, part): [] for name in models for part in parts}
     rows = []
     for index in range(0, options.photos, HELD_OUT):
         truth = photograph(surfaces, pinholes[index])
         found = {name: renderer.render(model, pinholes[index]).image for name, model in models.items()}
         for name, image in found.items():
-            scores[name].append(psnr(image, truth))
+            for part, where in parts.items():
+                scores[name, part].append(psnr(image[:, :, :3], truth, where))
         own = renderer.render(models["fisheye"], fisheyes[index]).image[:, :, :3]
         crop = own[(side - truth.shape[0]) // 2 :, (side - truth.shape[1]) // 2 :][: truth.shape[0], : truth.shape[1]]
         whole = own[:: -(-side // truth.shape[0]), :: -(-side // truth.shape[0])]
@@ -153,11 +164,12 @@ def main() -> None:
         shown[: whole.shape[0]] = whole
         rows.append(np.concatenate([truth, *found.values(), crop, shown], axis=1))
     write_image(options.folder / "views.png", np.clip(np.concatenate(rows), 0, 1).astype(np.float32))
-    means = {name: float(np.mean(values)) for name, values in scores.items()}
-    print(
-        f"PSNR on the pinhole's held-out pictures: {', '.join(f'{name} {value:.2f}' for name, value in means.items())}"
-    )
-    print(f"{means['pinhole'] - means['fisheye']:+.2f} dB lost by the fisheye")
+    means = {key: float(np.mean(values)) for key, values in scores.items()}
+    for part in reversed(parts):
+        pair = means["fisheye", part], means["pinhole", part]
+        print(
+            f"{part}: fisheye {pair[0]:.2f}, pinhole {pair[1]:.2f} dB, {pair[1] - pair[0]:+.2f} dB lost by the fisheye"
+        )
 
 
 if __name__ == "__main__":

@@ -26,7 +26,8 @@ from clsplat.evaluation.held_out import evaluate
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, View, load_scene
-from clsplat.training.poses import Poses, aligned
+from clsplat.training.cameras import aligned
+from clsplat.training.poses import Poses
 from clsplat.training.trainer import Trainer
 
 
@@ -93,7 +94,7 @@ def main() -> None:
 
             numbers = {"step": trainer.step, "gaussians": trainer.parameters.count, "seconds": None}
             means.append(evaluate(draw, subject.test_views, background, **numbers)["mean"]["psnr"])
-        degrees, shift = errors(trainer.poses.cameras, true)
+        degrees, shift = errors(trainer.cameras.poses.cameras, true)
         print(f"{name:15} {degrees:8.3f} {100 * shift / extent:12.3f} {means[0]:9.2f} {means[1]:13.2f}", flush=True)
         trainer.close()
 

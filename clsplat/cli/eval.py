@@ -63,6 +63,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
     from clsplat.report.page import write_last
     from clsplat.runs import scene_record
     from clsplat.runs.appearance import gains_of_run
+    from clsplat.runs.refined import through_refined
     from clsplat.runs.run import model_file, run_of
     from clsplat.scenes import doubts
     from clsplat.selftest.result import FORWARD
@@ -80,7 +81,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
     test_every = config.test_every if verb.test_every is None else verb.test_every
     device = verb.device.open(services)
     scene = load_scene(services, source, resolution, test_every, config.mask_use, config.lenses)
-    views = [view for view in scene.views if view.split == "test"]
+    views = through_refined([view for view in scene.views if view.split == "test"], trained)
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {test_every}")
     device = services.require(device, FORWARD)

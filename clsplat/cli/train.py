@@ -110,7 +110,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
-    from clsplat.selftest.result import APPEARANCE, DEPTH, MASKS, POSES, TRAINING
+    from clsplat.selftest.result import APPEARANCE, DEPTH, LENSES, MASKS, POSES, TRAINING
 
     verb.device.check()
     verb.config.check()
@@ -146,6 +146,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         *APPEARANCE[config.appearance],
         *(DEPTH if config.depth_use else ()),
         *(POSES if config.refine_poses else ()),
+        *(LENSES if config.refine_lenses else ()),
     )
     devices = [services.require(device, stages) for device in devices]
     verb.output.mkdir(parents=True, exist_ok=True)

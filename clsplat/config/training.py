@@ -306,6 +306,11 @@ class TrainConfig:
     pose_reach: float = 5.0
     """Degrees by which a refined pose can turn in a training, about; it can move by as many 57ths of the scene's
     extent."""
+    refine_lenses: bool = False
+    """Refine focal lengths and principal points with the model, those of photographs that share a lens together. The
+    run's refined/ gets them. For photographs without distortion; not with batches."""
+    lens_reach: float = 2.0
+    """Hundredths of the focal length by which it, or the principal point, can change in a training, about."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -319,6 +324,7 @@ class TrainConfig:
             (("thinning",), lambda value: 0 <= value <= 0.9, "0 to 0.9"),
             (("alpha_weight", "depth_weight"), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("pose_reach",), lambda value: 0 < value <= 30, "over 0 and at most 30 degrees"),
+            (("lens_reach",), lambda value: 0 < value <= 50, "over 0 and at most 50 hundredths"),
             (("depth_unit",), lambda value: 0 < value < inf, "a finite number, more than 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
             (("points_limit",), lambda value: value >= 1, "at least 1"),
@@ -345,15 +351,24 @@ class TrainConfig:
             raise InputError(
                 f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
             )
-        if self.refine_poses and self.batch > 1:
+        if self.refines and self.batch > 1:
             raise InputError(
-                f"--refine-poses: not with --batch {self.batch}, nor with several devices; expected one view a step"
+                f"{self._refining}: not with --batch {self.batch}, nor with several devices; expected one view a step"
             )
         if self.depth != "maps" and self.depth_maps != "metric":
             raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
+
+    @property
+    def refines(self) -> bool:
+        """True if cameras are refined."""
+        return self.refine_poses or self.refine_lenses
+
+    @property
+    def _refining(self) -> str:
+        return "--refine-poses" if self.refine_poses else "--refine-lenses"
 
     @property
     def mask_use(self) -> MaskUse:
@@ -383,8 +398,8 @@ class TrainConfig:
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
         """The settings for `count` devices: a batch of a view for each, unless it is told. Raises InputError for a
         batch that they cannot share evenly."""
-        if self.refine_poses and count > 1:
-            raise InputError(f"--refine-poses: not with {count} devices, expected one")
+        if self.refines and count > 1:
+            raise InputError(f"{self._refining}: not with {count} devices, expected one")
         if self.batch == 1 and not explicit:
             return replace(self, batch=count)
         if self.batch % count:

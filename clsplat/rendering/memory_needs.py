@@ -12,7 +12,7 @@ from clsplat.device.context import Device
 from clsplat.device.layout import POSE_ROWS, TILE, SlotFields
 from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_plan import Need, Plan, plan
-from clsplat.stages import blend, density, duplicate, loss, project, ranges, sampling, target
+from clsplat.stages import blend, density, duplicate, loss, pose, project, ranges, sampling, target
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.duplicate import MAX_PAIRS
 from clsplat.stages.sort import scratch_bytes
@@ -57,12 +57,13 @@ def plan_step(
     antialiased: bool = False,
     models: int = _MODELS,
     masks: bool = False,
+    lens: bool = False,
     further: int = 0,
 ) -> Plan:
     """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
     photographs: pixels of all that may stay on the device; turns: of `loss`; antialiased: of the model; models: arrays
     for each parameter, where they are not those of a step of one view; masks: photographs have masks, or an alpha loss;
-    further: bytes of a pixel in further planes. Raises CapacityError."""
+    lens: gradients by the lens are wanted; further: bytes of a pixel in further planes. Raises CapacityError."""
     planes, extra = 0, masks * (target.MASK_BYTES + loss.ALPHA_PIXEL_BYTES + turns)
     for camera in cameras:
         pixels = _plane_bytes(camera, _pixel_bytes(planes=further) + target.PIXEL_BYTES + loss.PIXEL_BYTES + extra)
@@ -76,7 +77,8 @@ def plan_step(
         + screen
         + statistics
         + (_SHOWN if models > _MODELS else 0)
-        + sampling.GAUSSIAN_BYTES * antialiased,
+        + sampling.GAUSSIAN_BYTES * antialiased
+        + 4 * pose.LENS * lens,
         banded=frame.banded + 4 * fields.floats,
         model=models * frame.model,
         pair=frame.pair + blend.gradient_pair_bytes(fields),

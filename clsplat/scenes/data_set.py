@@ -130,6 +130,16 @@ class Lens:
                 params[index] *= scale
         return replace(self, width=width, height=height, params=tuple(params))
 
+    def refocused(self, log: float, x: float, y: float) -> Lens:
+        """The same lens with focal lengths times e^log, its principal point moved by x and y of the old ones."""
+        camera, params = self._camera(), list(self.params)
+        shift = (x * camera.focal_length_x, y * camera.focal_length_y)
+        for index, by in zip(camera.principal_point_idxs(), shift, strict=True):
+            params[index] += by
+        for index in camera.focal_length_idxs():
+            params[index] *= math.exp(log)
+        return replace(self, params=tuple(params))
+
     def img_from_cam(self, points: Float64) -> Float64:
         """Project points (N, 3) in camera space to pixels (N, 2); NaN where the model has no image of them."""
         return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))

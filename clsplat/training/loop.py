@@ -43,8 +43,8 @@ from clsplat.scenes.scene import Scene
 from clsplat.stages.loss import Loss
 from clsplat.training import telemetry
 from clsplat.training.batch import Losses
+from clsplat.training.cameras import aligned
 from clsplat.training.health import RETURNS, WINDOW
-from clsplat.training.poses import aligned
 from clsplat.training.repro import write_bundle
 from clsplat.training.trainer import Trainer
 
@@ -236,14 +236,14 @@ class Session:
         gains = held_out_gains(trainer.appearance.record())
         return evaluate(
             lambda view: self.draw(view.camera)[0] * gains(view.name),
-            trainer.scene.test_views,
+            trainer.cameras.lenses.of_views(trainer.scene.test_views),
             background_colour(trainer.config.background),
             self.run.test_path if keep and self.run is not None else None,
             step=trainer.step,
             gaussians=trainer.parameters.count,
             seconds=self.seconds,
             corrected=trainer.config.appearance != "none",
-            aligned=(lambda view: self.draw(aligned(trainer, view))[0]) if trainer.poses.on and keep else None,
+            aligned=(lambda view: self.draw(aligned(trainer, view))[0]) if trainer.cameras.poses.on and keep else None,
             space=photos_space(view.path for view in trainer.scene.views),
         )
 
@@ -334,15 +334,15 @@ class Session:
             run.save_model(model, photos_space(view.path for view in trainer.scene.views))
             if (appearance := trainer.appearance.record()) is not None:
                 run.write_appearance(appearance, trainer.appearance.tables())
-            if trainer.poses.on:
-                _keep_poses(run, trainer)
+            if trainer.config.refines:
+                _keep_cameras(run, trainer)
             if trainer.scene.test_views:
                 result = self.evaluate(keep=True)
                 run.write_eval(result)
                 ample = trainer.device.memory.limit is None and not any(trainer.plan.pieces)
                 if trainer.config.report and ample:
                     with suppress(CapacityError, DriverError):  # a picture less is no failed training
-                        views = trainer.scene.test_views
+                        views = trainer.cameras.lenses.of_views(trainer.scene.test_views)
                         keep_depths(self.render, model, views, result["views"], run.depth_path)
         return model
 
@@ -364,11 +364,12 @@ class Session:
             self.doubt()
 
 
-def _keep_poses(run: Run, trainer: Trainer) -> None:
-    """Write the refined cameras, with those that are held out as they were given; a warning for any that went far."""
-    scene, poses = trainer.scene, trainer.poses
+def _keep_cameras(run: Run, trainer: Trainer) -> None:
+    """Write the refined cameras, with the poses that are held out as they were given; a warning for any that went
+    far."""
+    scene, poses, lenses = trainer.scene, trainer.cameras.poses, trainer.cameras.lenses
     refined = {view.name: camera for view, camera in zip(trainer.views, poses.cameras, strict=True)}
-    images = [(view.name, view.lens, refined.get(view.name, view.camera)) for view in scene.views]
+    images = [(view.name, lenses.refined(view.lens), refined.get(view.name, view.camera)) for view in scene.views]
     write_model(run.refined_path, images, scene.points, scene.point_colors)
     degrees, shifts = poses.motions()
     far = (degrees > FAR_DEGREES) | (shifts > FAR_PART * scene.extent)
@@ -377,6 +378,11 @@ def _keep_poses(run: Run, trainer: Trainer) -> None:
         warnings.warn(
             f"--refine-poses: {examples(names)}: moved by up to {degrees.max():.1f} degrees and {shifts.max():.3g} "
             "world units; look at their renders, or leave them out"
+        )
+    if (most := lenses.largest) > FAR_PART:
+        warnings.warn(
+            f"--refine-lenses: a focal length or principal point has changed by {most:.1%} of the focal length; look "
+            "at the renders, or leave them as they are"
         )
 
 

@@ -1,30 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of training views, learnt with the model, and of held-out views, found for a model as it is."""
+"""Poses of training views, learnt with the model."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
-from clsplat.camera import NO_ROTATION, Camera
+from clsplat.camera import NO_ROTATION
 from clsplat.config.training import TrainConfig
-from clsplat.device.buffers import DeviceArray, Workspace
-from clsplat.device.context import Device
-from clsplat.device.launch import only_tried
-from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.errors import InputError
-from clsplat.images.alpha import background_colour
-from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.scenes.scene import Scene, View
-from clsplat.stages.device_gaussians import AnyGaussians
-from clsplat.stages.pose import pose_rows, sum_of, sums_of
-from clsplat.training.photographs import kept_pixels
-from clsplat.training.step import GradientStep, StepProbe, StepRows, view_gradients
+from clsplat.scenes.scene import View
 
 BETA1, BETA2 = 0.9, 0.99
 FLATTEST, TINY = 1e-2, 1e-30
@@ -44,16 +33,17 @@ SWEEPS, ROUNDING = 6, 1e-16
 """Of Jacobi's rotations: passes over all pairs, and what counts as zero beside the diagonal."""
 LEAST = 0.01
 """Part of the rate that is left at the last step."""
-MODELS = 4
-"""Arrays for each parameter on the device: parameters, two moments, a view's gradients."""
-ALIGNING, ALIGNED = 40, 1.0
-"""Steps in which the pose of a held-out view is found, and degrees by which it can turn in them, about."""
 
 
 def fallen(reach: float, part: float, visits: float) -> float:
     """The rate of a visit that comes after this part of all: it falls exponentially, and all together are `reach`."""
     mean = (1 - LEAST) / -np.log(LEAST)
     return float(reach / max(visits * mean, 1.0) * LEAST**part)
+
+
+def first_step(config: TrainConfig) -> int:
+    """The step after which cameras are refined: the model has to show something by then."""
+    return min(500, config.iterations // 10)
 
 
 def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
@@ -85,32 +75,6 @@ def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64
     return step
 
 
-@dataclass(eq=False)
-class PoseSums:
-    """The gradient by the pose of a step's view, of a model of `count` rows; `add` is given all of them, in order."""
-
-    work: Workspace
-    count: int
-    _begun: tuple[Device, DeviceArray] | None = field(default=None, init=False)
-
-    def add(self, rows: StepRows) -> None:
-        """Add up the rows' parts. Kernels that come later are tried here, before anything changes."""
-        assert rows.gradients is not None, "asked for where poses are refined"
-        if self._begun is None:
-            self._begun = rows.device, sums_of(self.work, self.count)
-            with only_tried(rows.device):
-                sum_of(rows.device, self.work, self._begun[1])
-        of_view = (rows.camera_array, rows.projected.tile_counts, rows.gradients)
-        pose_rows(rows.device, rows.parameters, *of_view, self._begun[1], rows.start)
-
-    def gradient(self) -> Float64:
-        """The gradient (6,) by the motion of `Camera.moved`; waits for the device."""
-        assert self._begun is not None, "a model has rows"
-        device, sums = self._begun
-        found: Float64 = sum_of(device, self.work, sums).get()[0].astype(np.float64)
-        return found
-
-
 class Poses:
     """The cameras of the training views, which move where poses are refined.
 
@@ -130,7 +94,7 @@ class Poses:
         places = np.array([camera.position for camera in self.cameras])
         distances = np.linalg.norm(places - places[0], axis=1)
         self.held = (0, int(distances.argmax()) or len(views) - 1)
-        self._start = min(500, config.iterations // 10)
+        self._start = first_step(config)
         self._first, self._second = np.zeros((len(views), 6)), np.zeros((len(views), 6, 6))
         self._visits = np.zeros(len(views), np.int64)
 
@@ -186,52 +150,3 @@ class Poses:
         self.cameras = [given.posed(rotation, translation) for given, rotation, translation in poses]
         self._first, self._second = values["first"].copy(), values["second"].copy()
         self._visits = values["visits"].copy()
-
-
-@dataclass(frozen=True, eq=False)
-class _Look(GradientStep):
-    """A step that changes nothing of the model."""
-
-    def update(self, rows: StepRows) -> None:
-        """Leave the rows as they are."""
-
-
-class InTraining(Protocol):
-    """A model in training, as far as this goes: a `Trainer`."""
-
-    config: TrainConfig
-    device: Device
-    rasterizer: Rasterizer
-    parameters: AnyGaussians
-    scene: Scene
-
-    def rates(self) -> dict[str, float]:
-        """Learning rates at the step."""
-        ...
-
-    def local(self, camera: Camera) -> Camera:
-        """A camera in the world as one for the model."""
-        ...
-
-
-def aligned(trainer: InTraining, view: View) -> Camera:
-    """The camera of a held-out view, moved from where it is to where the model fits its photograph best. The model
-    stays as it is: its world may have drifted."""
-    config, rasterizer, model = replace(trainer.config, thinning=0.0), trainer.rasterizer, trainer.parameters
-    photograph = np.ascontiguousarray(view.load_masked())
-    kept, background = kept_pixels(photograph), np.array(background_colour(config.background), np.float32)
-    room, scale = view_gradients(rasterizer.work, model), np.repeat([1.0, trainer.scene.extent], 3)
-    first, second = np.zeros(6), np.zeros((6, 6))
-    camera = best = view.camera
-    least = np.inf
-    for step in range(1, ALIGNING + 1):
-        sums = PoseSums(rasterizer.work, model.count)
-        look = _Look(trainer.device, rasterizer, config, 1, trainer.rates(), PLAIN_SLOTS, pose=sums)
-        pixels = (photograph, trainer.local(camera), background)
-        loss, _ = look.run((model,), *pixels, StepProbe(), room, reads_loss=True, kept=kept).read()
-        if loss < least:
-            best, least = camera, loss
-        by = sums.gradient() * scale
-        rate = fallen(np.radians(ALIGNED), step / ALIGNING, ALIGNING)
-        camera = camera.moved(rate * scale * descend(first, second, by, step))
-    return best

@@ -70,13 +70,14 @@ class ViewRows:
 class StepRows(ViewRows):
     """The same with all that a step has of them: model: their parameters, and their moments or whatever else the step
     changes; device: with the switches of the view's projection; camera_array, slots: the step's view, and the gradients
-    of their pairs; gradients: the rows' own, where they are asked for."""
+    of their pairs; gradients: the rows' own, where they are asked for; by_lens (rows, 4): those by the view's lens."""
 
     model: tuple[DeviceGaussians, ...]
     device: Device
     camera_array: DeviceArray
     slots: Slots
     gradients: DeviceGaussians | None
+    by_lens: DeviceArray | None = None
 
     @property
     def parameters(self) -> DeviceGaussians:
@@ -89,8 +90,12 @@ class StepRows(ViewRows):
         return self.model[1]
 
 
-class PoseLook(Protocol):
-    """Takes what the rows of a step's view say of its pose."""
+class CameraLook(Protocol):
+    """Takes what the rows of a step's view say of its camera."""
+
+    def room(self, rows: int) -> DeviceArray | None:
+        """Room for what so many rows say of the lens, if that is wanted."""
+        ...
 
     def add(self, rows: StepRows) -> None:
         """Add these rows, before they change."""
@@ -126,7 +131,7 @@ class GradientStep:
 
     fields: the fields of a slot that the step fills; turn: of `loss`; room: of `Rasterizer.forward`; explore: what the
     step does beside following the gradient of the loss; appearance: of the view's photograph, where it is learnt;
-    pose: takes the gradient by the view's pose, where there is room for the gradients.
+    seen: takes the gradient by the view's camera, where there is room for the gradients.
     """
 
     device: Device
@@ -140,7 +145,7 @@ class GradientStep:
     room: Room | None = None
     explore: Exploration | None = None
     appearance: ViewAppearance | None = None
-    pose: PoseLook | None = None
+    seen: CameraLook | None = None
 
     def run(
         self,
@@ -190,13 +195,15 @@ class GradientStep:
             projected, row_slots = frame.projected.rows(start, stop), slots.rows(start, stop)
             screen = rasterizer.screen(stop - start, self.fields)
             of_view = (rasterizer.device_of(camera), frame.camera_array, row_slots)
-            rows = StepRows(start, stop, projected, screen, part, *of_view, gradients)
+            by_lens = None if self.seen is None else self.seen.room(stop - start)
+            rows = StepRows(start, stop, projected, screen, part, *of_view, gradients, by_lens)
             if gradients is not None:
                 sh_rest = updates_sh_rest(self.config.optimiser, self.step)
                 arrays = (part[0], frame.camera_array, projected, row_slots, gradients, screen)
-                project_grad(rows.device, *arrays, fields=self.fields, sh_rest=sh_rest, explore=self.explore)
-                if self.pose is not None:
-                    self.pose.add(rows)
+                asked: dict[str, Any] = {"sh_rest": sh_rest, "explore": self.explore, "by_lens": by_lens}
+                project_grad(rows.device, *arrays, fields=self.fields, **asked)
+                if self.seen is not None:
+                    self.seen.add(rows)
             probe.before_rows(rows)
             self.update(rows)
             probe.after_rows(rows)

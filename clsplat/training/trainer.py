@@ -53,13 +53,13 @@ from clsplat.stages.loss import Loss
 from clsplat.training import depth, edges
 from clsplat.training.appearance import appearance_of
 from clsplat.training.batch import OWNER_MODELS, REPLICA_MODELS, Batch, Losses
+from clsplat.training.cameras import MODELS, Cameras
 from clsplat.training.density import ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.health import Patience
 from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.pending import Pending
 from clsplat.training.photographs import Photographs
-from clsplat.training.poses import MODELS, Poses, PoseSums
 from clsplat.training.rates import rates_at
 from clsplat.training.resolution import sizes_of
 from clsplat.training.sampling import SamplingFilter
@@ -112,7 +112,7 @@ class Trainer:
         self.given = initial
         self.watch = Watch(self.rasterizer.readback, [view.name for view in self.views])
         self.pending = Pending(device, self.watch, self._begin_again)
-        self.pending.on &= self.batch is None and not config.refine_poses  # a batch reads its losses; poses, gradients
+        self.pending.on &= self.batch is None and not config.refines  # a batch reads its losses; cameras, gradients
         self._start()
 
     def _start(self) -> None:
@@ -129,7 +129,7 @@ class Trainer:
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
-        self.poses = Poses(self.config, self.views, self.scene.extent)
+        self.cameras = Cameras(self.config, self.views, self.scene.extent)
         self.origin, self.near = initial.origin, self.scene.near
         self._cameras: dict[int, tuple[Camera, Camera]] = {}
         cameras = {view.name: self.local(view.camera) for view in self.views}
@@ -157,11 +157,12 @@ class Trainer:
                 turns=self.pending.turns,
                 antialiased=self.config.antialiased,
                 masks=self.config.mask_use != NO_MASKS,
+                lens=self.config.refine_lenses,
                 further=self.appearance.pixel_bytes + sum(part.pixel_bytes(self.config) for part in (depth, edges)),
                 **models,
             )
 
-        models = MODELS if self.config.refine_poses else 0 if batch is None else OWNER_MODELS
+        models = MODELS if self.config.refines else 0 if batch is None else OWNER_MODELS
         self.plan = plan(self.device, models=models) if models else plan(self.device)
         self.rasterizer.follow(self.plan)
         self.photographs.follow(self.plan.photographs)
@@ -236,18 +237,17 @@ class Trainer:
         def run(turn: int, room: Room | None) -> Loss:
             sample = samples[0]
             appearance = next(iter(appearances), None)
-            moves = self.poses.moves(sample.view, number)
-            pose = PoseSums(self.rasterizer.work, self.parameters.count) if moves else None
-            with_view: dict[str, Any] = {"explore": explore, "appearance": appearance, "pose": pose}
+            seen = self.cameras.sums(self.rasterizer.work, self.parameters.count, sample.view, number)
+            with_view: dict[str, Any] = {"explore": explore, "appearance": appearance, "seen": seen}
             step = GradientStep(*settings, turn=turn, room=room, **with_view)
             known = sample.known
-            if moves:
+            if seen is not None:
                 known["gradients"] = view_gradients(self.rasterizer.work, self.parameters, zero=True)
             probe, model = Watched(self, step, number, sample, needs), (self.parameters, self.first, self.second)
             pixels = (sample.photograph, sample.camera, sample.background)
             result = step.run(model, *pixels, probe, reads_loss=reads_loss, **known)
-            if pose is not None:
-                self.poses.move(sample.view, number, pose.gradient())
+            if seen is not None:
+                self.cameras.move(sample, number, seen)
             self.sampling.apply(self.parameters)
             return result
 
@@ -457,12 +457,12 @@ class Trainer:
         return camera.from_origin(self.origin).before(self.near)
 
     def camera(self, view: int, width: int, height: int) -> Camera:
-        """A training view's camera at the size of its photograph, the same object while that and its pose stay."""
-        of, camera = self._cameras.get(view, (None, None))
-        if camera is None or of is not self.poses.cameras[view] or (camera.width, camera.height) != (width, height):
-            of = self.poses.cameras[view]
-            camera = self.local(of.resized(width, height))
-            self._cameras[view] = of, camera
+        """A training view's camera at the size of its photograph, the same object while that stays and nothing of it
+        is refined."""
+        (of, camera), now = self._cameras.get(view, (None, None)), self.cameras.of(view)
+        if camera is None or of is not now or (camera.width, camera.height) != (width, height):
+            camera = self.local(now.resized(width, height))
+            self._cameras[view] = now, camera
         return camera
 
     def gaussians(self) -> Gaussians:
@@ -490,7 +490,7 @@ class Trainer:
         arrays = {f"statistics/{name}": array.get() for name, array in self.statistics.named().items()}
         arrays.update({f"strategy/{name}": array for name, array in self.strategy.arrays().items()})
         arrays |= {f"{kind}/{group}": model[group].get() for kind, model in self.models().items() for group in GROUPS}
-        return arrays | self.sampling.arrays() | self.appearance.arrays() | self.poses.arrays()
+        return arrays | self.sampling.arrays() | self.appearance.arrays() | self.cameras.arrays()
 
     def restart(self) -> None:
         """Begin again, at the rates that `watch.patience` allows."""
@@ -533,7 +533,7 @@ class Trainer:
         try:
             self.sampling.load(checkpoint.named("sampling/"), self.parameters.count)
             self.appearance.load(checkpoint.named("appearance/"))
-            self.poses.load(checkpoint.named("poses/"))
+            self.cameras.load(checkpoint.named("poses/"), checkpoint.named("lenses/"))
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
 

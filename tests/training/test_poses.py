@@ -21,7 +21,8 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, View, load_scene
-from clsplat.training.poses import Poses, aligned, axes_of, descend
+from clsplat.training.cameras import aligned
+from clsplat.training.poses import Poses, axes_of, descend
 from clsplat.training.trainer import Trainer
 
 CONFIG = short(iterations=40, refine_poses=True)
@@ -65,10 +66,10 @@ def test_poses_come_back(scene: Scene, default_device: Device) -> None:
     """At 48 x 40 pixels, where a degree is a pixel, from some pixels to under one."""
     off = disturbed(scene, 3.0, 0.03)
     trainer = Trainer(off, replace(CONFIG, iterations=600, pose_reach=10.0), default_device)
-    held = [off.train_views[index] for index in trainer.poses.held]
+    held = [off.train_views[index] for index in trainer.cameras.poses.held]
 
     def away() -> float:
-        pairs = zip(trainer.poses.cameras, scene.train_views, strict=True)
+        pairs = zip(trainer.cameras.poses.cameras, scene.train_views, strict=True)
         return float(np.mean([pixels_off(camera, view.camera, scene.points) for camera, view in pairs]))
 
     before = away()
@@ -77,9 +78,9 @@ def test_poses_come_back(scene: Scene, default_device: Device) -> None:
     assert before > 1.5
     assert away() < 0.3 * before
     assert len(held) == 2
-    for view, index in zip(held, trainer.poses.held, strict=True):
-        assert trainer.poses.cameras[index] is view.camera
-    moved = trainer.poses.motions()[0] > 0
+    for view, index in zip(held, trainer.cameras.poses.held, strict=True):
+        assert trainer.cameras.poses.cameras[index] is view.camera
+    moved = trainer.cameras.poses.motions()[0] > 0
     assert moved.sum() == len(moved) - 2
 
 
@@ -159,7 +160,7 @@ def _second(scene: Scene) -> str:
 def test_a_checkpoint_that_is_damaged(
     scene: Scene, default_device: Device, name: str, spoilt: Callable[[np.ndarray], np.ndarray], text: str
 ) -> None:
-    poses = Trainer(scene, CONFIG, default_device).poses
+    poses = Trainer(scene, CONFIG, default_device).cameras.poses
     arrays = {key.removeprefix("poses/"): values for key, values in poses.arrays().items()}
     poses.load(arrays)
     with pytest.raises(ValueError, match=text):

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Focal lengths and principal points of a scene's lenses, learnt with the model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.errors import InputError
+from clsplat.scenes.data_set import Lens
+from clsplat.scenes.scene import View
+from clsplat.training.poses import descend, fallen, first_step
+
+MOTIONS = 3
+"""Of a lens: ln of both focal lengths, and the principal point in focal lengths."""
+
+
+class RefinedLenses:
+    """The lenses of the training views, which change where they are refined. Views of one lens share its change.
+
+    Raises InputError for photographs of which the change is none of their lens: what is bent, or no flat picture.
+    """
+
+    def __init__(self, config: TrainConfig, views: Sequence[View]) -> None:
+        self.on, self._config = config.refine_lenses, config
+        self._given = list(dict.fromkeys(view.lens for view in views))
+        self._of_view = [self._given.index(view.lens) for view in views] if self.on else []
+        if not self.on:
+            return
+        for view in views:
+            if not view.lens.is_pinhole or not view.camera.kind.flat:
+                raise InputError(
+                    f"--refine-lenses: {view.name} was taken through {view.lens.model}, which bends pictures; expected "
+                    "photographs without distortion, as `clsplat sfm` and COLMAP's image_undistorter write them"
+                )
+        self._start = first_step(config)
+        self._shares = np.bincount(self._of_view) / len(views)
+        self.changes = np.zeros((len(self._given), MOTIONS))
+        self._first, self._second = np.zeros((len(self._given), 6)), np.zeros((len(self._given), 6, 6))
+        self._visits = np.zeros(len(self._given), np.int64)
+
+    def moves(self, step: int) -> bool:
+        """True if the lens of the view is refined in this step."""
+        return self.on and step > self._start
+
+    def move(self, view: int, step: int, camera: Camera, gradient: Float64) -> None:
+        """Adam's step of a view's lens, with the gradient (4,) as of `Camera.refocused`, found with this camera; none
+        for a gradient that is not finite."""
+        if not np.isfinite(gradient).all():
+            return
+        lens, by = self._of_view[view], np.zeros(6)
+        by[:MOTIONS] = gradient[0] + gradient[1], camera.fx * gradient[2], camera.fy * gradient[3]
+        self._visits[lens] += 1
+        down = descend(self._first[lens], self._second[lens], by, int(self._visits[lens]))[:MOTIONS]
+        steps = self._config.iterations - self._start
+        part = (step - self._start) / steps
+        rate = fallen(self._config.lens_reach / 100, part, steps * float(self._shares[lens]))
+        self.changes[lens] += rate * down
+
+    def seen(self, lens: Lens, camera: Camera) -> Camera:
+        """The camera of a view through its lens as it is refined; the same object where it is not."""
+        if not self.on or lens not in self._given:
+            return camera
+        log, x, y = self.changes[self._given.index(lens)]
+        return camera.refocused(np.array([log, log, x * camera.fx, y * camera.fy]))
+
+    def refined(self, lens: Lens) -> Lens:
+        """The lens of a view as it is refined."""
+        if not self.on or lens not in self._given:
+            return lens
+        return lens.refocused(*self.changes[self._given.index(lens)].tolist())
+
+    @property
+    def largest(self) -> float:
+        """The largest change, in focal lengths."""
+        return float(np.abs(self.changes).max()) if self.on else 0.0
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        if not self.on:
+            return {}
+        moments = {"lenses/first": self._first, "lenses/second": self._second, "lenses/visits": self._visits}
+        return {"lenses/changes": self.changes, **moments}
+
+    def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Take the arrays of a checkpoint. Raises ValueError where that is of other lenses."""
+        values = {}
+        for name, own in self.arrays().items():
+            value = arrays.get(name.removeprefix("lenses/"))
+            if value is None or value.shape != own.shape or value.dtype != own.dtype or not np.isfinite(value).all():
+                raise ValueError(f"has no {name} of shape {own.shape}")
+            values[name.removeprefix("lenses/")] = value.copy()
+        if values:
+            self.changes, self._first, self._second = values["changes"], values["first"], values["second"]
+            self._visits = values["visits"]
+
+    def of_views(self, views: Sequence[View]) -> list[View]:
+        """Held-out views through their lenses as they are refined, to look at."""
+        return [replace(view, camera=self.seen(view.lens, view.camera)) for view in views] if self.on else list(views)
