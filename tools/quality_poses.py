@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbed poses, and how far training brings them back (`--refine-poses`).
+"""Disturbed poses or lenses, and how far training brings them back (`--refine-poses`, `--refine-lenses`).
 
     .venv/bin/python tools/quality_poses.py FOLDER [--scene SCENE] [--width 120] [--photos 40] [--points 5000]
-        [--iterations 7000] [--degrees 0.5] [--percent 1] [--seed 0] [--reach DEGREES]
+        [--iterations 7000] [--degrees 0.5] [--percent 1] [--seed 0] [--reach DEGREES] [--lens PERCENT]
 
 The scene is the demo's, whose poses are exact, or SCENE at --width. All training poses but the two that are held are
 turned by --degrees about random axes and shifted by --percent of the extent. Trained are the scene as it is, the
 disturbed one, and that with its poses refined. The table has mean errors of the disturbed poses, and PSNR on held-out
-views, with their own poses and with those that fit the model best.
+views, with their own poses and with those that fit the model best. With --lens poses stay, and focal length and
+principal point, across, are off by so many hundredths of the focal length, which the run can refine by 2.5 times that.
 """
 
 from __future__ import annotations
@@ -47,6 +48,15 @@ def disturbed(scene: Scene, degrees: float, percent: float, seed: int) -> Scene:
     return replace(scene, views=[off(view) for view in scene.views])
 
 
+def refocused(scene: Scene, part: float) -> Scene:
+    """The scene with every focal length and principal point off by this part of the focal length."""
+    views = []
+    for view in scene.views:
+        camera = view.camera.refocused(np.array([part, part, part * view.camera.fx, 0.0]))
+        views.append(replace(view, camera=camera, lens=view.lens.refocused(part, part, 0.0)))
+    return replace(scene, views=views)
+
+
 def errors(found: list[Camera], true: list[Camera]) -> tuple[float, float]:
     """Mean degrees and world units by which poses that were disturbed are off; two are not."""
     cosines = [(np.trace(a.rotation @ b.rotation.T) - 1) / 2 for a, b in zip(found, true, strict=True)]
@@ -61,7 +71,7 @@ def main() -> None:
     parser.add_argument("--scene", type=Path)
     for flag, value in (
         *(("--width", 120), ("--photos", 40), ("--points", 5000), ("--iterations", 7000), ("--seed", 0)),
-        *(("--degrees", 0.5), ("--percent", 1.0), ("--reach", TrainConfig.pose_reach)),
+        *(("--degrees", 0.5), ("--percent", 1.0), ("--reach", TrainConfig.pose_reach), ("--lens", 0.0)),
     ):
         parser.add_argument(flag, type=type(value), default=value)
     options = parser.parse_args()
@@ -73,10 +83,15 @@ def main() -> None:
         scene = load_scene(path)
     else:
         scene = load_scene(options.scene, resolution=options.width)
-    off = disturbed(scene, options.degrees, options.percent, options.seed)
+    if options.lens:
+        off = refocused(scene, options.lens / 100)
+    else:
+        off = disturbed(scene, options.degrees, options.percent, options.seed)
     true, extent = [view.camera for view in scene.train_views], scene.extent
     plain = TrainConfig(iterations=options.iterations, seed=options.seed)
-    refined = replace(plain, refine_poses=True, pose_reach=options.reach)
+    of_lens = {"refine_lenses": True, "lens_reach": 2.5 * options.lens}
+    of_poses = {"refine_poses": True, "pose_reach": options.reach}
+    refined = replace(plain, **(of_lens if options.lens else of_poses))
     print(f"{len(true)} training views, extent {extent:.3g}\n")
     print("trained          degrees  % of extent  PSNR own  PSNR aligned", flush=True)
     for name, subject, config in (("as it is", scene, plain), ("disturbed", off, plain), ("refined", off, refined)):
@@ -93,9 +108,13 @@ def main() -> None:
                 return renderer.render(trainer.parameters, trainer.local(camera_of(view)), background).image
 
             numbers = {"step": trainer.step, "gaussians": trainer.parameters.count, "seconds": None}
-            means.append(evaluate(draw, subject.test_views, background, **numbers)["mean"]["psnr"])
+            views = trainer.cameras.lenses.of_views(subject.test_views)
+            means.append(evaluate(draw, views, background, **numbers)["mean"]["psnr"])
         degrees, shift = errors(trainer.cameras.poses.cameras, true)
         print(f"{name:15} {degrees:8.3f} {100 * shift / extent:12.3f} {means[0]:9.2f} {means[1]:13.2f}", flush=True)
+        for log, x, y in trainer.cameras.lenses.changes if config.refine_lenses else ():
+            moved = f"principal point {x:+.2%} across, {y:+.2%} down"
+            print(f"the focal length has changed by {np.expm1(log):+.2%}, the {moved}")
         trainer.close()
 
 

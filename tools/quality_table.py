@@ -95,6 +95,7 @@ TOOLS: dict[str, tuple[str, ...]] = {
     "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", "--iterations", "{iterations}"),
     "fisheye": ("quality_fisheye.py", "{work}", "--iterations", "{iterations}"),
     "poses": ("quality_poses.py", "{work}", "--width", "320", "--iterations", "{iterations}"),
+    "lenses": ("quality_poses.py", "{work}", "--width", "320", "--lens", "2", "--iterations", "{iterations}"),
     "points": ("quality_points.py", "{work}", "--iterations", "{iterations}"),
     "real points": ("quality_points.py", "{work}", "--rgbd", "{scenes}/rgbd_7scenes", "--iterations", "{iterations}"),
     "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *FEW_VIEWS),
