@@ -10,14 +10,14 @@
 //   tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project.cl -> screen (n, 2): of the
 //   mean on the image, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): what each adds to the image,
 //   sums of its blending weights over all pixels. With LENS by_lens (n, 4): what each says of the logs of the camera's
-//   focal lengths and of its principal point, per pixel. project_grad: gradients of the parameters, of the same shapes, in
-//   loss per unit of each. Rows of Gaussians that are not visible are left as they are. project_step, built with ADAM:
-//   the parameters and their moments `first` and `second`, of the same shapes; `readback` (READBACK_SIZE) counts, and
-//   the scalars are those of Step, one a group where they differ. The gradient of a Gaussian that is not visible is
+//   focal lengths and of its principal point, per pixel. project_grad: gradients of the parameters, of the same shapes,
+//   in loss per unit of each. Rows of Gaussians that are not visible are left as they are. project_step, built with
+//   ADAM: the parameters and their moments `first` and `second`, of the same shapes; `readback` (READBACK_SIZE) counts,
+//   and the scalars are those of Step, one a group where they differ. The gradient of a Gaussian that is not visible is
 //   zero, or with SPARSE its row stays as it is. After a pass that has stopped (duplicate.cl) nothing changes. With
 //   PENALTIES the gradient has that of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
-//   (145). With RAYS docs/cameras.md, (22) to (28); with ORTHOGRAPHIC (20).
+//   (145). With RAYS docs/cameras.md, (22) to (29); with ORTHOGRAPHIC (20).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -31,10 +31,6 @@
 #endif
 #ifdef ADAM
 #include "shared/adam.h"
-#endif
-
-#if defined(ANTIALIASED) && !defined(RAYS) // which are not trained with it
-#define COMPENSATED
 #endif
 
 #ifndef ADAM
@@ -177,7 +173,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 
   // (58). The columns of M = J A S, whitened: w[k] times the scale. Of order one, and differences of nothing large.
   const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
-#ifdef COMPENSATED
+#ifdef ANTIALIASED
   // (84). The compensated opacity falls with the determinant of the filtered covariance, and rises with the other's.
   const intL compensated = p.det0 / p.det > LEAST_COMPENSATION * LEAST_COMPENSATION;
   const floatL thinner = compensated ? m_g : (floatL)(0.0f), by_det0 = compensated ? m_g / p.det0 : (floatL)(0.0f);
@@ -196,8 +192,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     float minors = 0.0f;
     for (int j = 3; j < 5; ++j) minors = fma1(p.m2[j], fma1(p.m2[j], b1, -(p.m1[j] * b2)), minors);
     const int l = (k + 1) % 3, n = (k + 2) % 3;
-    const float by_n = camera[CAMERA_HAND] * depth_of_axis(&p, n) * (inverse * inverse);
-    const float by_l = camera[CAMERA_HAND] * depth_of_axis(&p, l) * (inverse * inverse);
+    const float by_n = minor_of_axis(&p, camera, n), by_l = minor_of_axis(&p, camera, l);
     minors = fma1(p.m2[l], p.s[l] * by_n, fma1(-p.m2[n], p.s[n] * by_l, minors));
     wu[k] = lean * minors;
     wv[k] = l22 * b2;
@@ -227,13 +222,24 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     const floatL nu = p.s[k] * wu[k], nv = p.s[k] * wv[k];
     const floatL tu = fmaL(uu, nu, uv * nv), tv = fmaL(uv, nu, vv * nv);
     d->scale[k].all = fmaL(nu, tu, nv * tv);
-#ifdef COMPENSATED
-    const floatL area = p.s[l] * p.s[n], minor = area * p.c[k]; // (85) to (87)
-    const floatL other_l = p.s[n] * p.s[k] * p.c[l], other_n = p.s[k] * p.s[l] * p.c[n];
+#ifdef ANTIALIASED
+#ifdef RAYS
+    const float c[3] = {minor_of_axis(&p, camera, k), minor_of_axis(&p, camera, l), minor_of_axis(&p, camera, n)};
+#else
+    const floatL c[3] = {p.c[k], p.c[l], p.c[n]};
+#endif
+    const floatL area = p.s[l] * p.s[n], minor = area * c[0]; // (85) to (87)
+    const floatL other_l = p.s[n] * p.s[k] * c[1], other_n = p.s[k] * p.s[l] * c[2];
     d->scale[k].all = fmaL(by_det0, fmaL(other_l, other_l, other_n * other_n), d->scale[k].all);
     const floatL lever = by_det0 * minor * area;
+#ifdef RAYS // (29) of docs/cameras.md: the minors are the axes' parts along the mean's direction
+    const float turned_by = camera[CAMERA_HAND] / (p.distance * p.distance);
+    across_x = fma1(lever, turned_by * p.c1[k], across_x);
+    across_y = fma1(lever, turned_by * p.c2[k], across_y);
+#else
     across_x = fmaL(lever, fmaL(p.jx * p.rx, p.a2[k], p.b1[k]), across_x);
     across_y = fmaL(lever, fmaL(p.jy * p.ry, p.a2[k], p.b2[k]), across_y);
+#endif
 #endif
     d_size += d->scale[k].all;
 #ifdef RAYS
@@ -250,8 +256,8 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     const floatL apart = scale_difference(GATHER(log_scales, 3, l) - GATHER(log_scales, 3, n), p.s[l], p.s[n]);
     const floatL au = apart * wu[l], av = apart * wv[l], sum = p.s[l] + p.s[n];
     turned[k] = fmaL(fmaL(uu, au, uv * av), sum * wu[n], fmaL(uv, au, vv * av) * (sum * wv[n]));
-#ifdef COMPENSATED
-    turned[k] = fmaL(-(by_det0 * p.s[k] * p.c[l]), apart * sum * (p.s[k] * p.c[n]), turned[k]);
+#ifdef ANTIALIASED
+    turned[k] = fmaL(-(by_det0 * p.s[k] * c[1]), apart * sum * (p.s[k] * c[2]), turned[k]);
 #endif
   }
 #ifdef PENALTIES
@@ -271,6 +277,10 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
                                   0.5f * fma1(l12, turned_v, l22 * fma1(l12, uv, l22 * vv))};
   float by_low_pass[2];
   low_pass_gradient(p.f, camera, by_covariance, by_low_pass);
+#ifdef ANTIALIASED
+  by_low_pass[0] += across_x;
+  by_low_pass[1] += across_y;
+#endif
   const float turn_x = (d_mx + by_low_pass[0] - l11 * along_u / p.distance) / p.distance;
   const float turn_y = (d_my + by_low_pass[1] - fma1(l12, along_u, l22 * along_v) / p.distance) / p.distance;
   const float shrink = d_size / p.distance - (0.0f LESS_NEAR(p.distance));
@@ -286,7 +296,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, J moves with
   // z alone.
   const floatL rx = p.x / p.z, ry = p.y / p.z;
-#ifdef COMPENSATED
+#ifdef ANTIALIASED
   const float hand = camera[CAMERA_HAND];
   const floatL by_j02 = fmaL(l11, along_u, -(hand * (p.jy / p.jx) * across_x));
   const floatL by_j12 = fmaL(l12, along_u, fmaL(l22, along_v, -(hand * (p.jx / p.jy) * across_y)));
@@ -303,7 +313,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
 
 #ifdef LENS
-#ifdef COMPENSATED
+#ifdef ANTIALIASED
   lens[0].all += compensated ? m_g : (floatL)(0.0f);
   lens[1].all += compensated ? m_g : (floatL)(0.0f);
 #endif

@@ -2,7 +2,7 @@
 """A fisheye capture of 190 degrees against pinhole photographs of the same scene, each trained as it is.
 
     .venv/bin/python tools/quality_fisheye.py FOLDER [--iterations 2000] [--photos 40] [--width 120] [--seed 0]
-        [--threshold 1] [--finer 1]
+        [--threshold 1] [--finer 1] [--antialiased]
 
 Both captures are made by the demo's ray caster from the same places: one through Kannala and Brandt's lens, one through
 a pinhole with as many pixels a radian on the axis, or --finer times fewer. Both models are measured on the same
@@ -132,6 +132,7 @@ def main() -> None:
         "--threshold", type=float, default=1.0, help="factor of the fisheye's threshold of density control"
     )
     parser.add_argument("--finer", type=float, default=1.0, help="factor of the fisheye's pixels a radian")
+    parser.add_argument("--antialiased", action="store_true", help="train both so")
     options = parser.parse_args()
     surfaces = still_life()
     bake(surfaces, options.seed)
@@ -139,6 +140,7 @@ def main() -> None:
     side = round(options.finer * pinholes[0].fx * 1000 / fisheye_of(pinholes[0], 1000).fx)
     fisheyes = [fisheye_of(camera, side) for camera in pinholes]
     device, config = open_device(), TrainConfig(iterations=options.iterations, seed=options.seed, report=False)
+    config = replace(config, antialiased=options.antialiased)
     renderer, models = Renderer(device), {}
     for name, views in (("fisheye", fisheyes), ("pinhole", pinholes)):
         factor = options.threshold if name == "fisheye" else 1.0

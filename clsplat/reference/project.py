@@ -252,15 +252,14 @@ def compensation(det0: Float64, det: Float64) -> Float64:
     return np.maximum(np.sqrt(det0 / det), LEAST_COMPENSATION)
 
 
-def _compensation_grad(geometry: _Geometry, d_logs: Float64) -> Float64:
-    """Eq. (84): dL/dSigma (N, 2, 2) of what the compensation has of it. d_logs (N,): dL/d(ln of the opacity)."""
-    plain = geometry.half @ geometry.half.transpose(0, 2, 1)
-    filtered = plain + LOW_PASS_ANTIALIASED * np.eye(2)
+def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tuple[Float64, Float64]:
+    """Eq. (84): what the compensation has of dL/dSigma, (N, 2, 2), by the covariances without the low-pass and by those
+    with it. d_logs (N,): dL/d(ln of the opacity)."""
     free = np.linalg.det(plain) > LEAST_COMPENSATION**2 * np.linalg.det(filtered)
-    gradient = np.zeros_like(plain)
+    by_plain, by_filtered = np.zeros_like(plain), np.zeros_like(plain)
     half = 0.5 * d_logs[free, None, None]
-    gradient[free] = half * (np.linalg.inv(plain[free]) - np.linalg.inv(filtered[free]))
-    return gradient
+    by_plain[free], by_filtered[free] = half * np.linalg.inv(plain[free]), -half * np.linalg.inv(filtered[free])
+    return by_plain, by_filtered
 
 
 def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
@@ -318,7 +317,8 @@ def _jacobian_grad(
     gxx, gxy, gyy = d_covariances.T
     d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
     if by_log_opacity is not None:
-        d_covariance += _compensation_grad(geometry, by_log_opacity)
+        plain = geometry.half @ geometry.half.transpose(0, 2, 1)
+        d_covariance += sum(compensation_grad(plain, plain + LOW_PASS_ANTIALIASED * np.eye(2), by_log_opacity))
     d_half = 2 * d_covariance @ geometry.half
     factor = geometry.rotations * geometry.scales[:, None, :]
     return d_half, factor, d_half @ (camera.rotation @ factor).transpose(0, 2, 1)

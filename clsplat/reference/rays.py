@@ -21,6 +21,7 @@ from clsplat.reference.project import (
     Seen,
     colour_grad,
     compensation,
+    compensation_grad,
     covariance_grad,
     quaternion_grad,
     rotation_matrices,
@@ -116,9 +117,9 @@ def pixel_sides(pixels: Float64) -> Float64:
     return sides
 
 
-def low_pass_grad(directions: Float64, camera: Camera, gradients: Float64) -> Float64:
+def low_pass_grad(directions: Float64, camera: Camera, gradients: Float64, low_pass: float) -> Float64:
     """(26) to (28), B: the gradient by a step of the mean's direction along the plane's axes, (N, 2), of what the
-    low-pass adds; gradients (N, 2, 2) by the covariance."""
+    low-pass of so many square pixels adds; gradients (N, 2, 2) by the covariance."""
     x, y, z = directions.T
     g11, g12, g22 = gradients[:, 0, 0], gradients[:, 0, 1], gradients[:, 1, 1]
     result = np.zeros((len(directions), 2))
@@ -127,8 +128,8 @@ def low_pass_grad(directions: Float64, camera: Camera, gradients: Float64) -> Fl
         free = level > 0.5 / camera.fy
         across = np.where(free, level, 0.5 / camera.fy) / camera.fx
         around = y / np.where(level > 0, level, np.inf)
-        result[:, 0] = 2 * LOW_PASS * g12 * around * (across**2 - camera.fy**-2)
-        result[:, 1] = -2 * LOW_PASS * g11 * np.where(free, across * y / camera.fx, 0.0)
+        result[:, 0] = 2 * low_pass * g12 * around * (across**2 - camera.fy**-2)
+        result[:, 1] = -2 * low_pass * g11 * np.where(free, across * y / camera.fx, 0.0)
         return result
     r = np.hypot(x, y)
     safe = np.where(r > 0, r, 1.0)
@@ -147,7 +148,7 @@ def low_pass_grad(directions: Float64, camera: Camera, gradients: Float64) -> Fl
     )
     by_angle -= g22 * 2 * c * s * more * (q * q - p * q * z)
     result[:, 1] = np.where(r > 1e-6, by_angle / safe, 0.0)
-    return LOW_PASS * result
+    return low_pass * result
 
 
 def fisheye_sides(camera: Camera, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
@@ -163,7 +164,7 @@ def fisheye_sides(camera: Camera, theta: Float64) -> tuple[Float64, Float64, Flo
 
 
 def tangents_grad(gaussians: Gaussians, camera: Camera, seen: Tangents, screen: BlendGradients) -> dict[str, Float64]:
-    """(22) to (28): gradients by the five parameter arrays, keyed by their names; zero where culled."""
+    """(22) to (29): gradients by the five parameter arrays, keyed by their names; zero where culled."""
     rows = np.flatnonzero(seen.visible)
     arrays = parameters(gaussians)
     means, quaternions = arrays["means"][rows], arrays["quaternions"][rows]
@@ -177,6 +178,14 @@ def tangents_grad(gaussians: Gaussians, camera: Camera, seen: Tangents, screen: 
     conics = np.stack([seen.conic(row) for row in rows.tolist()]) if len(rows) else np.zeros((0, 3))
     gxx, gxy, gyy = covariance_grad(conics, screen.conics[rows]).T
     d_covariance = np.stack([np.stack([gxx, gxy], axis=1), np.stack([gxy, gyy], axis=1)], axis=1)
+    d_low_pass, low_pass = d_covariance, LOW_PASS
+    if gaussians.antialiased:
+        by_log_opacity = screen.opacities[rows] * seen.opacities[rows]
+        by_plain, by_filtered = compensation_grad(
+            half @ half.transpose(0, 2, 1), seen.covariances[rows], by_log_opacity
+        )
+        d_low_pass, low_pass = d_covariance + by_filtered, LOW_PASS_ANTIALIASED
+        d_covariance = d_low_pass + by_plain
     d_half = 2 * d_covariance @ half
     d_factor = (plane @ camera.rotation / depths[:, None, None]).transpose(0, 2, 1) @ d_half
     d_log_scales = (d_factor * factor).sum(axis=1)
@@ -184,7 +193,7 @@ def tangents_grad(gaussians: Gaussians, camera: Camera, seen: Tangents, screen: 
 
     ahead = np.einsum("ni,nij->nj", directions, axes) / depths[:, None]
     turn = screen.means2d[rows] - np.einsum("nij,nj->ni", d_half, ahead)
-    turn += low_pass_grad(directions, camera, d_covariance)
+    turn += low_pass_grad(directions, camera, d_low_pass, low_pass)
     size = (d_half * half).sum(axis=(1, 2))
     d_p = (np.einsum("ni,nij->nj", turn, plane) - size[:, None] * directions) / depths[:, None]
     of_colour = (arrays["sh"][rows], camera, gaussians.sh_degree, seen.colors[rows], screen.colors[rows])
@@ -195,6 +204,7 @@ def tangents_grad(gaussians: Gaussians, camera: Camera, seen: Tangents, screen: 
     gradients["means"][rows] = d_p @ camera.rotation + d_by_colour
     gradients["quaternions"][rows] = d_quaternions
     gradients["log_scales"][rows] = d_log_scales
-    gradients["opacity_logits"][rows] = screen.opacities[rows] * opacities * (1 - opacities)
+    logits = arrays["opacity_logits"][rows]
+    gradients["opacity_logits"][rows] = screen.opacities[rows] * opacities / (1 + np.exp(logits))
     gradients["sh"][rows, : basis.shape[1]] = basis[:, :, None] * d_value[:, None, :]
     return gradients

@@ -13,7 +13,6 @@ from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.stages.sampling import limit_scales, sampling_limits, upload_cameras
 
@@ -26,16 +25,11 @@ class SamplingFilter:
     settings ask for none."""
 
     def __init__(self, config: TrainConfig, device: Device, work: Workspace, cameras: Mapping[str, Camera]) -> None:
-        """cameras: by the views' names. Raises InputError for one that is not trained so."""
+        """cameras: by the views' names."""
         self._device, self._work, self._on = device, work, config.antialiased
         self._least: DeviceArray | None = None  # (n,), None where they have to be worked out before the next step
         if not self._on:
             return
-        if (name := next((name for name, camera in cameras.items() if not camera.kind.flat), None)) is not None:
-            raise InputError(
-                f"--antialiased: {name} is {cameras[name].projection}, expected perspective or orthographic "
-                "photographs; --lenses undistort makes these of a fisheye's"
-            )
         self._cameras = upload_cameras(device, list(cameras.values()))
 
     def is_due(self, step: int) -> bool:

@@ -3,6 +3,10 @@
 #include "shared/elementary.h"
 #include "shared/angles.h"
 
+#ifndef CAMERA_SPACE // where the camera is
+#define CAMERA_SPACE __constant
+#endif
+
 // sin(x) for |x| up to a little over a quarter turn, to 2e-8 of it: minimax in x^2.
 static inline floatL sinL(floatL x) {
   const floatL t = x * x;
@@ -19,28 +23,28 @@ static inline floatL absL(floatL x) { return x < 0.0f ? -x : x; }
 #define FARTHEST_ANGLE(camera) (camera)[CAMERA_FOLD]
 #define SERIES(camera) (2.0f * (camera)[CAMERA_K1])
 // The distance from the axis in focal lengths of what is seen at the angle t from it, its slope, and that one's.
-static inline floatL radius_of(floatL t, __constant float *camera) {
+static inline floatL radius_of(floatL t, CAMERA_SPACE float *camera) {
   const floatL t2 = t * t;
   floatL p = fmaL(t2, (floatL)(camera[CAMERA_K4]), (floatL)(camera[CAMERA_K3]));
   p = fmaL(t2, p, (floatL)(camera[CAMERA_K2]));
   p = fmaL(t2, p, (floatL)(camera[CAMERA_K1]));
   return fmaL(t2 * p, t, t);
 }
-static inline floatL slope_of(floatL t, __constant float *camera) {
+static inline floatL slope_of(floatL t, CAMERA_SPACE float *camera) {
   const floatL t2 = t * t;
   floatL p = fmaL(t2, (floatL)(9.0f * camera[CAMERA_K4]), (floatL)(7.0f * camera[CAMERA_K3]));
   p = fmaL(t2, p, (floatL)(5.0f * camera[CAMERA_K2]));
   p = fmaL(t2, p, (floatL)(3.0f * camera[CAMERA_K1]));
   return fmaL(t2, p, (floatL)(1.0f));
 }
-static inline float bend_of(float t, __constant float *camera) {
+static inline float bend_of(float t, CAMERA_SPACE float *camera) {
   const float t2 = t * t;
   float p = fma1(t2, 72.0f * camera[CAMERA_K4], 42.0f * camera[CAMERA_K3]);
   p = fma1(t2, p, 20.0f * camera[CAMERA_K2]);
   return t * fma1(t2, p, 6.0f * camera[CAMERA_K1]);
 }
 // The angle of a distance from the axis by Newton's steps; the host sees to it that they arrive.
-static inline floatL angle_of(floatL radius, __constant float *camera) {
+static inline floatL angle_of(floatL radius, CAMERA_SPACE float *camera) {
   const floatL fold = (floatL)(FARTHEST_ANGLE(camera));
   floatL t = radius < fold ? radius : fold;
   for (int step = 0; step < 12; ++step) {
@@ -58,7 +62,7 @@ static inline floatL angle_of(floatL radius, __constant float *camera) {
 #endif
 
 // The direction (x, y, z), of unit length, of pixels (px, py); all 0 where a pixel has none.
-static inline void ray_of(floatL px, floatL py, __constant float *camera, floatL *x, floatL *y, floatL *z) {
+static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floatL *x, floatL *y, floatL *z) {
   const floatL a = (px - camera[CAMERA_CX]) / camera[CAMERA_FX], b = (py - camera[CAMERA_CY]) / camera[CAMERA_FY];
 #if RAYS == 1
   // longitude within half a turn of the axis

@@ -129,6 +129,12 @@ static inline float depth_of_axis(const RayProjection *p, int k) {
   return fma1(p->f[0], p->a[k], fma1(p->f[1], p->a[3 + k], p->f[2] * p->a[6 + k]));
 }
 
+// The minor of M without its scales that has the axes beside k.
+static inline float minor_of_axis(const RayProjection *p, __constant float *camera, int k) {
+  const float inverse = 1.0f / p->distance;
+  return camera[CAMERA_HAND] * depth_of_axis(p, k) * (inverse * inverse);
+}
+
 // (26) to (28): the gradient by a step of the mean's direction along e1 and e2 of what the low-pass adds to the
 // covariance; g: the gradient by the covariance's xx, xy (once) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {

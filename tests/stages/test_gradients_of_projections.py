@@ -29,7 +29,10 @@ CAMERAS: dict[str, Camera] = {
     "fisheye of 300 degrees": fisheye(60, 60, 300),
     "bent fisheye": replace(fisheye(60, 50, 190), radial=BENT),
     "fisheye that folds over": replace(fisheye(60, 50, 150), radial=(-0.06, 0.0, 0.0, 0.0)),
+    "antialiased panorama": panorama(70, 35),
+    "antialiased fisheye": replace(fisheye(60, 50, 190), radial=BENT),
 }
+"""By name; what begins with antialiased is, with Gaussians small enough that the low-pass tells."""
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 BAND = 3e-4
 STEP = 1e-7
@@ -38,7 +41,10 @@ STEP = 1e-7
 def subject(name: str, count: int) -> tuple[Gaussians, Camera]:
     if name == "orthographic":
         return scenes.overlap(count=count)[0], CAMERAS[name]
-    return all_around(count, 5), CAMERAS[name]
+    gaussians = all_around(count, 5)
+    if name.startswith("antialiased"):
+        gaussians = replace(gaussians, antialiased=True, log_scales=gaussians.log_scales - np.float32(1.0))
+    return gaussians, CAMERAS[name]
 
 
 def direction_of_loss(gaussians: Gaussians, camera: Camera, band: float) -> np.ndarray:
@@ -60,13 +66,13 @@ def wanted(name: str) -> tuple[np.ndarray, every_pixel.Gradients]:
 def test_the_twin_by_central_differences(name: str) -> None:
     gaussians, camera = subject(name, 40)
     arrays = {group: np.asarray(values, np.float64) for group, values in gaussians.arrays().items()}
-    model = Gaussians(**arrays, near=gaussians.near)
+    model = Gaussians(**arrays, near=gaussians.near, antialiased=gaussians.antialiased)
     d_image = direction_of_loss(model, camera, 2e-4)
     gradients = every_pixel.render_grad(model, camera, d_image, BACKGROUND).parameters
     rng = np.random.default_rng(6)
     for group in GROUPS:
         direction = rng.standard_normal(arrays[group].shape)
-        moved = [Gaussians(**{**arrays, group: arrays[group] + step * direction}) for step in (STEP, -STEP)]
+        moved = [replace(model, **{group: arrays[group] + step * direction}) for step in (STEP, -STEP)]
         losses = [float((every_pixel.render(other, camera, BACKGROUND).image * d_image).sum()) for other in moved]
         slope = (losses[0] - losses[1]) / (2 * STEP)
         error = abs(slope - float((gradients[group] * direction).sum()))

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import scenes
 from compare import assert_close
+from test_project_rays import all_around, fisheye, panorama
 
 from clsplat.camera import Camera
 from clsplat.device.buffers import Workspace, allocate
@@ -23,6 +25,24 @@ def cameras() -> list[Camera]:
     _, camera = scenes.random_cloud(1, 3, 48, 32)
     nearer = replace(camera, translation=camera.translation - [0.3, 0.1, 0.5], fx=3 * camera.fx, fy=2 * camera.fy)
     return [camera, nearer]
+
+
+def rays() -> list[Camera]:
+    """A fisheye with coefficients, one without, and a panorama that sees only what is farther than the others."""
+    bent = replace(fisheye(60, 50, 190), radial=(0.04, -0.012, 0.004, -0.0006))
+    return [bent, replace(fisheye(40, 40, 120), fy=30.0), replace(panorama(70, 35), near=4.0)]
+
+
+@pytest.mark.parametrize("several", [rays, lambda: rays()[:1], lambda: [*cameras(), *rays()[:2]]])
+def test_of_other_projections(device: Device, several: Callable[[], list[Camera]]) -> None:
+    gaussians = all_around(300, 5)
+    wanted = twin(gaussians.means.astype(np.float64), several())
+    held, work, least = upload_gaussians(device, gaussians), Workspace(device), allocate(device, (300,), np.float32)
+    sampling_limits(device, work, held, upload_cameras(device, several()), least)
+    got, seen = least.get(), np.isfinite(wanted)
+    assert seen.sum() > 50
+    assert np.array_equal(seen, got > -1e29)
+    assert_close(got[seen], wanted[seen], absolute=1e-5)  # as below; angles are good to 1e-7
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 65, 300])

@@ -93,9 +93,10 @@ def test_the_cameras_are_those_of_the_file(scene: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_it_learns_to_the_held_out_views(scene: Scene, default_device: Device) -> None:
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_it_learns_to_the_held_out_views(scene: Scene, default_device: Device, antialiased: bool) -> None:
     losses: list[float] = []
-    steps = quiet(120)
+    steps = replace(quiet(120), antialiased=antialiased)
     model = train(scene, steps, device=default_device, on_step=lambda report: losses.append(report.loss))
     assert losses[-1] < 0.5 * losses[0], losses
     renderer = Renderer(default_device)
