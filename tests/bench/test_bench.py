@@ -230,8 +230,18 @@ MOST_LAUNCHES = 40
 
 @pytest.mark.parametrize(("shape", "launches"), [((1, 64), MOST_LAUNCHES), (None, MOST_LAUNCHES)], ids=str)
 @pytest.mark.parametrize("count", [300, 6000])
-def test_what_a_step_gives_the_queue(device: Device, shape: tuple[int, int] | None, launches: int, count: int) -> None:
-    """A step waits for one number, and for no copy to the device, whichever sort its size asks for."""
+@pytest.mark.parametrize("by_capacity", [False, True])
+def test_what_a_step_gives_the_queue(
+    device: Device,
+    monkeypatch: pytest.MonkeyPatch,
+    shape: tuple[int, int] | None,
+    launches: int,
+    count: int,
+    by_capacity: bool,
+) -> None:
+    """A step waits for one number, by capacity for none, and for no copy to the device, whichever sort its size asks
+    for."""
+    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", str(int(by_capacity)))
     if shape:
         device = device.with_shape(lanes=shape[0], items=shape[1])
     subject = bench_subject.synthetic(count, 320, 200)
@@ -242,8 +252,9 @@ def test_what_a_step_gives_the_queue(device: Device, shape: tuple[int, int] | No
 
     for work in (trainer.train_step, frame):
         work()
+        work()  # by capacity the second is the first that knows one
         calls = bench_stages.calls_of(device, work)
-        assert calls.blocking_reads <= 1
+        assert calls.blocking_reads <= (0 if by_capacity and work == trainer.train_step else 1)
         assert calls.blocking_writes == 0
         assert 0 < calls.launches <= launches
 

@@ -13,6 +13,7 @@ from typing import Any
 import gpu_compilers
 import gpu_intel
 import gpu_page
+import gpu_rules
 import gpu_static
 import pytest
 from gpu_assembly import Block, Instruction, Loop, gcn_kind, parse_gcn, parse_sass, sass_kind
@@ -298,6 +299,23 @@ def test_rules_are_of_lines_that_kernels_have() -> None:
         (lines,) = [text for text in texts.values() if any(re.match(rf"(.* )?{kernel}\(", line) for line in text)]
         for rule in rules:
             assert any(rule.matches(number, lines) for number in range(1, len(lines) + 1)), (kernel, rule.text)
+
+
+@pytest.mark.parametrize("items", [32, 64, 128, 256])
+def test_rules_have_the_kernels_own_sizes(items: int) -> None:
+    """Numbers of the rules that stand in the kernels too."""
+
+    def defined(path: str, name: str) -> int:
+        text = (kernel_root() / path).read_text()
+        (value,) = re.findall(rf"^#define {name} (.*ITEMS.*|\d{{2,}})$", text, re.MULTILINE)
+        words = re.sub(r"(.*?) \? (.*?) : ", r"(\2) if (\1) else ", value.strip("()")).replace("/", "//")
+        return int(eval(words, {"ITEMS": items}))  # of a file of this repository
+
+    run = Run(items)
+    assert run.together == defined("blend_grad.cl", "TOGETHER")
+    assert run.batch == defined("shared/blocks.h", "BATCH")
+    assert run.loss_rows == defined("loss.cl", "ROWS")
+    assert defined("sort_radix.cl", "RUN") == gpu_rules.PER_ITEM
 
 
 def test_rounds_of_a_launch() -> None:
