@@ -5,7 +5,8 @@
         [--threshold 1] [--finer 1] [--antialiased]
 
 Both captures are made by the demo's ray caster from the same places: one through Kannala and Brandt's lens, one through
-a pinhole with as many pixels a radian on the axis, or --finer times fewer. Both models are measured on the same
+a pinhole with as many pixels a radian on the axis, or --finer times fewer. What lies around the fisheye's circle is
+masked, as it has to be in any capture: other photographs show what is there. Both models are measured on the same
 held-out pinhole pictures, and on those pixels alone that a fisheye has too, which is all; then on the inner and the
 outer half of them, where a pinhole has up to 1 / cos^3 of the angle as many pixels for the same part of the scene.
 Writes FOLDER/fisheye and FOLDER/pinhole, each with model.ply, which is taken again where it is there, and
@@ -35,6 +36,7 @@ from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.reference.cameras import cam_from_pixel, pixel_grid
+from clsplat.reference.project import Bool
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
 
@@ -54,13 +56,18 @@ def fisheye_of(pinhole: Camera, side: int) -> Camera:
     return replace(pinhole, width=side, height=side, **lens)  # type: ignore[arg-type]
 
 
+def circle(camera: Camera) -> Bool:
+    """Pixels (H, W) that a fisheye of 190 degrees shows."""
+    rays = np.nan_to_num(cam_from_pixel(camera, pixel_grid(camera))[1])
+    inside: Bool = np.any(rays != 0, axis=1) & (rays[:, 2] > np.cos(ANGLE / 2))
+    return inside.reshape(camera.height, camera.width)
+
+
 def photograph(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32:
     """The ray caster's picture of a camera of any projection: samples^2 rays a pixel; black beyond 190 degrees."""
     fine = camera.resized(camera.width * samples, camera.height * samples)
     rays = np.nan_to_num(cam_from_pixel(fine, pixel_grid(fine))[1])
-    shown = np.any(rays != 0, axis=1)
-    if camera.projection == "fisheye":
-        shown &= rays[:, 2] > np.cos(ANGLE / 2)
+    shown = circle(fine).ravel() if camera.projection == "fisheye" else np.any(rays != 0, axis=1)
     colours = np.zeros((len(rays), 3), np.float32)
     colours[shown] = cast(surfaces, camera, rays[shown])
     linear = colours.reshape(camera.height, samples, camera.width, samples, 3).mean(axis=(1, 3))
@@ -84,8 +91,9 @@ def write_scene(folder: Path, surfaces: list[Surface], views: list[Camera]) -> P
     """A COLMAP scene of the cameras' photographs, with points on the surfaces and their colours."""
     sparse, images = folder / "sparse" / "0", folder / "images"
     sparse.mkdir(parents=True, exist_ok=True)
-    images.mkdir(exist_ok=True)
     one = views[0]
+    for made in (images, folder / "masks"):
+        made.mkdir(exist_ok=True)
     model = "OPENCV_FISHEYE" if one.projection == "fisheye" else "PINHOLE"
     radial = one.radial if one.projection == "fisheye" else ()
     numbers = " ".join(map(str, (one.width, one.height, one.fx, one.fy, one.cx, one.cy, *radial)))
@@ -97,6 +105,9 @@ def write_scene(folder: Path, surfaces: list[Surface], views: list[Camera]) -> P
             pose = " ".join(map(repr, map(float, (w, x, y, z, *views[index].translation))))
             lines.append(f"{index + 1} {pose} 1 {index:03d}.png\n\n")
             write_image(images / f"{index:03d}.png", picture)
+            if one.projection == "fisheye":
+                shown = np.repeat(circle(one)[:, :, None], 3, axis=2).astype(np.float32)
+                write_image(folder / "masks" / f"{index:03d}.png", shown)
     (sparse / "images.txt").write_text("".join(lines))
     rng, rows = np.random.default_rng(1), []
     for surface in surfaces:
@@ -111,7 +122,7 @@ def write_scene(folder: Path, surfaces: list[Surface], views: list[Camera]) -> P
 
 def trained(folder: Path, config: TrainConfig, device: Device) -> Gaussians:
     """The model of a scene, trained through its own lens, or the one that is there."""
-    scene = load_scene(folder, lenses="native", test_every=HELD_OUT)
+    scene = load_scene(folder, lenses="native", test_every=HELD_OUT, masks=config.mask_use)
     path = folder / "model.ply"
     if path.exists():
         return Gaussians.load(path)
@@ -145,7 +156,7 @@ def main() -> None:
     for name, views in (("fisheye", fisheyes), ("pinhole", pinholes)):
         factor = options.threshold if name == "fisheye" else 1.0
         density = replace(config.density, gradient_threshold=factor * config.density.gradient_threshold)
-        own_config = replace(config, density=density)
+        own_config = replace(config, density=density, masks="ignore" if name == "fisheye" else "none")
         models[name] = trained(write_scene(options.folder / name, surfaces, views), own_config, device)
     one = pinholes[0]
     across, down = (np.abs(np.arange(size) + 0.5 - size / 2) for size in (one.width, one.height))
