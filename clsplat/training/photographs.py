@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray, allocate, shared
 from clsplat.device.context import Device
+from clsplat.device.uploads import SLOTS, Uploads
 from clsplat.errors import CapacityError
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ class Photographs:
         self._on_device: dict[int, DeviceArray] = {}
         self._kept: dict[tuple[int, float], int | None] = {}
         self._taken = self.allowed = 0
+        self._uploads: Uploads | None = None
 
     def for_device(self, device: Device) -> Photographs:
         """The same for another device, with the same pixels on the host."""
@@ -75,12 +77,14 @@ class Photographs:
         return self._kept[index, factor]
 
     def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
-        """The same, on the device where there is room for it: it goes up once, and stays. A device that shares the
-        host's memory reads it there."""
+        """The same, on the device where there is room for it: it goes up once, and stays, or it has been sent `ahead`.
+        A device that shares the host's memory reads it there."""
         image = self.load(index, factor)
         if index not in self._on_device:
             if self._device.shares_memory:
                 self._on_device[index] = shared(self._device, image)
+            elif self._uploads is not None and (sent := self._uploads.take((index, factor))) is not None:
+                return sent
             elif self._taken + image.nbytes <= self.allowed:
                 try:
                     array = allocate(self._device, image.shape, image.dtype)
@@ -92,6 +96,26 @@ class Photographs:
                 self._taken += image.nbytes
         return self._on_device.get(index, image)
 
+    def ahead(self, index: int, factor: float) -> None:
+        """Send the same to the device while that is at work, where there is no room to keep it: for the next `bring`
+        of it. Called when a step has been launched."""
+        if self._device.shares_memory or index in self._on_device:
+            return
+        image = self.load(index, factor)
+        if self._taken + image.nbytes <= self.allowed:
+            return
+        if self._uploads is None and SLOTS * image.nbytes <= self.allowed:
+            while self._taken + SLOTS * image.nbytes > self.allowed:  # for those that went up last
+                self._taken -= self._on_device.popitem()[1].nbytes
+            try:
+                self._uploads = Uploads(self._device, image.nbytes)
+            except CapacityError:
+                self.allowed = self._taken
+                return
+            self._taken += self._uploads.taken
+        if self._uploads is not None:
+            self._uploads.begin((index, factor), image)
+
     def _leave_device(self) -> None:
         self._on_device.clear()
-        self._taken = 0
+        self._uploads, self._taken = None, 0

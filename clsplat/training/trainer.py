@@ -254,6 +254,8 @@ class Trainer:
         result: Loss | Losses
         if self.batch is None:
             result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
+            if self.queue:  # the next one, unless the resolution rises
+                self.photographs.ahead(self.queue[-1], factor)
         else:
             model, look = (self.parameters, self.first, self.second), self._watched_in_batch
             exact = GradientStep(*settings, explore=explore)

@@ -16,6 +16,7 @@ from clsplat.device.account import Memory
 from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.profile import Calls
+from clsplat.device.uploads import SLOTS, Uploads
 from clsplat.errors import CapacityError
 from clsplat.rendering.memory_plan import Need, plan
 from clsplat.scenes.scene import Scene, load_scene
@@ -140,3 +141,50 @@ def test_they_take_nothing_from_anything_else() -> None:
         assert (made.pieces, made.gathers, made.rows) == (without.pieces, without.gathers, without.rows)
         assert abs((without.pairs - made.pairs) * NEED.pair - made.photographs) <= NEED.pair
         assert made.pairs >= min(without.pairs, NEED.pairs), "there is room for the guess"
+
+
+def test_those_that_do_not_fit_are_sent_ahead(scene: Scene, default_device: Device) -> None:
+    """From room that the last ones give up; never more than allowed."""
+    views = scene.require_training_views()
+    device, some = with_memory_of_its_own(default_device), bytes_of(scene) // len(views) * (SLOTS + 1)
+    store = Photographs(views, device)
+    store.follow(some)
+    for index in range(len(views)):
+        store.bring(index, 1.0)
+    for index in (*range(len(views)), *range(len(views))):
+        store.ahead(index, 1.0)
+        image = store.bring(index, 1.0)
+        assert isinstance(image, DeviceArray)
+        np.testing.assert_array_equal(image.get(), store.load(index, 1.0))
+        assert device.memory.used <= some
+    store.ahead(0, 2.0)
+    assert device.memory.used <= some, "at another size it begins anew"
+    tight = Photographs(views, with_memory_of_its_own(default_device))
+    tight.follow(some // 2)
+    for index in range(len(views) // 2):
+        tight.bring(index, 1.0)
+    tight.ahead(len(views) - 1, 1.0)
+    assert not isinstance(tight.bring(len(views) - 1, 1.0), DeviceArray), "too little for them"
+
+
+@pytest.mark.parametrize("by_capacity", ["0", "1"])
+def test_training_is_the_same_with_those_that_are_sent_ahead(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, by_capacity: str
+) -> None:
+    wanted = train(scene, LONG, device=default_device)
+    most = bytes_of(scene) // len(scene.require_training_views()) * SLOTS
+    follow, taken = Photographs.follow, []
+
+    def take(uploads: Uploads, key: object) -> DeviceArray | None:
+        found = plain(uploads, key)
+        taken.append(found is not None)
+        return found
+
+    plain = Uploads.take
+    monkeypatch.setattr(Uploads, "take", take)
+    monkeypatch.setattr(Photographs, "follow", lambda store, allowed: follow(store, min(allowed, most)))
+    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", by_capacity)
+    got = train(scene, LONG, device=with_memory_of_its_own(default_device))
+    assert sum(taken) > LONG.iterations / 3
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        assert_same_bits(getattr(got, name), getattr(wanted, name), name)

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arrays that go up from pinned memory, on a queue of their own, while the device is at work on those before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray, allocate, pinned
+from clsplat.device.context import Device
+from clsplat.errors import CapacityError
+
+SLOTS = 3
+"""Arrays at a time: of the work that is under way, of that behind it, which may be made again, and the one that goes
+up."""
+
+
+@dataclass(eq=False)
+class _Slot:
+    """Room on the device and as much pinned on the host. key: of what it holds; arrived: its copy to the device; used:
+    when all that was launched with it is done."""
+
+    array: DeviceArray
+    host: NDArray[np.uint8]
+    key: object = None
+    held: DeviceArray | None = None
+    arrived: cl.Event | None = None
+    used: cl.Event | None = None
+
+
+class Uploads:
+    """Room for SLOTS arrays of at most `nbytes` each. Raises CapacityError where the device has none."""
+
+    def __init__(self, device: Device, nbytes: int) -> None:
+        self._device, self.nbytes = device, nbytes
+        arrays = [allocate(device, (nbytes,), np.uint8) for _ in range(SLOTS)]
+        try:
+            self._queue = cl.CommandQueue(device.context, device.cl_device)
+            hosts = [pinned(device, (nbytes,), np.uint8) for _ in range(SLOTS)]
+        except cl.Error as error:
+            raise CapacityError(f"{device.name}: no second queue, or no pinned memory ({error})") from None
+        self._slots = [_Slot(*pair) for pair in zip(arrays, hosts, strict=True)]
+        """The one that was sent or taken longest ago first."""
+
+    def begin(self, key: object, values: NDArray[Any]) -> None:
+        """Start to send an array, for `take`; nothing where it is too large or on its way already."""
+        if values.nbytes > self.nbytes or any(slot.key == key for slot in self._slots):
+            return
+        done = cl.enqueue_marker(self._device.queue)
+        self._device.queue.flush()
+        for slot in self._slots:
+            if slot.held is not None and slot.used is None:
+                slot.used = done
+        slot = self._slots[0]
+        self._touch(slot)
+        if slot.arrived is not None:
+            slot.arrived.wait()  # sent a while ago: the pinned memory is free
+        host = slot.host[: values.nbytes].view(values.dtype).reshape(values.shape)
+        host[...] = values
+        held = DeviceArray(self._device, slot.array.buffer, values.shape, values.dtype)
+        again = slot.held is not None and (slot.held.shape, slot.held.dtype) == (held.shape, held.dtype)
+        slot.held, slot.key = slot.held if again else held, key  # tapes know the object
+        before = None if slot.used is None else [slot.used]
+        slot.arrived = cl.enqueue_copy(self._queue, slot.array.buffer, host, is_blocking=False, wait_for=before)
+        slot.used = None
+        self._queue.flush()
+        self._device.calls.writes += 1
+
+    def take(self, key: object) -> DeviceArray | None:
+        """An array that was sent, for what is launched from here on; None if it was not. It stays until SLOTS - 1
+        others have been sent or taken after it."""
+        for slot in self._slots:
+            if slot.key == key and slot.arrived is not None:
+                cl.enqueue_barrier(self._device.queue, wait_for=[slot.arrived])
+                slot.used = None
+                self._touch(slot)
+                return slot.held
+        return None
+
+    def _touch(self, slot: _Slot) -> None:
+        self._slots.remove(slot)
+        self._slots.append(slot)
+
+    @property
+    def taken(self) -> int:
+        """Bytes on the device."""
+        return SLOTS * self.nbytes
