@@ -33,6 +33,7 @@ from clsplat.selftest.result import (
     DEEP,
     DEPTH,
     FORWARD,
+    LENSES,
     MASKS,
     POSES,
     RAYS,
@@ -93,7 +94,7 @@ BROKEN = {
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
     monkeypatch.setenv(BREAK, change)
-    groups = (FORWARD, CHANNELS, DEEP, RAYS, MASKS, BACKWARD, *APPEARANCE.values(), DEPTH, POSES)
+    groups = (FORWARD, CHANNELS, DEEP, RAYS, MASKS, BACKWARD, *APPEARANCE.values(), DEPTH, POSES, LENSES)
     group = next(stages for stages in groups if last in stages)
     before = () if group is FORWARD else FORWARD
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))

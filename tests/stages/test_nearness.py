@@ -132,6 +132,7 @@ def test_other_projections(default_device: Device, name: str) -> None:
     nothing = np.zeros((camera.height, camera.width, 3))
     wanted = every_pixel.render_grad(gaussians, camera, nothing, BACKGROUND, d_nearness)
     rasterizer, model = Rasterizer(default_device), upload_gaussians(default_device, gaussians)
+    rasterizer.antialias(on=gaussians.antialiased)
     background = upload(default_device, np.array(BACKGROUND, np.float32))
     frame = rasterizer.forward(model, camera, background, nearness=True)
     gradients = allocate_gaussians(default_device, model.count, model.coefficients, zero=True)
