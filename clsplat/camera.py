@@ -186,10 +186,10 @@ class Camera:
         """The same camera with another `cam_from_world`."""
         return replace(self, rotation=rotation, translation=translation)
 
-    def refocused(self, by: Float64) -> Camera:
-        """The same view through another lens: by (4,) is added to ln fx, ln fy, cx and cy."""
-        wider, higher = np.exp(np.asarray(by[:2], np.float64)).tolist()
-        return replace(self, fx=self.fx * wider, fy=self.fy * higher, cx=self.cx + by[2], cy=self.cy + by[3])
+    def refocused(self, log: float, x: float, y: float) -> Camera:
+        """The same view with focal lengths times e^log, its principal point moved by x and y of the old ones."""
+        factor, moved = math.exp(log), (self.cx + x * self.fx, self.cy + y * self.fy)
+        return replace(self, fx=self.fx * factor, fy=self.fy * factor, cx=moved[0], cy=moved[1])
 
     def before(self, near: float) -> Camera:
         """The same view of a model whose near plane is at `near`: that counts unless the camera has its own."""

@@ -2,10 +2,9 @@
 //
 // Owner: A work-item owns a Gaussian.
 // Launch: One work-item for each, in groups of 64; those beyond the last do nothing.
-// Buffers: cameras (views, CAMERA_SIZE) as project.cl has one, of one projection; means (n, 3) -> least (n): natural
-// log
-//   of the least standard deviation in world units, or with `more` what is less of that and what is there. log_scales
-//   (n, 3): those less than that are made that.
+// Buffers: cameras (views, CAMERA_SIZE) as project.cl has one, of one projection; means (n, 3) -> least (n): the
+//   natural log of the least standard deviation in world units, or with `more` what is less of that and what is there.
+//   log_scales (n, 3): those less than that are made that.
 // Equations: docs/gradients.md, (88).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -231,7 +231,7 @@ def fill_in(page: str, tables: Mapping[str, str]) -> str:
     return page
 
 
-def _trained_and_picture(frames: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], str]:
+def trained_and_picture(frames: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], str]:
     """The frames of training, the largest last, and the name of the one that is drawn alone."""
     trained = [frame for frame in frames if not frame.get("picture")]
     return trained, next(frame["name"] for frame in frames if frame.get("picture"))
@@ -239,7 +239,7 @@ def _trained_and_picture(frames: Sequence[Mapping[str, Any]]) -> tuple[list[Mapp
 
 def missed_goals(predictions: Predictions, frames: Sequence[Mapping[str, Any]]) -> list[str]:
     """The goals that the predictions miss, in words."""
-    trained, picture = _trained_and_picture(frames)
+    trained, picture = trained_and_picture(frames)
     largest = trained[-1]["name"]
     step, shown = (sum(predictions[SHAPE, GPU, name].values(), Stage()).both for name in (largest, picture))
     found = []
@@ -258,7 +258,7 @@ def tables_of(
     intel: Sequence[IntelBuilt] = (),
 ) -> dict[str, str]:
     """The page's tables by name. compilers: their versions; intel: empty for no table of Intel's."""
-    trained, picture = _trained_and_picture(frames)
+    trained, picture = trained_and_picture(frames)
     names, largest = [frame["name"] for frame in trained], trained[-1]["name"]
     tables = {
         "compilers": compilers,
@@ -285,7 +285,7 @@ def stale_tables(page: str, tables: Mapping[str, str]) -> list[str]:
 def write_page(tables: Mapping[str, str], predictions: Predictions, frames: Sequence[Mapping[str, Any]]) -> None:
     """Write the tables into the page, and the plot beside it."""
     atomic_write(PAGE, fill_in(PAGE.read_text("utf-8"), tables).encode())
-    largest = _trained_and_picture(frames)[0][-1]["name"]
+    largest = trained_and_picture(frames)[0][-1]["name"]
     bars = {
         gpu.name: {part: stage.both for part, stage in parts_of(predictions[SHAPE, gpu.name, largest]).items()}
         for gpu in GPUS

@@ -40,7 +40,7 @@ from gpu_devices import ARCHITECTURES, GPUS, occupancy
 from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
 from gpu_model import Stage, predict
-from gpu_page import PAGE, Predictions, missed_goals, stale_tables, tables_of, write_page
+from gpu_page import PAGE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
 from gpu_rules import BY_PAIR, WALK, Rule, Run
 from measuring import reporting, require
 
@@ -244,7 +244,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once")
     options = parser.parse_args(arguments)
     frames = json.loads(FRAMES.read_text())["frames"]
-    trained = [frame for frame in frames if not frame.get("picture")]
+    trained, _ = trained_and_picture(frames)
     if options.page:
         return make_page(frames, options.jobs)
     if options.check:
@@ -318,7 +318,7 @@ def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], 
             built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
             for frame, step in zip(frames, steps, strict=True):
                 predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
-    trained = [frame for frame in frames if not frame.get("picture")]
+    trained, _ = trained_and_picture(frames)
     for shape in WALKS:
         sources = sources_of(ask_package("step", shape, trained[-1:])[0])
         walks = {source: kernels for source, kernels in sources.items() if source.by_gaussian}

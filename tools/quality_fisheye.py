@@ -24,6 +24,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from clsplat.api import train
@@ -36,7 +37,6 @@ from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.reference.cameras import cam_from_pixel, pixel_grid
-from clsplat.reference.project import Bool
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
 
@@ -56,10 +56,10 @@ def fisheye_of(pinhole: Camera, side: int) -> Camera:
     return replace(pinhole, width=side, height=side, **lens)  # type: ignore[arg-type]
 
 
-def circle(camera: Camera) -> Bool:
+def circle(camera: Camera) -> NDArray[np.bool_]:
     """Pixels (H, W) that a fisheye of 190 degrees shows."""
     rays = np.nan_to_num(cam_from_pixel(camera, pixel_grid(camera))[1])
-    inside: Bool = np.any(rays != 0, axis=1) & (rays[:, 2] > np.cos(ANGLE / 2))
+    inside: NDArray[np.bool_] = np.any(rays != 0, axis=1) & (rays[:, 2] > np.cos(ANGLE / 2))
     return inside.reshape(camera.height, camera.width)
 
 
@@ -91,9 +91,12 @@ def write_scene(folder: Path, surfaces: list[Surface], views: list[Camera]) -> P
     """A COLMAP scene of the cameras' photographs, with points on the surfaces and their colours."""
     sparse, images = folder / "sparse" / "0", folder / "images"
     sparse.mkdir(parents=True, exist_ok=True)
-    one = views[0]
-    for made in (images, folder / "masks"):
-        made.mkdir(exist_ok=True)
+    images.mkdir(exist_ok=True)
+    one, masks = views[0], folder / "masks"
+    shown = None
+    if one.projection == "fisheye":
+        masks.mkdir(exist_ok=True)
+        shown = np.repeat(circle(one)[:, :, None], 3, axis=2).astype(np.float32)
     model = "OPENCV_FISHEYE" if one.projection == "fisheye" else "PINHOLE"
     radial = one.radial if one.projection == "fisheye" else ()
     numbers = " ".join(map(str, (one.width, one.height, one.fx, one.fy, one.cx, one.cy, *radial)))
@@ -105,9 +108,8 @@ def write_scene(folder: Path, surfaces: list[Surface], views: list[Camera]) -> P
             pose = " ".join(map(repr, map(float, (w, x, y, z, *views[index].translation))))
             lines.append(f"{index + 1} {pose} 1 {index:03d}.png\n\n")
             write_image(images / f"{index:03d}.png", picture)
-            if one.projection == "fisheye":
-                shown = np.repeat(circle(one)[:, :, None], 3, axis=2).astype(np.float32)
-                write_image(folder / "masks" / f"{index:03d}.png", shown)
+            if shown is not None:
+                write_image(masks / f"{index:03d}.png", shown)
     (sparse / "images.txt").write_text("".join(lines))
     rng, rows = np.random.default_rng(1), []
     for surface in surfaces:

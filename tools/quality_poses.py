@@ -52,8 +52,8 @@ def refocused(scene: Scene, part: float) -> Scene:
     """The scene with every focal length and principal point off by this part of the focal length."""
     views = []
     for view in scene.views:
-        camera = view.camera.refocused(np.array([part, part, part * view.camera.fx, 0.0]))
-        views.append(replace(view, camera=camera, lens=view.lens.refocused(part, part, 0.0)))
+        change = (part, part, 0.0)
+        views.append(replace(view, camera=view.camera.refocused(*change), lens=view.lens.refocused(*change)))
     return replace(scene, views=views)
 
 

@@ -98,7 +98,7 @@ def render_grad(
 def render_lens_grad(
     gaussians: Gaussians, camera: Camera, d_image: Float64, background: Sequence[float] | Float64 = BLACK
 ) -> Float64:
-    """Gradient (4,) of a loss with dL/dimage = d_image (H, W, 3) by the lens, as `Camera.refocused` changes it."""
+    """Gradient (4,) of a loss with dL/dimage = d_image (H, W, 3) by ln fx, ln fy, cx and cy."""
     arrays, camera = parameters(gaussians), camera.before(gaussians.near)
     projected = project(**arrays, camera=camera, sh_degree=gaussians.sh_degree, antialiased=gaussians.antialiased)
     screen = blend_grad(projected, camera.width, camera.height, background, d_image)

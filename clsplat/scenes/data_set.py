@@ -131,7 +131,7 @@ class Lens:
         return replace(self, width=width, height=height, params=tuple(params))
 
     def refocused(self, log: float, x: float, y: float) -> Lens:
-        """The same lens with focal lengths times e^log, its principal point moved by x and y of the old ones."""
+        """The same lens, changed as `Camera.refocused` changes a camera."""
         camera, params = self._camera(), list(self.params)
         shift = (x * camera.focal_length_x, y * camera.focal_length_y)
         for index, by in zip(camera.principal_point_idxs(), shift, strict=True):

@@ -19,7 +19,6 @@ from clsplat.stages.pose import LENS, lens_rows, pose_rows, sum_of, sums_of
 from clsplat.stages.project import Screen, project_grad
 
 MADE_UP = ("means", "quaternions", "sh_dc")
-ROOM = {"screen": 2, "by_lens": LENS}
 
 
 def of_pose(bench: Bench) -> Outcome:

@@ -59,8 +59,8 @@ def lens_rows(
 
 @stage("pose")
 def sum_of(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
-    """The sum (1, numbers) of all sums (m, numbers): by the turn and the shift of `Camera.moved`, or by the lens as
-    `Camera.refocused` has it."""
+    """The sum (1, numbers) of all sums (m, numbers): by the turn and the shift of `Camera.moved`, or by ln fx, ln fy,
+    cx and cy."""
     kernel, numbers, level = device.kernels("pose", LANES=1).pose_sums, sums.shape[1], 0
     while sums.shape[0] > 1:
         level += 1

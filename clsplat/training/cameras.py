@@ -78,7 +78,7 @@ class CameraSums:
         return self._gradient(POSE)
 
     def by_lens(self) -> Float64:
-        """The gradient (4,) by the change of `Camera.refocused`; waits for the device."""
+        """The gradient (4,) by ln fx, ln fy, cx and cy; waits for the device."""
         return self._gradient(LENS)
 
 

@@ -16,7 +16,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.scenes.data_set import Lens
 from clsplat.scenes.scene import View
-from clsplat.training.poses import descend, fallen, first_step
+from clsplat.training.poses import checked_arrays, descend, fallen, first_step
 
 MOTIONS = 3
 """Of a lens: ln of both focal lengths, and the principal point in focal lengths."""
@@ -30,8 +30,7 @@ class RefinedLenses:
 
     def __init__(self, config: TrainConfig, views: Sequence[View]) -> None:
         self.on, self._config = config.refine_lenses, config
-        self._given = list(dict.fromkeys(view.lens for view in views))
-        self._of_view = [self._given.index(view.lens) for view in views] if self.on else []
+        self._rows: dict[Lens, int] = {}
         if not self.on:
             return
         for view in views:
@@ -40,19 +39,22 @@ class RefinedLenses:
                     f"--refine-lenses: {view.name} was taken through {view.lens.model}, which bends pictures; expected "
                     "photographs without distortion, as `clsplat sfm` and COLMAP's image_undistorter write them"
                 )
-        self._start = first_step(config)
+        self._rows = {lens: row for row, lens in enumerate(dict.fromkeys(view.lens for view in views))}
+        self._of_view = [self._rows[view.lens] for view in views]
+        self._start, count = first_step(config), len(self._rows)
         self._shares = np.bincount(self._of_view) / len(views)
-        self.changes = np.zeros((len(self._given), MOTIONS))
-        self._first, self._second = np.zeros((len(self._given), 6)), np.zeros((len(self._given), 6, 6))
-        self._visits = np.zeros(len(self._given), np.int64)
+        self.changes = np.zeros((count, MOTIONS))
+        # of six motions, which `descend` takes; the last three stay 0
+        self._first, self._second = np.zeros((count, 6)), np.zeros((count, 6, 6))
+        self._visits = np.zeros(count, np.int64)
 
     def moves(self, step: int) -> bool:
         """True if the lens of the view is refined in this step."""
         return self.on and step > self._start
 
     def move(self, view: int, step: int, camera: Camera, gradient: Float64) -> None:
-        """Adam's step of a view's lens, with the gradient (4,) as of `Camera.refocused`, found with this camera; none
-        for a gradient that is not finite."""
+        """Adam's step of a view's lens, with the gradient (4,) by ln fx, ln fy, cx and cy that was found with this
+        camera; none for a gradient that is not finite."""
         if not np.isfinite(gradient).all():
             return
         lens, by = self._of_view[view], np.zeros(6)
@@ -64,18 +66,20 @@ class RefinedLenses:
         rate = fallen(self._config.lens_reach / 100, part, steps * float(self._shares[lens]))
         self.changes[lens] += rate * down
 
+    def _change(self, lens: Lens) -> tuple[float, float, float] | None:
+        """The change of a lens, as `refocused` takes it; None where it is not refined."""
+        row = self._rows.get(lens)
+        return None if row is None else tuple(self.changes[row].tolist())
+
     def seen(self, lens: Lens, camera: Camera) -> Camera:
         """The camera of a view through its lens as it is refined; the same object where it is not."""
-        if not self.on or lens not in self._given:
-            return camera
-        log, x, y = self.changes[self._given.index(lens)]
-        return camera.refocused(np.array([log, log, x * camera.fx, y * camera.fy]))
+        change = self._change(lens)
+        return camera if change is None else camera.refocused(*change)
 
     def refined(self, lens: Lens) -> Lens:
         """The lens of a view as it is refined."""
-        if not self.on or lens not in self._given:
-            return lens
-        return lens.refocused(*self.changes[self._given.index(lens)].tolist())
+        change = self._change(lens)
+        return lens if change is None else lens.refocused(*change)
 
     @property
     def largest(self) -> float:
@@ -91,15 +95,11 @@ class RefinedLenses:
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take the arrays of a checkpoint. Raises ValueError where that is of other lenses."""
-        values = {}
-        for name, own in self.arrays().items():
-            value = arrays.get(name.removeprefix("lenses/"))
-            if value is None or value.shape != own.shape or value.dtype != own.dtype or not np.isfinite(value).all():
-                raise ValueError(f"has no {name} of shape {own.shape}")
-            values[name.removeprefix("lenses/")] = value.copy()
-        if values:
-            self.changes, self._first, self._second = values["changes"], values["first"], values["second"]
-            self._visits = values["visits"]
+        if not self.on:
+            return
+        values = checked_arrays(self.arrays(), arrays, "lenses/")
+        self.changes, self._visits = values["changes"], values["visits"]
+        self._first, self._second = values["first"], values["second"]
 
     def of_views(self, views: Sequence[View]) -> list[View]:
         """Held-out views through their lenses as they are refined, to look at."""

@@ -54,6 +54,8 @@ REPORT_EVERY = 10
 
 FAR_DEGREES, FAR_PART = 5.0, 0.1
 """Degrees, and part of the scene's extent, beyond which a refined pose is told of."""
+FAR_CHANGE = 0.1
+"""The same of a lens, in focal lengths."""
 
 Between = Callable[[Trainer, Callable[[], bool]], None]
 """A function called before each step, with the trainer and a function that is True once Ctrl-C was pressed: then it
@@ -379,7 +381,7 @@ def _keep_cameras(run: Run, trainer: Trainer) -> None:
             f"--refine-poses: {examples(names)}: moved by up to {degrees.max():.1f} degrees and {shifts.max():.3g} "
             "world units; look at their renders, or leave them out"
         )
-    if (most := lenses.largest) > FAR_PART:
+    if (most := lenses.largest) > FAR_CHANGE:
         warnings.warn(
             f"--refine-lenses: a focal length or principal point has changed by {most:.1%} of the focal length; look "
             "at the renders, or leave them as they are"

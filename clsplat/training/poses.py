@@ -46,6 +46,20 @@ def first_step(config: TrainConfig) -> int:
     return min(500, config.iterations // 10)
 
 
+def checked_arrays(
+    own: Mapping[str, NDArray[Any]], arrays: Mapping[str, NDArray[Any]], folder: str
+) -> dict[str, NDArray[Any]]:
+    """Copies of a checkpoint's arrays by name, for those that `own` has in this folder. Raises ValueError for one that
+    is missing, or of other views."""
+    values = {}
+    for name, like in own.items():
+        value = arrays.get(name.removeprefix(folder))
+        if value is None or value.shape != like.shape or value.dtype != like.dtype or not np.isfinite(value).all():
+            raise ValueError(f"has no {name} of shape {like.shape}")
+        values[name.removeprefix(folder)] = value.copy()
+    return values
+
+
 def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
     """Eigenvalues (6,) of a symmetric matrix (6, 6), and the eigenvectors as rows, by Jacobi rotations of three pairs
     at a time (Golub and Van Loan, section 8.5): LAPACK has other bits on another processor."""
@@ -137,16 +151,10 @@ class Poses:
         """Take the arrays of a checkpoint. Raises ValueError where that is of other views."""
         if not self.on:
             return
-        values = {}
-        for name, own in self.arrays().items():
-            value = arrays.get(name.removeprefix("poses/"))
-            if value is None or value.shape != own.shape or value.dtype != own.dtype or not np.isfinite(value).all():
-                raise ValueError(f"has no {name} of shape {own.shape}")
-            values[name.removeprefix("poses/")] = value
+        values = checked_arrays(self.arrays(), arrays, "poses/")
         turned = values["rotations"]
         if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > NO_ROTATION:
             raise ValueError("has poses/rotations that are none")
         poses = zip(self._given, values["rotations"], values["translations"], strict=True)
         self.cameras = [given.posed(rotation, translation) for given, rotation, translation in poses]
-        self._first, self._second = values["first"].copy(), values["second"].copy()
-        self._visits = values["visits"].copy()
+        self._first, self._second, self._visits = values["first"], values["second"], values["visits"]

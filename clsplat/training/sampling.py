@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,13 +24,12 @@ class SamplingFilter:
     """The least scales of a model in training, by the cameras of its pictures at their full size; nothing where the
     settings ask for none."""
 
-    def __init__(self, config: TrainConfig, device: Device, work: Workspace, cameras: Mapping[str, Camera]) -> None:
-        """cameras: by the views' names."""
+    def __init__(self, config: TrainConfig, device: Device, work: Workspace, cameras: Sequence[Camera]) -> None:
         self._device, self._work, self._on = device, work, config.antialiased
         self._least: DeviceArray | None = None  # (n,), None where they have to be worked out before the next step
         if not self._on:
             return
-        self._cameras = upload_cameras(device, list(cameras.values()))
+        self._cameras = upload_cameras(device, cameras)
 
     def is_due(self, step: int) -> bool:
         """True if the least scales are worked out before this step."""

@@ -132,7 +132,7 @@ class Trainer:
         self.cameras = Cameras(self.config, self.views, self.scene.extent)
         self.origin, self.near = initial.origin, self.scene.near
         self._cameras: dict[int, tuple[Camera, Camera]] = {}
-        cameras = {view.name: self.local(view.camera) for view in self.views}
+        cameras = [self.local(view.camera) for view in self.views]
         self.sampling = SamplingFilter(self.config, self.device, self.rasterizer.work, cameras)
         self._make_plan(len(initial))
         if self.plan.streamed:

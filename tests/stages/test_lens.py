@@ -58,7 +58,9 @@ def test_the_twin_by_central_differences(kind: str) -> None:
     found = reference.render_lens_grad(model, camera, d_image, BACKGROUND)
 
     def loss(by: np.ndarray) -> float:
-        return float((reference.render(model, camera.refocused(by), BACKGROUND)[0] * d_image).sum())
+        focal = {"fx": camera.fx * np.exp(by[0]), "fy": camera.fy * np.exp(by[1])}
+        other = replace(camera, **focal, cx=camera.cx + by[2], cy=camera.cy + by[3])
+        return float((reference.render(model, other, BACKGROUND)[0] * d_image).sum())
 
     slopes = np.array([(loss(step) - loss(-step)) / 2 / step.sum() for step in np.diag(STEPS)])
     for part in (slice(2), slice(2, 4)):  # of 12 digits that a loss of about 100 has, such steps leave 6
@@ -110,8 +112,8 @@ def test_sums_at_the_seams(device: Device, count: int) -> None:
 
 def test_another_lens_sees_from_the_same_place() -> None:
     camera = scenes.tilted_camera(40, 30)
-    other = camera.refocused(np.array([np.log(2), 0.0, 1.5, -0.5]))
-    assert (other.fx, other.fy) == (pytest.approx(2 * camera.fx), camera.fy)
-    assert (other.cx, other.cy) == (camera.cx + 1.5, camera.cy - 0.5)
+    other = camera.refocused(float(np.log(2)), 0.0625, -0.125)
+    assert (other.fx, other.fy) == (pytest.approx(2 * camera.fx), pytest.approx(2 * camera.fy))
+    assert (other.cx, other.cy) == (camera.cx + 0.0625 * camera.fx, camera.cy - 0.125 * camera.fy)
     assert (other.rotation == camera.rotation).all()
     assert (other.translation == camera.translation).all()

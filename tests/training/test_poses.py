@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses that are refined in training: they come back, two are held, bytes, and what a run has of them."""
+"""Poses that are refined in training: they come back, two are held, and what a run has of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from same_bytes import check_in_less_memory, interrupted, model_bytes
+from same_bytes import model_bytes
 from tiny import short, write_scene
 
 from clsplat.api import train
@@ -99,30 +99,10 @@ def test_a_held_out_view_is_aligned(scene: Scene, default_device: Device) -> Non
     assert pixels_off(found, view.camera, scene.points) < 0.33
 
 
-def test_an_interruption_gives_the_same_bytes(
-    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
-) -> None:
-    """At step 10, when every view but those that are held has moved."""
-    assert interrupted(scene, CONFIG, default_device, tmp_path) == undisturbed
-
-
 def test_moving_poses_make_another_model(
     scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
 ) -> None:
     assert model_bytes(scene, replace(CONFIG, refine_poses=False), default_device, tmp_path) != undisturbed
-
-
-@pytest.mark.slow
-def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
-    scene = load_scene(write_scene(tmp_path / "scene", points=False))
-    check_in_less_memory(scene, replace(CONFIG, random_points=1500), default_device, tmp_path)
-
-
-def test_poison_changes_no_byte(
-    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("CLSPLAT_POISON", "1")
-    assert model_bytes(scene, CONFIG, default_device, tmp_path / "poisoned") == undisturbed
 
 
 def test_what_a_run_has_of_them(folder: Path, scene: Scene, default_device: Device, tmp_path: Path) -> None:
