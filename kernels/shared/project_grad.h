@@ -1,0 +1,345 @@
+// The chain rule from the sums of LANES Gaussians' slots back to their parameters, and to the camera's lens. Equation
+// numbers are those of docs/gradients.md, with RAYS of docs/cameras.md. Needs splat.h, gaussian.h and sh.h, with RAYS
+// tangent.h; defines are those of project_grad.cl.
+
+// Memory that the gradients of the higher SH bands are written to: all Gaussians', or a work-item's own. With one lane
+// project_step makes them of basis and colour.
+#if !defined(ADAM)
+#define SH_GRADIENT __global float
+#elif LANES > 1
+#define SH_GRADIENT float
+#endif
+
+// The SH coefficients after the first one, of so many that are used.
+#define SH_HIGHER 15
+#if LANES == 1
+#define FOR_HIGHER(k, used) UNROLL for (int k = 1; k <= SH_HIGHER; ++k) if (k < (used))
+#else
+#define FOR_HIGHER(k, used) for (int k = 1; k < (used); ++k)
+#endif
+
+// Gradients of LANES Gaussians by their parameters. That by an SH coefficient is the basis there times colour's; colour
+// is a row's red, green and blue, each zero where it is clamped.
+typedef struct {
+  Lanes mean[3], quaternion[4], scale[3], opacity, colour[3], basis[16];
+} Gradients;
+
+// Gradients of the visible ones of the rows from first_row on; returns 0 if none is visible. `shown` (LANES) is 1 where
+// one is. Fills screen and contributions, and of visible rows d_sh_rest, which is row first_row's.
+static inline int gradients_of(const uint n, const uint first_row, const int coefficients, __constant float *camera,
+                               __global const uint *tile_counts, __global const uint *first_slots,
+                               __global const float *slots, __global const float *splats, __global const float *means,
+                               __global const float *quaternions, __global const float *log_scales,
+                               __global const float *opacity_logits, __global const float *sh_rest,
+                               __global float *screen,
+#ifdef CONTRIBUTIONS
+                               __global float *contributions,
+#endif
+#ifdef LENS
+                               __global float *by_lens,
+#endif
+#ifdef PENALTIES
+                               const float opacity_weight, const float scale_weight,
+#endif
+#ifdef SH_GRADIENT
+                               SH_GRADIENT *d_sh_rest,
+#endif
+                               int *shown, Gradients *d) {
+  uint row[LANES];
+  for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < n ? first_row + lane : n - 1;
+  const uint lanes_used = n - first_row < LANES ? n - first_row : LANES;
+  Lanes m[SLOT_STRIDE];
+  int any = 0;
+  for (int field = 0; field < SLOT_STRIDE; ++field) m[field].all = (floatL)(0.0f);
+  Lanes whitening[3]; // nobody has written the splats of Gaussians that are not visible
+  for (int k = 0; k < 3; ++k) whitening[k].all = (floatL)(0.0f);
+  for (uint lane = 0; lane < LANES; ++lane) {
+    const uint count = lane < lanes_used ? tile_counts[first_row + lane] : 0;
+    shown[lane] = count > 0;
+    if (count == 0) continue;
+    any = 1;
+#ifdef ADDED_UP
+    __global const float *slot = slots + (size_t)SLOT_STRIDE * (first_row + lane);
+    const uint addends = 1;
+#else
+    __global const float *slot = slots + (size_t)SLOT_STRIDE * first_slots[first_row + lane];
+    const uint addends = count;
+#endif
+    float sums[SLOT_STRIDE];
+    for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
+    for (uint k = 0; k < addends; ++k, slot += SLOT_STRIDE)
+      for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] += slot[field];
+    for (int field = 0; field < SLOT_STRIDE; ++field) m[field].lane[lane] = sums[field];
+#ifndef RAYS
+    __global const float *splat = splats + (size_t)SPLAT_SIZE * (first_row + lane);
+    whitening[0].lane[lane] = splat[SPLAT_L11];
+    whitening[1].lane[lane] = splat[SPLAT_L12];
+    whitening[2].lane[lane] = splat[SPLAT_L22];
+#endif
+  }
+#ifdef RAYS
+  RayProjection p;
+  if (!any || !project_ray(first_row, means, quaternions, log_scales, camera, &p)) return 0;
+  whitening[0].all = WHITEN * sqrt(p.syy / p.det);
+  whitening[1].all = -(p.sxy / p.syy) * whitening[0].all;
+  whitening[2].all = WHITEN / sqrt(p.syy);
+#else
+  Projection p;
+  if (!any || !project_gaussians(row, means, quaternions, log_scales, camera, &p)) return 0;
+#endif
+  const floatL l11 = whitening[0].all, l12 = whitening[1].all, l22 = whitening[2].all;
+  const floatL m_g = m[SLOT_G].all, m_gu = m[SLOT_GU].all, m_gv = m[SLOT_GV].all;
+
+  // Opacity, (29) and (41): sum of g is o dL/do, and do/dlogit = o (1 - o).
+  Lanes d_screen[2];
+  d->opacity.all = m_g * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also where o is next to 1
+#ifdef PENALTIES                                                  // (91)
+  const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
+  d->opacity.all = fmaL(opacity_weight * opacity, sigmoidL(-GATHER(opacity_logits, 1, 0)), d->opacity.all);
+#endif
+
+#ifdef RAYS // along e1 and e2 of the tangent plane; on the screen per pixel there
+  const floatL d_mx = INVERSE_WHITEN2 * m_gu, d_my = INVERSE_WHITEN2 * m_gv;
+  const float side_x = sqrt(fma1(p.t.k[0], p.t.k[0], p.t.k[1] * p.t.k[1]));
+  const float side_y = sqrt(fma1(p.t.k[2], p.t.k[2], p.t.k[3] * p.t.k[3]));
+#ifdef ABSOLUTE_GRADIENTS
+  d_screen[0].all = side_x * (INVERSE_WHITEN2 * m[SLOT_ABSX].all);
+  d_screen[1].all = side_y * (INVERSE_WHITEN2 * m[SLOT_ABSY].all);
+#else
+  d_screen[0].all = side_x * d_mx;
+  d_screen[1].all = side_y * d_my;
+#endif
+#else
+  // (50). Mean on the image: -W^T (sum of g w).
+  const floatL d_mx = -INVERSE_WHITEN2 * (l11 * m_gu);
+  const floatL d_my = -INVERSE_WHITEN2 * fmaL(l12, m_gu, l22 * m_gv);
+#ifdef ABSOLUTE_GRADIENTS
+  d_screen[0].all = INVERSE_WHITEN2 * m[SLOT_ABSX].all;
+  d_screen[1].all = INVERSE_WHITEN2 * m[SLOT_ABSY].all;
+#else
+  d_screen[0].all = d_mx;
+  d_screen[1].all = d_my;
+#endif
+#endif
+
+  // (58). The columns of M = J A S, whitened: w[k] times the scale. Of order one, and differences of nothing large.
+  const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
+#ifdef ANTIALIASED
+  // (84). The compensated opacity falls with the determinant of the filtered covariance, and rises with the other's.
+  const intL compensated = p.det0 / p.det > LEAST_COMPENSATION * LEAST_COMPENSATION;
+  const floatL thinner = compensated ? m_g : (floatL)(0.0f), by_det0 = compensated ? m_g / p.det0 : (floatL)(0.0f);
+  const floatL uu = fmaL((floatL)(unwhiten), m[SLOT_GUU].all, -INVERSE_WHITEN2 * thinner),
+               uv = unwhiten * m[SLOT_GUV].all;
+  const floatL vv = fmaL((floatL)(unwhiten), m[SLOT_GVV].all, -INVERSE_WHITEN2 * thinner);
+  floatL across_x = (floatL)(0.0f), across_y = across_x;
+#else
+  const floatL uu = unwhiten * m[SLOT_GUU].all, uv = unwhiten * m[SLOT_GUV].all, vv = unwhiten * m[SLOT_GVV].all;
+#endif
+  floatL wu[3], wv[3];
+  const floatL lean = l11 / p.syy;
+  FOR_AXES(k) {
+#ifdef RAYS // the same by minors of the directions' plane, and of the low-pass' columns
+    const float inverse = 1.0f / p.distance, b1 = inverse * p.c1[k], b2 = inverse * p.c2[k];
+    float minors = 0.0f;
+    for (int j = 3; j < 5; ++j) minors = fma1(p.m2[j], fma1(p.m2[j], b1, -(p.m1[j] * b2)), minors);
+    const int l = (k + 1) % 3, n = (k + 2) % 3;
+    const float by_n = minor_of_axis(&p, camera, n), by_l = minor_of_axis(&p, camera, l);
+    minors = fma1(p.m2[l], p.s[l] * by_n, fma1(-p.m2[n], p.s[n] * by_l, minors));
+    wu[k] = lean * minors;
+    wv[k] = l22 * b2;
+#else
+    const int l = (k + 1) % 3, n = (k + 2) % 3;
+    const floatL minors = fmaL(p.s[l] * p.b2[l], p.s[l] * p.c[n], -(p.s[n] * p.b2[n] * (p.s[n] * p.c[l])));
+    wu[k] = lean * fmaL((floatL)(LOW_PASS), p.b1[k], minors);
+    wv[k] = l22 * p.b2[k];
+#endif
+  }
+
+  // (122). The gradient of nearness by depth, which along the axis is towards the camera.
+#ifndef NEARNESS
+#define LESS_NEAR(z)
+#else
+#define LESS_NEAR(z) -m[SLOT_NEAR].all / ((z) * (z))
+#endif
+
+  // (59) to (61): log scales, the turn in the Gaussian's own frame, and what the Jacobian takes of the gradient.
+  floatL d_size = (floatL)(0.0f), along_u = d_size, along_v = d_size, turned[3];
+#ifdef LENS
+  Lanes lens[4];
+  lens[0].all = lens[1].all = d_size;
+#endif
+  FOR_AXES(k) {
+    const int l = (k + 1) % 3, n = (k + 2) % 3;
+    const floatL nu = p.s[k] * wu[k], nv = p.s[k] * wv[k];
+    const floatL tu = fmaL(uu, nu, uv * nv), tv = fmaL(uv, nu, vv * nv);
+    d->scale[k].all = fmaL(nu, tu, nv * tv);
+#ifdef ANTIALIASED
+#ifdef RAYS
+    const float c[3] = {minor_of_axis(&p, camera, k), minor_of_axis(&p, camera, l), minor_of_axis(&p, camera, n)};
+#else
+    const floatL c[3] = {p.c[k], p.c[l], p.c[n]};
+#endif
+    const floatL area = p.s[l] * p.s[n], minor = area * c[0]; // (85) to (87)
+    const floatL other_l = p.s[n] * p.s[k] * c[1], other_n = p.s[k] * p.s[l] * c[2];
+    d->scale[k].all = fmaL(by_det0, fmaL(other_l, other_l, other_n * other_n), d->scale[k].all);
+    const floatL lever = by_det0 * minor * area;
+#ifdef RAYS // (29) of docs/cameras.md: the minors are the axes' parts along the mean's direction
+    const float turned_by = camera[CAMERA_HAND] / (p.distance * p.distance);
+    across_x = fma1(lever, turned_by * p.c1[k], across_x);
+    across_y = fma1(lever, turned_by * p.c2[k], across_y);
+#else
+    across_x = fmaL(lever, fmaL(p.jx * p.rx, p.a2[k], p.b1[k]), across_x);
+    across_y = fmaL(lever, fmaL(p.jy * p.ry, p.a2[k], p.b2[k]), across_y);
+#endif
+#endif
+    d_size += d->scale[k].all;
+#ifdef RAYS
+    const floatL depth = p.s[k] * depth_of_axis(&p, k);
+#else
+    const floatL depth = p.s[k] * p.a2[k];
+#endif
+    along_u = fmaL(tu, depth, along_u);
+    along_v = fmaL(tv, depth, along_v);
+#ifdef LENS // (144): a focal length is a factor of a row of M
+    lens[0].all = fmaL(l11 * tu, p.s[k] * p.b1[k], lens[0].all);
+    lens[1].all = fmaL(fmaL(l12, tu, l22 * tv), p.s[k] * p.b2[k], lens[1].all);
+#endif
+    const floatL apart = scale_difference(GATHER(log_scales, 3, l) - GATHER(log_scales, 3, n), p.s[l], p.s[n]);
+    const floatL au = apart * wu[l], av = apart * wv[l], sum = p.s[l] + p.s[n];
+    turned[k] = fmaL(fmaL(uu, au, uv * av), sum * wu[n], fmaL(uv, au, vv * av) * (sum * wv[n]));
+#ifdef ANTIALIASED
+    turned[k] = fmaL(-(by_det0 * p.s[k] * c[1]), apart * sum * (p.s[k] * c[2]), turned[k]);
+#endif
+  }
+#ifdef PENALTIES
+  FOR_AXES(k) d->scale[k].all = fmaL((floatL)(scale_weight), p.s[k], d->scale[k].all);
+#endif
+  const floatL w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
+  const floatL turn = 2.0f / p.length;
+  d->quaternion[0].all = turn * -fmaL(x, turned[0], fmaL(y, turned[1], z * turned[2]));
+  d->quaternion[1].all = turn * fmaL(w, turned[0], fmaL(y, turned[2], -(z * turned[1])));
+  d->quaternion[2].all = turn * fmaL(w, turned[1], fmaL(z, turned[0], -(x * turned[2])));
+  d->quaternion[3].all = turn * fmaL(w, turned[2], fmaL(x, turned[1], -(y * turned[0])));
+
+#ifdef RAYS                                               // (22) to (28) of docs/cameras.md
+  const float half_u = 0.5f * l11, half_uu = half_u * uu; // G = W^T (sum of g w w^T) W / 2
+  const float turned_v = fma1(l12, uu, l22 * uv);
+  const float by_covariance[3] = {half_uu * l11, half_u * turned_v,
+                                  0.5f * fma1(l12, turned_v, l22 * fma1(l12, uv, l22 * vv))};
+  float by_low_pass[2];
+  low_pass_gradient(p.f, camera, by_covariance, by_low_pass);
+#ifdef ANTIALIASED
+  by_low_pass[0] += across_x;
+  by_low_pass[1] += across_y;
+#endif
+  const float turn_x = (d_mx + by_low_pass[0] - l11 * along_u / p.distance) / p.distance;
+  const float turn_y = (d_my + by_low_pass[1] - fma1(l12, along_u, l22 * along_v) / p.distance) / p.distance;
+  const float shrink = d_size / p.distance - (0.0f LESS_NEAR(p.distance));
+  const float d_x = fma1(turn_x, p.t.e1[0], fma1(turn_y, p.t.e2[0], -(shrink * p.f[0])));
+  const float d_y = fma1(turn_x, p.t.e1[1], fma1(turn_y, p.t.e2[1], -(shrink * p.f[1])));
+  const float d_z = fma1(turn_x, p.t.e1[2], fma1(turn_y, p.t.e2[2], -(shrink * p.f[2])));
+#elif defined(ORTHOGRAPHIC) // the image is linear in x and y, and in nothing else
+  const floatL d_x = p.jx * d_mx, d_y = p.jy * d_my, d_z = (floatL)(0.0f)LESS_NEAR(p.z);
+#ifdef LENS
+  const floatL beyond_x = (floatL)(0.0f), beyond_y = beyond_x;
+#endif
+#else
+  // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, J moves with
+  // z alone.
+  const floatL rx = p.x / p.z, ry = p.y / p.z;
+#ifdef ANTIALIASED
+  const float hand = camera[CAMERA_HAND];
+  const floatL by_j02 = fmaL(l11, along_u, -(hand * (p.jy / p.jx) * across_x));
+  const floatL by_j12 = fmaL(l12, along_u, fmaL(l22, along_v, -(hand * (p.jx / p.jy) * across_y)));
+#else
+  const floatL by_j02 = l11 * along_u, by_j12 = fmaL(l12, along_u, l22 * along_v);
+#endif
+  const floatL d_j02 = rx == p.rx ? by_j02 : (floatL)(0.0f);
+  const floatL d_j12 = ry == p.ry ? by_j12 : (floatL)(0.0f);
+#ifdef LENS // (145): a clamped ratio is a place on the image, which stays where it is
+  const floatL beyond_x = (by_j02 - d_j02) / p.z, beyond_y = (by_j12 - d_j12) / p.z;
+#endif
+  const floatL d_x = p.jx * (d_mx - d_j02 / p.z), d_y = p.jy * (d_my - d_j12 / p.z);
+  const floatL d_z = -fmaL(d_x, rx, fmaL(d_y, ry, d_size / p.z)) LESS_NEAR(p.z);
+#endif
+
+#ifdef LENS
+#ifdef ANTIALIASED
+  lens[0].all += compensated ? m_g : (floatL)(0.0f);
+  lens[1].all += compensated ? m_g : (floatL)(0.0f);
+#endif
+  lens[0].all = fmaL(p.jx * p.x, d_mx, fmaL(p.jx * p.z * p.rx, beyond_x, lens[0].all));
+  lens[1].all = fmaL(p.jy * p.y, d_my, fmaL(p.jy * p.z * p.ry, beyond_y, lens[1].all));
+  lens[2].all = d_mx + beyond_x;
+  lens[3].all = d_my + beyond_y;
+#endif
+
+  // Colour, (38) to (40): a channel that is clamped has no gradient; the basis depends on the mean through the view
+  // direction, but for SH so large that the sum overflows.
+  floatL vx = FROM_CAMERA(means, X, 0), vy = FROM_CAMERA(means, Y, 1), vz = FROM_CAMERA(means, Z, 2);
+  const floatL length = sqrt(fmaL(vx, vx, fmaL(vy, vy, vz * vz)));
+#ifdef ORTHOGRAPHIC // one direction for all
+  vx = (floatL)(camera[CAMERA_R20]);
+  vy = (floatL)(camera[CAMERA_R21]);
+  vz = (floatL)(camera[CAMERA_R22]);
+#else
+  vx /= length;
+  vy /= length;
+  vz /= length;
+#endif
+  Lanes weight[16];
+  sh_basis(SH_USED(coefficients), vx, vy, vz, &d->basis[0].all);
+  for (uint lane = 0; lane < lanes_used; ++lane) {
+    const size_t i = first_row + lane;
+    if (!shown[lane]) continue;
+    __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
+    const float4 d_colour = (float4)(splat[SPLAT_RED] > 0.0f ? m[SLOT_RED].lane[lane] : 0.0f,
+                                     splat[SPLAT_GREEN] > 0.0f ? m[SLOT_GREEN].lane[lane] : 0.0f,
+                                     splat[SPLAT_BLUE] > 0.0f ? m[SLOT_BLUE].lane[lane] : 0.0f, 0.0f);
+    d->colour[0].lane[lane] = d_colour.x;
+    d->colour[1].lane[lane] = d_colour.y;
+    d->colour[2].lane[lane] = d_colour.z;
+    __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
+#ifdef SH_GRADIENT
+    SH_GRADIENT *d_f = d_sh_rest + 3 * (coefficients - 1) * lane;
+#endif
+    FOR_HIGHER(k, SH_USED(coefficients)) {
+#if defined(SH_GRADIENT) && !defined(NO_SH_REST) // OptimiserConfig.sh_rest_every
+      const float along = d->basis[k].lane[lane];
+      d_f[0] = along * d_colour.x;
+      d_f[1] = along * d_colour.y;
+      d_f[2] = along * d_colour.z;
+      d_f += 3;
+#endif
+      weight[k].lane[lane] = fma1(d_colour.x, f[0], fma1(d_colour.y, f[1], d_colour.z * f[2]));
+      f += 3;
+    }
+  }
+  floatL d_v[3];
+  sh_direction_gradient(SH_USED(coefficients), vx, vy, vz, &weight[0].all, d_v);
+  const floatL along = d_v[0] * vx + d_v[1] * vy + d_v[2] * vz;
+  FOR_AXES(k) {
+    const floatL v = k == 0 ? vx : (k == 1 ? vy : vz);
+#ifdef ORTHOGRAPHIC
+    const floatL by_colour = (floatL)(0.0f);
+#else
+    const floatL by_colour = (d_v[k] - along * v) / length;
+#endif
+    const floatL above = by_colour < 1e37f ? by_colour : (floatL)(0.0f);
+    d->mean[k].all = camera[CAMERA_R00 + k] * d_x + camera[CAMERA_R10 + k] * d_y + camera[CAMERA_R20 + k] * d_z +
+                     (by_colour > -1e37f ? above : (floatL)(0.0f));
+  }
+
+  for (uint lane = 0; lane < lanes_used; ++lane) {
+    const size_t i = first_row + lane;
+    if (!shown[lane]) continue;
+    for (int k = 0; k < 2; ++k) screen[2 * i + k] = d_screen[k].lane[lane];
+#ifdef CONTRIBUTIONS
+    contributions[i] = m[SLOT_WEIGHT].lane[lane];
+#endif
+#ifdef LENS
+    for (int k = 0; k < 4; ++k) by_lens[4 * i + k] = lens[k].lane[lane];
+#endif
+  }
+  return 1;
+}
