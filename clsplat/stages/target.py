@@ -43,24 +43,10 @@ def target(
     """
     if isinstance(image, DeviceArray):
         device.under_way.append(image.buffer)  # it may be the host's memory
-        render = () if blended is None else (blended.image.buffer, blended.stops.buffer)
-        key = (background, alpha, *render)
-        return work.replayed(image, key, lambda: _target(device, work, image, background, blended, alpha=alpha))
-    source = work.array("target_source", image.shape, image.dtype)
-    source.send(np.ascontiguousarray(image))
-    return _target(device, work, source, background, blended, alpha=alpha)
-
-
-def _target(
-    device: Device,
-    work: Workspace,
-    source: DeviceArray,
-    background: DeviceArray,
-    blended: Blended | None,
-    *,
-    alpha: bool,
-) -> DeviceArray:
-    """`target` of an image on the device."""
+        source = image
+    else:
+        source = work.array("target_source", image.shape, image.dtype)
+        source.send(np.ascontiguousarray(image))
     height, width, channels = source.shape
     rows, stride = padded_size(width, height)
     planes = work.array("target", (3 + alpha, rows, stride))

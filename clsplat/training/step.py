@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
 from typing import Any, Protocol, TypeVar
 from weakref import ref
 
@@ -120,11 +119,6 @@ class StepProbe:
         """Adam has changed these rows."""
 
 
-def _made_anew(_key: tuple[object, ...], make: Callable[[], R]) -> R:
-    """Call `make`: the place of `Workspace.replayed` in a step that waits for its counts."""
-    return make()
-
-
 @dataclass(frozen=True, eq=False)
 class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in the memory of a rasterizer.
@@ -175,18 +169,23 @@ class GradientStep:
         planes = target(device, work, photograph, frame.background, frame.blended, alpha=alpha_weight > 0)
         size, weight, appearance = (camera.width, camera.height), self.config.dssim_weight, self.appearance
         image = frame.blended.image if appearance is None else appearance.apply(work, frame.blended.image, *size)
-        replayed = _made_anew if self.room is None else partial(work.replayed, model[0])
         settings: dict[str, Any] = {"kept": kept, "alpha_weight": alpha_weight, "depth": depth}
-        result = (replayed if depth is None else _made_anew)(  # known depths are sent
-            (frame.part, image.buffer, kept, alpha_weight, self.turn),
-            lambda: loss(device, work, image, planes, *size, weight, self.turn, blended=frame.blended, **settings),
-        )
+
+        def compared() -> Loss:
+            return loss(device, work, image, planes, *size, weight, self.turn, blended=frame.blended, **settings)
+
+        if depth is None:
+            key = (frame.part, image.buffer, kept, alpha_weight, self.turn)
+            result = self.replayed(model[0], key, compared)
+        else:  # known depths are sent
+            result = compared()
         if reads_loss:
             result = result.fetched()
         probe.loss(result)
         if appearance is not None:
             columns = appearance.gradient(work, frame.blended.image, image, result.gradient, *size)
-        slots = replayed(
+        slots = self.replayed(
+            model[0],
             (frame.part, frame.background, result.gradient, self.fields),
             lambda: rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
         )
@@ -211,6 +210,15 @@ class GradientStep:
             self.learn(appearance, columns)
         return result
 
+    def replayed(
+        self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
+    ) -> R:
+        """`Workspace.replayed` in a step by capacity. One with exact counts has new arrays each time, and a tape of it
+        would never be used again."""
+        if self.room is None:
+            return make()
+        return self.rasterizer.work.replayed(of, key, make, numbers)
+
     def learn(self, appearance: ViewAppearance, columns: DeviceArray) -> None:
         """Adam's step of the view's appearance."""
         appearance.update(columns, self.rasterizer.readback)
@@ -226,18 +234,15 @@ class GradientStep:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
             arguments = (rows.device, self.step, self.rates, optimiser, rows.model, *view)
             fields, explore = self.fields, self.explore
-            if self.room is None:
-                project_step(*arguments, fields=fields, explore=explore)
-            else:
-                arrays = (*vars(rows.slots).values(), *vars(rows.screen).values())
-                key = (*map(ref, rows.model), rows.projected, *arrays, updates_sh_rest(optimiser, self.step))
-                penalised = explore is not None and explore.penalised
-                self.rasterizer.work.replayed(
-                    rows.parameters,
-                    (*key, rows.device, rows.camera_array, fields, penalised),
-                    lambda: project_step(*arguments, fields=fields, explore=explore),
-                    step_numbers(optimiser, self.step, self.rates, explore),
-                )
+            arrays = (*vars(rows.slots).values(), *vars(rows.screen).values())
+            key = (*map(ref, rows.model), rows.projected, *arrays, updates_sh_rest(optimiser, self.step))
+            penalised = explore is not None and explore.penalised
+            self.replayed(
+                rows.parameters,
+                (*key, rows.device, rows.camera_array, fields, penalised),
+                lambda: project_step(*arguments, fields=fields, explore=explore),
+                step_numbers(optimiser, self.step, self.rates, explore),
+            )
         if self.explore is not None:
             noise(self.device, self.explore, rows.parameters, rows.start, readback)
 

@@ -77,7 +77,7 @@ class Watched(StepProbe):
         device, camera, screen = self.trainer.device, self.sample.camera, rows.screen
         if self.needs.gradients:
             size, threshold = (camera.width, camera.height, camera.fx), self.needs.threshold
-            self.trainer.rasterizer.work.replayed(
+            self.step.replayed(
                 statistics,
                 (rows.projected, screen.gradients, *size, threshold),
                 lambda: add_statistics(device, statistics, camera, rows.projected, screen, threshold),

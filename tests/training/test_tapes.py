@@ -123,6 +123,18 @@ def test_every_setting_has_its_bytes(
             assert (len(checked) > 20) == (use == CHECK and config.batch == 1)
 
 
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_step_with_exact_counts_makes_no_tape(
+    default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch, batch: int
+) -> None:
+    """Its arrays are new each time: a tape would never be used, and its kernel objects take the host a millisecond."""
+    made: list[int] = []
+    monkeypatch.setattr(Tape, "add_launch", lambda *_: made.append(1))
+    config = replace(PLAIN, batch=batch, iterations=6)
+    trained(load_scene(folder), config, default_device, monkeypatch, capacity="0", tapes="1")
+    assert not made
+
+
 def test_a_number_that_is_not_declared_is_found(
     default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
