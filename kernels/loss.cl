@@ -24,9 +24,6 @@
 #include "shared/lanes.h"
 #include "shared/group.h"
 
-// PoCL 3.0 gives garbage where one of the passes below is a call of its own, as a second use would make it.
-#define PASS __attribute__((always_inline)) static inline
-
 #define TAPS 11
 #define REACH 5
 #define C1 1e-4f
@@ -88,7 +85,7 @@ static inline int2 taps_inside(const Block block, const int y) {
 
 // near = the vertical windows around y and the rows below: means of x and y, variances of x and y, covariance; 0
 // outside the image.
-PASS void moments(const Block block, const int margin, const int y, __local float *near) {
+static inline void moments(const Block block, const int margin, const int y, __local float *near) {
   FOR_VECTORS(block, margin) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) {
@@ -123,7 +120,7 @@ PASS void moments(const Block block, const int margin, const int y, __local floa
 
 // near -> partials: dSSIM by the mean of x as far as it counts from the pixel in the middle, by the variance and by the
 // covariance, 0 right of the image. Returns the item's sum of SSIM over the block's own columns.
-PASS float derivatives(const Block block, const int margin, const int y, __local float *near) {
+static inline float derivatives(const Block block, const int margin, const int y, __local float *near) {
   floatL total = (floatL)(0.0f);
   FOR_VECTORS(block, margin) {
     VECTOR(block)
@@ -167,7 +164,7 @@ PASS float derivatives(const Block block, const int margin, const int y, __local
 
 // near = the partials' vertical windows, the first with what the pixels differ by from the one in the middle; image and
 // target; 0 outside the image.
-PASS void adjoint_moments(const Block block, const int margin, const int y, __local float *near) {
+static inline void adjoint_moments(const Block block, const int margin, const int y, __local float *near) {
   FOR_VECTORS(block, margin) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) {
@@ -200,8 +197,8 @@ PASS void adjoint_moments(const Block block, const int margin, const int y, __lo
 
 // near -> gradient, a plane. Returns the item's sums of |image - target| and of its square. l1_scale and ssim_scale are
 // the weights over the number of pixels and channels.
-PASS float2 differences(const Block block, const int y, const float l1_scale, const float ssim_scale,
-                        __local float *near, __global float *gradient) {
+static inline float2 differences(const Block block, const int y, const float l1_scale, const float ssim_scale,
+                                 __local float *near, __global float *gradient) {
   floatL absolute = (floatL)(0.0f), squares = absolute;
   FOR_VECTORS(block, 0) {
     VECTOR(block)
