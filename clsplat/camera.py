@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from clsplat.arrays import Float64
+from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError
 
 Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
@@ -21,12 +21,17 @@ Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"
 class ProjectionKind:
     """Properties of a projection.
 
-    flat: True if there is an image plane, on which Gaussians are ellipses and depth is z; else a pixel is a ray, and
-    depth the distance; defines: those that the kernels are built with.
+    flat: True if there is an image plane; defines: those that the kernels are built with.
     """
 
     flat: bool = True
     defines: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def rays(self) -> bool:
+        """True if Gaussians are ellipses on planes of their own, at which a pixel looks along its ray, and kernels have
+        distances for depths; else they are on the image's plane, and depth is z."""
+        return "RAYS" in self.defines
 
 
 PROJECTIONS: dict[Projection, ProjectionKind] = {
@@ -39,6 +44,12 @@ PROJECTIONS: dict[Projection, ProjectionKind] = {
 
 BENT_FISHEYE = ProjectionKind(flat=False, defines={"RAYS": 2, "KANNALA_BRANDT": True})
 """The fisheye with coefficients (`Camera.radial`)."""
+
+PERSPECTIVE_BY_RAYS = ProjectionKind(defines={"RAYS": 3})
+"""The pinhole that shows what a fisheye shows (`Camera.by_rays`)."""
+
+KINDS = (*PROJECTIONS.values(), BENT_FISHEYE, PERSPECTIVE_BY_RAYS)
+"""Every kind that a camera may have."""
 
 LEAST_SLOPE = 0.1
 """Pixels a radian, in those of the axis, from which on a fisheye's picture counts as folded over: it has nothing there,
@@ -88,6 +99,9 @@ class Camera:
     radial: k1 to k4 of a fisheye (Kannala and Brandt; OpenCV's and COLMAP's OPENCV_FISHEYE): the angle t from the axis
     is t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from it; 0 for the equidistant one.
 
+    by_rays: True for a perspective camera that draws Gaussians as the fisheye and the panorama do, along the rays of
+    its pixels, for a model that was trained so (`Gaussians.by_rays`).
+
     window: where the picture is a part of a frame, or more than it: width and height are the picture's, cx and cy are
     measured from the frame's corner. What both show has the same bits where x and y are multiples of a tile and the
     Jacobian's clamp is the same (docs/pictures.md).
@@ -106,10 +120,13 @@ class Camera:
     projection: Projection = "perspective"
     window: Window | None = None
     radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    by_rays: bool = False
 
     @property
     def kind(self) -> ProjectionKind:
         """The properties of its projection."""
+        if self.by_rays:
+            return PERSPECTIVE_BY_RAYS
         return BENT_FISHEYE if any(self.radial) else PROJECTIONS[self.projection]
 
     @cached_property
@@ -155,12 +172,16 @@ class Camera:
             )
         if not 0 < self.near < self.far:
             raise InputError(f"camera: near is {self.near}, far {self.far}, expected 0 < near < far")
+        self._check_projection()
+
+    def _check_projection(self) -> None:
         if self.projection not in PROJECTIONS:
             raise InputError(f"camera: projection is {self.projection!r}, expected one of {', '.join(PROJECTIONS)}")
-        if any(self.radial) and self.projection != "fisheye":
-            raise InputError(
-                f"camera: radial is {self.radial} of a camera that is {self.projection}, expected a fisheye"
-            )
+        for name, of, other in (("radial", "fisheye", any(self.radial)), ("by_rays", "perspective", self.by_rays)):
+            if other and self.projection != of:
+                raise InputError(
+                    f"camera: {name} is {getattr(self, name)} of a camera that is {self.projection}, expected {of}"
+                )
         if len(self.radial) != 4 or not all(math.isfinite(value) for value in self.radial):
             raise InputError(f"camera: radial is {self.radial}, expected four finite numbers")
 
@@ -194,6 +215,22 @@ class Camera:
     def before(self, near: float) -> Camera:
         """The same view of a model whose near plane is at `near`: that counts unless the camera has its own."""
         return replace(self, near=near) if self.near == NEAR != near else self
+
+    def along_rays(self, by_rays: bool) -> Camera:
+        """The same view of a model that is drawn along rays, or is not; for another projection than perspective the
+        camera itself."""
+        changes = self.projection == "perspective" and by_rays != self.by_rays
+        return replace(self, by_rays=by_rays) if changes else self
+
+    def depths_of_distances(self) -> Float32 | None:
+        """What depth, z, is in distances, for each pixel (height, width) of a perspective camera whose kernels have
+        distances; None where what they have is the depth."""
+        if not self.by_rays:
+            return None
+        x, y = (self.window.x, self.window.y) if self.window else (0, 0)
+        a = (x + np.arange(self.width) + 0.5 - self.cx) / self.fx
+        b = (y + np.arange(self.height) + 0.5 - self.cy) / self.fy
+        return (1 / np.sqrt(1 + a**2 + b[:, None] ** 2)).astype(np.float32)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view on another pixel grid: pixel centres at +0.5 make this a pure scaling.

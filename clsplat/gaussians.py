@@ -26,7 +26,8 @@ class Gaussians:
     colour = 0.5 + sum of basis times coefficient. All float32, C-contiguous. origin (3,) float64: the place in the
     world that the means count from; 0 but for scenes far from it, which float32 would blur (docs/decisions/0017). near:
     where cameras without a near plane of their own begin to see, world units (docs/decisions/0019). antialiased: True
-    for a model that is drawn with the filter of docs/gradients.md, section 13, as it was trained.
+    for a model that is drawn with the filter of docs/gradients.md, section 13, as it was trained; by_rays: True for one
+    that perspective cameras draw along the rays of their pixels (`Camera.by_rays`), as it was trained.
     """
 
     means: Float32
@@ -37,6 +38,7 @@ class Gaussians:
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
     near: float = NEAR
     antialiased: bool = False
+    by_rays: bool = False
 
     def __len__(self) -> int:
         return len(self.means)
@@ -51,8 +53,9 @@ class Gaussians:
         return {group.field: getattr(self, group.field) for group in GROUPS.values()}
 
     def local(self, camera: Camera) -> Camera:
-        """A camera in the world as one that counts from where the means do, with the model's near plane."""
-        return camera.from_origin(self.origin).before(self.near)
+        """A camera in the world as one that counts from where the means do, with the model's near plane, which draws as
+        the model wants it."""
+        return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def check(self) -> None:
         """Raise ValueError naming the array whose dtype or shape is not as the class says."""

@@ -35,7 +35,7 @@ static inline void normal_of(__global const float *q, __global const float *log_
 #ifdef FEATURE_MOTION
 // (64): from the mean's place on the image to that under another camera, in pixels; 0 where that has it behind its near
 // plane.
-#ifdef RAYS
+#if defined(RAYS) && RAYS != 3
 typedef struct {
   Double at[3];
 } InCamera;
@@ -90,19 +90,31 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
 #endif
 }
 #else
-// Whole pixels and the rest are subtracted apart, as a float32 of their sum would be cut.
-static inline void motion_of(__constant float *camera, float x, float y, float z, __global const float *splat,
-                             __global float *motion) {
+// The place of a mean on the image, whole pixels and the rest; 0 where it is not before the near plane.
+static inline int place_of(__constant float *camera, float x, float y, float z, float *whole, float *rest) {
   const Double at_x = CAMERA_ROW(0), at_y = CAMERA_ROW(1), at_z = CAMERA_ROW(2);
-  motion[0] = motion[1] = 0.0f;
-  if (!(at_z.high > camera[CAMERA_NEAR])) return;
-  float whole, rest;
+  if (!(at_z.high > camera[CAMERA_NEAR])) return 0;
   image_position(at_x.high, at_x.low, at_z.high, at_z.low, camera[CAMERA_FX], camera[CAMERA_FX_LOW], camera[CAMERA_CX],
-                 camera[CAMERA_CX_LOW], camera[CAMERA_WINDOW_X], &whole, &rest);
-  motion[0] = (whole - splat[SPLAT_PIXEL_X]) + (rest - splat[SPLAT_SUB_X]);
+                 camera[CAMERA_CX_LOW], camera[CAMERA_WINDOW_X], &whole[0], &rest[0]);
   image_position(at_y.high, at_y.low, at_z.high, at_z.low, camera[CAMERA_FY], camera[CAMERA_FY_LOW], camera[CAMERA_CY],
-                 camera[CAMERA_CY_LOW], camera[CAMERA_WINDOW_Y], &whole, &rest);
-  motion[1] = (whole - splat[SPLAT_PIXEL_Y]) + (rest - splat[SPLAT_SUB_Y]);
+                 camera[CAMERA_CY_LOW], camera[CAMERA_WINDOW_Y], &whole[1], &rest[1]);
+  return 1;
+}
+
+// Whole pixels and the rest are subtracted apart, as a float32 of their sum would be cut.
+static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
+                             __global const float *splat, __global float *motion) {
+  float whole[2], rest[2];
+  motion[0] = motion[1] = 0.0f;
+  if (!place_of(after, x, y, z, whole, rest)) return;
+#ifdef RAYS // a splat has no place
+  float own_whole[2], own_rest[2];
+  if (!place_of(camera, x, y, z, own_whole, own_rest)) return;
+  for (int k = 0; k < 2; ++k) motion[k] = (whole[k] - own_whole[k]) + (rest[k] - own_rest[k]);
+#else
+  motion[0] = (whole[0] - splat[SPLAT_PIXEL_X]) + (rest[0] - splat[SPLAT_SUB_X]);
+  motion[1] = (whole[1] - splat[SPLAT_PIXEL_Y]) + (rest[1] - splat[SPLAT_SUB_Y]);
+#endif
 }
 #endif
 #endif
@@ -132,10 +144,10 @@ __kernel void features(const uint n, __constant float *camera, __constant float 
   row[FEATURE_POSITION + 2] = z;
 #endif
 #ifdef FEATURE_MOTION
-#ifdef RAYS
+#if defined(RAYS) && RAYS != 3
   motion_of(camera, after, x, y, z, row + FEATURE_MOTION);
 #else
-  motion_of(after, x, y, z, splat, row + FEATURE_MOTION);
+  motion_of(camera, after, x, y, z, splat, row + FEATURE_MOTION);
 #endif
 #endif
 }

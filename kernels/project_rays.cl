@@ -1,11 +1,12 @@
-// Projection for equirectangular (RAYS == 1) and fisheye (RAYS == 2) cameras: each Gaussian to its ellipse on the plane
-// that touches the sphere of directions at its mean's, where perspective bends it least; there is no pole and no seam.
+// Projection along rays, for equirectangular (RAYS == 1), fisheye (RAYS == 2) and perspective (RAYS == 3) cameras: each
+// Gaussian to its ellipse on the plane that touches the sphere of directions at its mean's, where perspective bends it
+// least; there is no pole and no seam.
 //
 // Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
 // Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
 // Buffers: As in project.cl, but for what that can leave out of a model that is held -> splats (n, RAY_SIZE),
 //   directions in the camera's axes and distance in world units; tile_counts (n).
-// Equations: docs/cameras.md, (8) to (14), (18), (19); colour docs/gradients.md, (12).
+// Equations: docs/cameras.md, (8) to (14), (18), (19), (30), (32); colour docs/gradients.md, (12).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -21,18 +22,44 @@
 
 // Slack of a box in pixels, over TILE_SLACK: what float32 angles lose of a picture 32768 wide.
 #define BOX_SLACK 0.1f
+#define NO_END 1e15f
+#define LEAST_AHEAD 1e-4f // of a direction's length; less is beyond every picture
 
 typedef struct {
   float low_x, high_x, low_y, high_y; // in pixels, not clamped
   int whole_rows;                     // it goes all the way round
 } Box;
 
+#if RAYS == 3
+// (32), one side: where directions within an angle, of the sine `sine`, of one with the coordinates along and z are on
+// the image, in focal lengths; without an end where they reach beyond the camera's plane.
+static inline void side_of(float along, float z, float sine, float *low, float *high) {
+  const float level = sqrt(fma1(along, along, z * z));
+  *low = -NO_END;
+  *high = NO_END;
+  if (!(sine < 0.999f * level)) return;
+  const float ratio = sine / level, cosine = sqrt(1.0f - ratio * ratio);
+  const float ahead_low = fma1(cosine, z, ratio * along), ahead_high = fma1(cosine, z, -(ratio * along));
+  if (ahead_low > LEAST_AHEAD * level) *low = fma1(cosine, along, -(ratio * z)) / ahead_low;
+  if (ahead_high > LEAST_AHEAD * level) *high = fma1(cosine, along, ratio * z) / ahead_high;
+}
+#endif
+
 // The box of all directions within an angle of f whose tangent is `reach`.
 static inline void box_of(const float *f, float reach, __constant float *camera, Box *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
   const float cx = camera[CAMERA_CX] - camera[CAMERA_WINDOW_X], cy = camera[CAMERA_CY] - camera[CAMERA_WINDOW_Y];
-  const float cap = quarter_atan(reach, 1.0f), sine = reach / sqrt(fma1(reach, reach, 1.0f));
+  const float sine = reach / sqrt(fma1(reach, reach, 1.0f));
   t->whole_rows = 0;
+#if RAYS == 3
+  side_of(f[0], f[2], sine, &t->low_x, &t->high_x);
+  side_of(f[1], f[2], sine, &t->low_y, &t->high_y);
+  t->low_x = fma1(fx, t->low_x, cx);
+  t->high_x = fma1(fx, t->high_x, cx);
+  t->low_y = fma1(fy, t->low_y, cy);
+  t->high_y = fma1(fy, t->high_y, cy);
+#else
+  const float cap = quarter_atan(reach, 1.0f);
 #if RAYS == 1
   const float level = sqrt(fma1(f[0], f[0], f[2] * f[2]));
   const float latitude = f[1] < 0.0f ? -quarter_atan(-f[1], level) : quarter_atan(f[1], level);
@@ -69,6 +96,7 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
   t->high_x = fma1(fx, middle_x + half_x, cx);
   t->low_y = fma1(fy, middle_y - half_y, cy);
   t->high_y = fma1(fy, middle_y + half_y, cy);
+#endif
 #endif
 }
 

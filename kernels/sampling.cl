@@ -26,7 +26,7 @@
 // its edges, which the bounds of the Jacobian's are; 1e30 where not.
 static inline float pixel_width(float x, float y, float z, __global const float *camera) {
   const float in_x = ALONG(0), in_y = ALONG(1), in_z = ALONG(2), focal = fmax(camera[CAMERA_FX], camera[CAMERA_FY]);
-#ifndef RAYS
+#if !defined(RAYS) || RAYS == 3
   const int seen = in_z > camera[CAMERA_NEAR] && in_x > camera[CAMERA_XMIN] * in_z &&
                    in_x < camera[CAMERA_XMAX] * in_z && in_y > camera[CAMERA_YMIN] * in_z &&
                    in_y < camera[CAMERA_YMAX] * in_z;

@@ -117,6 +117,11 @@ def run(verb: Convert, services: Services) -> int:
             f"{verb.target}: {target_format.name} has no place for antialiasing; readers will draw what is small or "
             "far away too thick"
         )
+    if read.by_rays != edited.by_rays:
+        warn(
+            f"{verb.target}: {target_format.name} has no place for drawing along rays; readers will show what is large "
+            "and beside the picture as a haze"
+        )
     written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
     result: dict[str, Any] = {
         "source": _described(source, format_of(source), original),

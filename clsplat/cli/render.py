@@ -218,7 +218,7 @@ def _read_job(verb: Render) -> Job:
     model = model_file(verb.model)
     gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else ()
     gaussians = Gaussians.load(model)
-    tasks = [task.seen_from(gaussians.near) for task in tasks]
+    tasks = [task.seen_by(gaussians) for task in tasks]
     recorded = recorded_space(model)
     colours = Colours(options.pictures.colour, recorded)
     extension = Path(verb.output).suffix.lower()

@@ -20,6 +20,7 @@ from clsplat.errors import InputError
 
 Background = Literal["black", "white", "random"]
 Lenses = Literal["undistort", "native"]
+Perspective = Literal["auto", "plane", "rays"]
 Growth = Literal["paper", "budget", "mcmc"]
 AppearanceKind = Literal["none", "exposure", "grid"]
 
@@ -231,6 +232,10 @@ class TrainConfig:
     antialiased: bool = False
     """Train for pictures of any size (Mip-Splatting): a narrower low-pass that leaves a Gaussian its light, and no
     Gaussian smaller than the photographs show. The model is drawn so too, and its file says it."""
+    perspective: Perspective = "auto"
+    """How pinholes' pictures show a Gaussian. plane: as an ellipse on the image's plane (Kerbl et al.); rays: along the
+    rays of the pixels, as fisheyes and panoramas do, which takes longer; auto: rays where the scene has photographs of
+    these, so that all show the same. The model is drawn so too, and its file says it."""
     masks: MaskMeaning = "none"
     """Meaning of the masks beside the photographs, white where a pixel counts. ignore: what is black is not looked at,
     such as people; transparent: there is nothing there, such as around a thing on a turntable; none: no masks are
@@ -351,6 +356,8 @@ class TrainConfig:
             raise InputError(
                 f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
             )
+        if self.refine_lenses and self.perspective == "rays":
+            raise InputError("--refine-lenses: rays have no gradient by the lens, expected --perspective plane with it")
         if self.refines and self.batch > 1:
             raise InputError(
                 f"{self._refining}: not with --batch {self.batch}, nor with several devices; expected one view a step"

@@ -51,7 +51,8 @@ def bin_bounds(gaussians: Gaussians, camera: Camera, config: DeepConfig) -> Floa
 
 
 def depths_in_view(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
-    """Depths of the means that are in front of the camera and, if it has an image plane, in its frame."""
+    """Depths of the means that are in front of the camera and, if it has an image plane, in its frame; for a model that
+    is drawn along rays their distances."""
     camera = gaussians.local(camera)
     p = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
     if not camera.kind.flat:
@@ -61,7 +62,8 @@ def depths_in_view(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
     frame = camera.window or camera
     by = p[:, 2] if camera.projection == "perspective" else 1.0
     x, y = camera.fx * p[:, 0] / by + camera.cx, camera.fy * p[:, 1] / by + camera.cy
-    return np.asarray(p[(x >= 0) & (x <= frame.width) & (y >= 0) & (y <= frame.height), 2])
+    p = p[(x >= 0) & (x <= frame.width) & (y >= 0) & (y <= frame.height)]
+    return np.asarray(np.linalg.norm(p, axis=1) if camera.kind.rays else p[:, 2])
 
 
 def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:

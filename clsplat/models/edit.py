@@ -69,11 +69,15 @@ def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
 
 def merge(models: Sequence[Gaussians]) -> Gaussians:
     """One after the other, SH of lower degree padded with zeros; the means count from the first one's origin. Raises
-    InputError for models of which some are antialiased and some are not."""
+    InputError for models of which some are antialiased, or drawn along rays, and some are not."""
     if len(models) == 1:
         return models[0]
     if len({model.antialiased for model in models}) > 1:
         raise InputError("some of the models are antialiased and some are not, expected models that are drawn alike")
+    if len({model.by_rays for model in models}) > 1:
+        raise InputError(
+            "some of the models are drawn along rays and some are not, expected models that are drawn alike"
+        )
     coefficients, origin = max(model.sh.shape[1] for model in models), models[0].origin
 
     def means(model: Gaussians) -> Float32:
@@ -86,7 +90,8 @@ def merge(models: Sequence[Gaussians]) -> Gaussians:
     parts = [replace(model, means=means(model), sh=sh(model)).arrays() for model in models]
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     near = min(model.near for model in models)
-    return Gaussians(**whole, origin=origin, near=near, antialiased=models[0].antialiased)
+    first = models[0]
+    return Gaussians(**whole, origin=origin, near=near, antialiased=first.antialiased, by_rays=first.by_rays)
 
 
 def decompose(matrix: Float64, slack: float = _SIMILAR) -> tuple[float, Float64, Float64]:
@@ -127,6 +132,7 @@ def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILAR) ->
         origin,
         scale * gaussians.near,
         gaussians.antialiased,
+        gaussians.by_rays,
     )
 
 

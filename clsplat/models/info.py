@@ -103,6 +103,8 @@ def text(info: dict[str, Any]) -> str:
         lines.append(("near plane", f"{info['near']:.6g}"))
     if info.get("antialiased"):
         lines.append(("antialiased", "yes: to be drawn with Mip-Splatting's low-pass"))
+    if info.get("by_rays"):
+        lines.append(("perspective", "along rays, as a fisheye: other programs show a haze"))
     lines.append(("colour space", info["colorspace"]))
     lines += [("comment", line) for line in info.get("comments", [])]
     if info.get("ignored"):

@@ -20,7 +20,7 @@ def nearness_grad(means: Float64, camera: Camera, d_nearness: Float64) -> Float6
     """Eq. (122): the gradient (N, 3) by the means, of that by one over the depth (N,), which is the distance where
     pixels are rays."""
     local = means @ camera.rotation.T + camera.translation
-    if camera.kind.flat:
+    if not camera.kind.rays:
         along, depth = np.zeros_like(local), local[:, 2]
         along[:, 2] = 1
     else:

@@ -5,7 +5,7 @@ are those of docs/gradients.md (14 to 16) and docs/channels.md (60 to 64)."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,7 +52,7 @@ def render(
 ) -> Picture:
     """Front to back by depth. after: the camera that motion goes to. A pixel without a ray shows the background."""
     seen: Seen
-    if camera.kind.flat:
+    if not camera.kind.rays:
         degree, antialiased = gaussians.sh_degree, gaussians.antialiased
         projected = project(**parameters(gaussians), camera=camera, sh_degree=degree, antialiased=antialiased)
         seen = _Unbounded(**vars(projected))
@@ -60,6 +60,9 @@ def render(
         seen = tangents(gaussians, camera)
     blended = blend(seen, camera.width, camera.height, background)
     others = channels(seen, gaussians, camera, after or camera)
+    if (of_distances := camera.depths_of_distances()) is not None:
+        depths = {name: getattr(others, name) * of_distances for name in ("depth", "median", "first")}
+        others = replace(others, **depths)
     alpha, margin, nearness = 1 - blended.transmittance, blended.margin, blended.nearness
     return Picture(**vars(others), image=blended.image, alpha=alpha, margin=margin, nearness=nearness)
 
@@ -74,7 +77,7 @@ def render_grad(
     """Gradients of a loss with dL/dimage = d_image (H, W, 3), and by nearness (H, W), of a
     camera of any projection; those of means on the
     image of rays are along the axes of the tangent plane, per pixel there."""
-    if camera.kind.flat:
+    if not camera.kind.rays:
         return on_plane.render_grad(gaussians, camera, d_image, background, d_nearness=d_nearness)
     seen = tangents(gaussians, camera)
     screen = blend_grad(seen, camera.width, camera.height, background, d_image, d_nearness=d_nearness)

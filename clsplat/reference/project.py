@@ -337,7 +337,7 @@ def lens_grad(
     antialiased: bool = False,
 ) -> Float64:
     """Eqs. (144), (145): gradient (4,) by ln fx, ln fy, cx and cy of a flat camera. Arguments as of `project_grad`."""
-    assert camera.kind.flat
+    assert not camera.kind.rays
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
     by_log_opacity = d_opacities[rows] * projected.opacities[rows] if antialiased else None
@@ -379,7 +379,7 @@ def project_grad(
     d_colors (N, 3). Of an orthographic camera J does not change, and no colour follows the mean. Those of rays:
     `reference.rays`.
     """
-    assert camera.kind.flat
+    assert not camera.kind.rays
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
     x, y, z = geometry.p.T

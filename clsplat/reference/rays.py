@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians of equirectangular and fisheye pictures in float64, and their gradient: twin of kernels/project_rays.cl, of
+"""Gaussians of pictures along rays in float64, and their gradient: twin of kernels/project_rays.cl, of
 a ray's alphas and of project_grad.cl with RAYS. Equation numbers are those of docs/cameras.md."""
 
 from __future__ import annotations
@@ -81,14 +81,14 @@ def footprints(directions: Float64, camera: Camera) -> tuple[Float64, Float64, F
     safe = np.where(across > 0, across, 1.0)
     c, s = np.where(across > 0, x / safe, 1.0), np.where(across > 0, y / safe, 0.0)
     right, down = np.stack([z * c, z * s, -across], axis=1), np.stack([-s, c, zero], axis=1)
-    along, around, _, _ = fisheye_sides(camera, np.arctan2(across, z))
+    along, around, _, _ = pixel_angles(camera, np.arctan2(across, z))
     pixels[:, 0, 0], pixels[:, 0, 1] = c * along / camera.fx, s * along / camera.fy
     pixels[:, 1, 0], pixels[:, 1, 1] = -s * around / camera.fx, c * around / camera.fy
     return right, down, pixels
 
 
 def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
-    """(8) to (13)."""
+    """(8) to (13), and (30)."""
     arrays = parameters(gaussians)
     means = arrays["means"]
     p = means @ camera.rotation.T + camera.translation
@@ -104,7 +104,7 @@ def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
         opacities = opacities * compensation(np.linalg.det(plain), np.linalg.det(covariances))
     basis = sh_basis(view_directions(means, camera)[0], gaussians.sh_degree)
     colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, arrays["sh"][:, : basis.shape[1]]))
-    visible = (depths > camera.near) & (opacities > ALPHA_MIN)
+    visible = ((p[:, 2] if camera.kind.flat else depths) > camera.near) & (opacities > ALPHA_MIN)
     if any(camera.radial):
         visible &= np.arctan2(np.hypot(p[:, 0], p[:, 1]), p[:, 2]) < camera.fold[0]
     rays = np.nan_to_num(cam_from_pixel(camera, pixel_grid(camera))[1])
@@ -135,7 +135,7 @@ def low_pass_grad(directions: Float64, camera: Camera, gradients: Float64, low_p
     safe = np.where(r > 0, r, 1.0)
     c, s = np.where(r > 0, x / safe, 1.0), np.where(r > 0, y / safe, 0.0)
     theta = np.arctan2(r, z)
-    p, q, dp, dq = fisheye_sides(camera, theta)
+    p, q, dp, dq = pixel_angles(camera, theta)
     wide, more = camera.fx**-2, camera.fy**-2 - camera.fx**-2
     result[:, 0] = g11 * 2 * p * dp * (wide + s * s * more)
     result[:, 0] += 2 * g12 * (dp * q + p * dq) * c * s * more
@@ -151,9 +151,12 @@ def low_pass_grad(directions: Float64, camera: Camera, gradients: Float64, low_p
     return low_pass * result
 
 
-def fisheye_sides(camera: Camera, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-    """Radians a radian's pixels, away from a fisheye's axis and around it, at the angle theta (N,), and the derivatives
-    of the two by theta: p, q of (19), p', q'."""
+def pixel_angles(camera: Camera, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
+    """Radians a radian's pixels, away from the axis of a fisheye or a perspective camera and around it, at the angle
+    theta (N,), and the derivatives of the two by theta: p, q of (19) or (30), p', q'."""
+    if camera.projection == "perspective":
+        sine, cosine = np.sin(theta), np.cos(theta)
+        return cosine**2, cosine, -2 * sine * cosine, -sine
     radius, slope, bend = radii(camera, theta)
     with np.errstate(all="ignore"):
         ratio = np.where(theta > 1e-6, np.sin(theta) / radius, 1.0)

@@ -12,7 +12,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.reference.cameras import radii
 from clsplat.reference.project import frustum_limits
-from clsplat.reference.rays import fisheye_sides
+from clsplat.reference.rays import pixel_angles
 
 SAMPLING = np.sqrt(0.2)
 
@@ -34,7 +34,7 @@ def pixel_widths(means: Float64, camera: Camera) -> Float64:
     if camera.projection == "fisheye":
         across = np.hypot(p[:, 0], p[:, 1])
         theta = np.arctan2(across, p[:, 2])
-        along, around, _, _ = fisheye_sides(camera, theta)
+        along, around, _, _ = pixel_angles(camera, theta)
         places = radii(camera, theta)[0][:, None] * p[:, :2] / np.where(across > 0, across, 1.0)[:, None]
         seen = (depths > camera.near) & (theta < camera.fold[0]) & ((places > low) & (places < high)).all(axis=1)
         return np.where(seen, depths / focal * np.minimum(along, around), np.inf)

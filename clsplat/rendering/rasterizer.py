@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import BENT_FISHEYE, PROJECTIONS, Camera
+from clsplat.camera import KINDS, Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.thinning import Thinning
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, pinned
@@ -111,8 +111,7 @@ class Rasterizer:
         self._antialiased = on
         self.device = self._bare.with_switches(kernel_defines(self.config, antialiased=on))
         self._by_kind = {
-            id(kind): self.device.with_switches(kind.defines) if kind.defines else self.device
-            for kind in (*PROJECTIONS.values(), BENT_FISHEYE)
+            id(kind): self.device.with_switches(kind.defines) if kind.defines else self.device for kind in KINDS
         }
 
     def follow(self, plan: Plan) -> None:

@@ -16,12 +16,13 @@ from clsplat.config.checks import parse_bytes
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
+from clsplat.device.layout import DEEP
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.rendering.sh_storage import check_half, coefficients_in_use, needed_degrees
-from clsplat.stages.channels import Features
+from clsplat.stages.channels import DEPTHS, Features
 from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import AnyGaussians, HostGaussians, ShStorage, host_gaussians, upload_gaussians
@@ -122,6 +123,8 @@ class Renderer:
         if contiguous:
             means, whole = np.ascontiguousarray(means), np.ascontiguousarray(whole)
         named = features.named(means, whole)
+        if (of_distances := camera.depths_of_distances()) is not None:
+            named |= {name: named[name] * of_distances for name in ("depth", *DEPTHS)}
         if "position" in named and origin.any():  # in the world: float32 keeps what it can of that
             shown = named["count"][:, :, None] > 0
             named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
@@ -135,6 +138,8 @@ class Renderer:
         frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
         slices = self._rasterizer.deep(frame, upload(self.device, np.append(bounds, np.inf).astype(np.float32)))
         planes = slices.get()[:, :, : camera.height, : camera.width]
+        if (of_distances := camera.depths_of_distances()) is not None:
+            planes[:, [DEEP.index("FIRST"), DEEP.index("LAST")]] *= of_distances
         return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
 
     def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:

@@ -288,8 +288,8 @@ def owned_files(path: Path) -> list[Path]:
 
 def check_resumed(earlier: Run, config: TrainConfig) -> None:
     """Raise InputError where `config` changes what a run cannot change on its way."""
-    fixed = ("sh_degree", "seed", "test_every", "lenses", "appearance", "antialiased", "refine_poses", "refine_lenses")
-    for name in fixed:
+    of_model = ("sh_degree", "seed", "test_every", "lenses", "appearance", "antialiased", "perspective")
+    for name in (*of_model, "refine_poses", "refine_lenses"):
         was, now = getattr(earlier.config, name), getattr(config, name)
         if was != now:
             raise InputError(f"{earlier.config_path}: {name} is {was} there, a resumed run cannot change it to {now}")

@@ -92,8 +92,10 @@ def _deep(bench: Bench) -> Outcome:
 
 
 def _rays(bench: Bench) -> Outcome:
-    """Projection to tangent planes, and a frame with a channel of it, for both kinds of camera."""
-    return joined([_of_rays(bench, name) for name, kind in PROJECTIONS.items() if not kind.flat])
+    """Projection to tangent planes, and a frame with a channel of it, for each kind of camera."""
+    cameras: dict[str, Camera] = {name: _amid(bench.camera, name) for name, kind in PROJECTIONS.items() if kind.rays}
+    cameras |= {"perspective": replace(bench.camera, by_rays=True)}
+    return joined([_of_rays(bench, name, camera) for name, camera in cameras.items()])
 
 
 def _amid(camera: Camera, projection: Projection) -> Camera:
@@ -107,9 +109,9 @@ def _amid(camera: Camera, projection: Projection) -> Camera:
     return Camera(camera.width, camera.height, focal, focal, *centre, rotation, translation, projection=projection)
 
 
-def _of_rays(bench: Bench, projection: Projection) -> Outcome:
+def _of_rays(bench: Bench, projection: str, camera: Camera) -> Outcome:
     # with memory of its own: the next stages want what those before have made
-    rasterizer, camera, gaussians = Rasterizer(bench.device), _amid(bench.camera, projection), bench.frozen.gaussians
+    rasterizer, gaussians = Rasterizer(bench.device), bench.frozen.gaussians
 
     def launch() -> tuple[Frame, Channels]:
         frame = rasterizer.forward(bench.model, camera, bench.background, backward=False)
@@ -131,7 +133,9 @@ def _of_rays(bench: Bench, projection: Projection) -> Outcome:
         solid = clear & (picture.alpha > 0.5)
         parts["image"] = (cropped(image, camera)[clear], picture.image[clear])
         parts["transmittance"] = (cropped(left, camera)[clear], 1 - picture.alpha[clear])
-        parts["mean depth"] = (cropped(means, camera)[solid, 0], picture.depth[solid])
+        of_distances = camera.depths_of_distances()
+        depth = picture.depth if of_distances is None else picture.depth / of_distances
+        parts["mean depth"] = (cropped(means, camera)[solid, 0], depth[solid])
     hidden = int((shown & ~tangents.visible).sum())
     return outcome.compared({f"{name}, {projection}": part for name, part in parts.items()}, hidden_Gaussians=hidden)
 

@@ -104,7 +104,7 @@ class FrameRenderer:
 
     def _trust(self, camera: Camera) -> None:
         """Self-test what panoramas and fisheyes need before the first of them."""
-        if camera.kind.flat or self._rays_tested:
+        if not camera.kind.rays or self._rays_tested:
             return
 
         device = self._renderer.device

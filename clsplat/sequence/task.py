@@ -20,6 +20,7 @@ from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, Samplin
 from clsplat.errors import InputError
 from clsplat.files import digest, is_file
 from clsplat.frame.window import framed
+from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.images.frame_files import VIDEO, Header, camera_matrices
 from clsplat.shots import Shot
@@ -74,10 +75,13 @@ class Task:
         """The camera of the whole frame at a time in frames from the frame."""
         return self.camera if time == 0 or self.stretch is None else self.stretch.at(time)
 
-    def seen_from(self, near: float) -> Task:
-        """The frame of a model whose near plane is there."""
-        after = self.after.before(near) if self.after is not None else None
-        return replace(self, camera=self.camera.before(near), after=after)
+    def seen_by(self, gaussians: Gaussians) -> Task:
+        """The frame of a model, with its near plane, and drawn as it wants it."""
+
+        def seen(camera: Camera) -> Camera:
+            return camera.before(gaussians.near).along_rays(gaussians.by_rays)
+
+        return replace(self, camera=seen(self.camera), after=None if self.after is None else seen(self.after))
 
     @property
     def is_video(self) -> bool:

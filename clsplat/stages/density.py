@@ -113,7 +113,7 @@ def add_statistics(
     """Add one view: the norm of each visible mean's gradient, in NDC as the paper's threshold is. Where agreeing views
     are counted, those with at least the threshold count."""
     n = projected.tile_counts.shape[0]
-    rays = not camera.kind.flat
+    rays = camera.kind.rays
     kernels = device.kernels("density", **({"RAYS": camera.kind.defines["RAYS"]} if rays else {}))
     to_ndc = (0.5 * camera.width, 0.5 * camera.height)
     view, sums = (projected.tile_counts, screen.gradients), (statistics.gradient_sums, statistics.seen)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.camera import Camera
 from clsplat.config.depth import DECAY
 from clsplat.config.training import TrainConfig
 from clsplat.scenes.scene import View
@@ -32,15 +33,18 @@ class Depths:
         self._config, self._views, self._extent = config, views, extent
         self._held: dict[int, tuple[tuple[int, int], tuple[NDArray[np.int64], Float32, Float32]]] = {}
 
-    def aims(self, view: int, width: int, height: int, step: int) -> DepthAims | None:
-        """The depths that a view's render is compared with, of the step's size; None where none are."""
+    def aims(self, view: int, camera: Camera, step: int) -> DepthAims | None:
+        """The depths that a view's render is compared with, of the size of the step's camera; None where none are."""
         if not self._config.depth_use:
             return None
+        width, height = camera.width, camera.height
         pixels, nearness, weights = self._known(view, width, height)
         rows, stride = padded_size(width, height)
         planes = np.zeros((2, rows, stride), np.float32)
         at = pixels // width, pixels % width
-        planes[0][at], planes[1][at] = nearness, weights
+        of_distances = camera.depths_of_distances()
+        planes[0][at] = nearness if of_distances is None else nearness * of_distances[at]
+        planes[1][at] = weights
         total = float(weights.sum(dtype=np.float64))
         factor = weight_at(self._config, step) * self._extent / total if total > 0 else 0.0
         return DepthAims(planes, factor)

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
 RECORD = "bundle.json"
 """The member of a bundle with everything that is no array."""
-_LENS = ("width", "height", "fx", "fy", "cx", "cy", "near", "projection", "radial")
+_LENS = ("width", "height", "fx", "fy", "cx", "cy", "near", "projection", "radial", "by_rays")
 _KINDS = ("parameters", "first", "second")
 
 
@@ -78,7 +78,7 @@ class Bundle:
 def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
     """Write `folder`/trouble-step-STEP.npz of what happened; the path."""
     photograph = trainer.photographs.load(incident.view, trainer.sizes.factor(incident.step))
-    camera = trainer.views[incident.view].camera.resized(photograph.shape[1], photograph.shape[0]).before(trainer.near)
+    camera = trainer.camera(incident.view, photograph.shape[1], photograph.shape[0])
     device = trainer.device
     record: dict[str, Any] = {
         "step": incident.step,
@@ -98,7 +98,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
         "device": {"name": device.name, "driver": device.driver, "shape": str(device.shape)},
     }
     pixels = {"photograph": photograph, "background": incident.background}
-    aims = trainer.depths.aims(incident.view, camera.width, camera.height, incident.step)
+    aims = trainer.depths.aims(incident.view, camera, incident.step)
     if aims is not None:
         record["depth_factor"], pixels["depth"] = aims.factor, aims.planes
     pose = {"rotation": camera.rotation, "translation": camera.translation}

@@ -131,6 +131,8 @@ class Trainer:
         self.appearance = appearance_of(self.config, self.device, self.scene)
         self.cameras = Cameras(self.config, self.views, self.scene.extent)
         self.origin, self.near = initial.origin, self.scene.near
+        asked = self.config.perspective
+        self.by_rays = asked == "rays" or (asked == "auto" and any(view.camera.kind.rays for view in self.views))
         self._cameras: dict[int, tuple[Camera, Camera]] = {}
         cameras = [self.local(view.camera) for view in self.views]
         self.sampling = SamplingFilter(self.config, self.device, self.rasterizer.work, cameras)
@@ -290,7 +292,7 @@ class Trainer:
         image = bring(view, factor)
         self.background = self._background_colour()
         camera, kept = self.camera(view, image.shape[1], image.shape[0]), self.photographs.kept(view, factor)
-        aims = self.depths.aims(view, camera.width, camera.height, self.step)
+        aims = self.depths.aims(view, camera, self.step)
         return Sample(view, image, camera, self.background, begins, kept, aims)
 
     def _watched_in_batch(self, sample: Sample, step: GradientStep) -> StepProbe:
@@ -456,7 +458,7 @@ class Trainer:
 
     def local(self, camera: Camera) -> Camera:
         """A camera in the world as one for the model in training: see `Gaussians.local`."""
-        return camera.from_origin(self.origin).before(self.near)
+        return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def camera(self, view: int, width: int, height: int) -> Camera:
         """A training view's camera at the size of its photograph, the same object while that stays and nothing of it
@@ -473,7 +475,8 @@ class Trainer:
         model = download_gaussians(self.parameters)
         full = np.zeros((len(model), (self.config.sh_degree + 1) ** 2, 3), np.float32)
         full[:, : model.sh.shape[1]] = model.sh
-        model.sh, model.origin, model.near, model.antialiased = full, self.origin, self.near, self.config.antialiased
+        model.sh, model.origin, model.near = full, self.origin, self.near
+        model.antialiased, model.by_rays = self.config.antialiased, self.by_rays
         return model
 
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

@@ -1,5 +1,6 @@
-// Pixels as rays, of equirectangular (RAYS == 1) and fisheye (RAYS == 2) cameras: equations (4) and (5) of
-// docs/cameras.md, in the camera's axes. Needs lanes.h; its own functions, for the same bits on every driver.
+// Pixels as rays, of equirectangular (RAYS == 1), fisheye (RAYS == 2) and perspective (RAYS == 3) cameras: equations
+// (2), (4) and (5) of docs/cameras.md, in the camera's axes. Needs lanes.h; its own functions, for the same bits on
+// every driver.
 #include "shared/elementary.h"
 #include "shared/angles.h"
 
@@ -75,6 +76,11 @@ static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floa
   *x = there * (level * (longitude < 0.0f ? -across : across));
   *y = there * sinL(there * b);
   *z = there * (level * sinL(from_side));
+#elif RAYS == 3
+  const floatL shrunk = 1.0f / sqrt(fmaL(a, a, fmaL(b, b, (floatL)(1.0f))));
+  *x = shrunk * a;
+  *y = shrunk * b;
+  *z = shrunk;
 #else
   const floatL theta = sqrt(fmaL(a, a, b * b));
 #ifdef KANNALA_BRANDT

@@ -46,6 +46,12 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   t->e2[0] = -s;
   t->e2[1] = c;
   t->e2[2] = 0.0f;
+#if RAYS == 3 // (30)
+  t->k[0] = c * (f[2] * f[2]) / fx;
+  t->k[1] = s * (f[2] * f[2]) / fy;
+  t->k[2] = -(s * f[2]) / fx;
+  t->k[3] = c * f[2] / fy;
+#else
   const float theta = half_atan(across, f[2]), radius = radius_of(theta, camera);
   const float ratio = theta > 1e-6f ? across / radius : 1.0f;
   const float least = 0.5f / (HALF_TURN * fx);
@@ -60,6 +66,7 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   t->k[2] = -(s * around) / fx;
   t->k[3] = c * around / fy;
 #endif
+#endif
 }
 
 // (8) to (12); returns 0 where the Gaussian is culled. Conditions are positive, so that NaN culls.
@@ -69,7 +76,7 @@ static inline int project_ray(size_t i, __global const float *means, __global co
   const Double in_x = CAMERA_ROW(0), in_y = CAMERA_ROW(1), in_z = CAMERA_ROW(2);
   const float at[3] = {in_x.high, in_y.high, in_z.high};
   const float distance = sqrt(fma1(at[0], at[0], fma1(at[1], at[1], at[2] * at[2])));
-  if (!(distance > camera[CAMERA_NEAR] && distance < 1e15f)) return 0;
+  if (!((RAYS == 3 ? at[2] : distance) > camera[CAMERA_NEAR] && distance < 1e15f)) return 0;
   p->distance = distance;
   for (int k = 0; k < 3; ++k) p->f[k] = at[k] / distance;
 #ifdef KANNALA_BRANDT // beyond the fold-over a lens shows nothing
@@ -148,8 +155,11 @@ static inline void low_pass_gradient(const float *f, __constant float *camera, c
 #else
   const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2];
   const float c = r > 0.0f ? f[0] / r : 1.0f, s = r > 0.0f ? f[1] / r : 0.0f;
-  const float theta = half_atan(r, z);
   const float more = 1.0f / (camera[CAMERA_FY] * camera[CAMERA_FY]) - wide;
+#if RAYS == 3 // (31)
+  const float p = z * z, q = z, dp = -2.0f * (z * r), dq = -r;
+#else
+  const float theta = half_atan(r, z);
   float p = 1.0f, dp = 0.0f, radius = theta, slope = 1.0f;
 #ifdef KANNALA_BRANDT
   radius = radius_of(theta, camera);
@@ -163,6 +173,7 @@ static inline void low_pass_gradient(const float *f, __constant float *camera, c
   const float near_axis = theta * (-1.0f / 3.0f - SERIES(camera));
   const float off_axis = fma1(-q, slope, z) / radius;
   const float dq = ratio > least ? (theta > 0.02f ? off_axis : near_axis) : 0.0f;
+#endif
   by[0] = 2.0f * LOW_PASS *
           (g[0] * (p * dp) * fma1(s * s, more, wide) + g[1] * fma1(dp, q, p * dq) * (c * s * more) +
            g[2] * (q * dq) * fma1(c * c, more, wide));

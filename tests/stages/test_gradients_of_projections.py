@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gradient of orthographic, fisheye and equirectangular pictures: the twin against central differences, and the
-kernels against the twin."""
+"""The gradient of orthographic, fisheye and equirectangular pictures, and of perspective ones along rays: the twin
+against central differences, and the kernels against the twin."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import scenes
 from compare import assert_close_gradient, assert_same_bits
 from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
-from test_project_rays import all_around, fisheye, panorama
+from test_project_rays import all_around, fisheye, panorama, pinhole
 
 from clsplat.camera import Camera
 from clsplat.device.context import Device
@@ -29,7 +29,10 @@ CAMERAS: dict[str, Camera] = {
     "fisheye of 300 degrees": fisheye(60, 60, 300),
     "bent fisheye": replace(fisheye(60, 50, 190), radial=BENT),
     "fisheye that folds over": replace(fisheye(60, 50, 150), radial=(-0.06, 0.0, 0.0, 0.0)),
+    "perspective": pinhole(60, 50, 70),
+    "perspective of 150 degrees": pinhole(60, 50, 150),
     "antialiased panorama": panorama(70, 35),
+    "antialiased perspective": pinhole(60, 50, 110),
     "antialiased fisheye": replace(fisheye(60, 50, 190), radial=BENT),
 }
 """By name; what begins with antialiased is, with Gaussians small enough that the low-pass tells."""

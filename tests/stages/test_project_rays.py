@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Equirectangular and fisheye pictures against a float64 twin that has every Gaussian at every pixel."""
+"""Equirectangular and fisheye pictures, and perspective ones along rays, against a float64 twin that has every Gaussian
+at every pixel."""
 
 from __future__ import annotations
 
@@ -50,6 +51,17 @@ def fisheye(width: int, height: int, angle: float) -> Camera:
     return replace(tilted, fx=focal, fy=1.1 * focal, cx=0.47 * width, cy=0.52 * height, projection="fisheye")
 
 
+def pinhole(width: int, height: int, angle: float) -> Camera:
+    """Perspective along rays."""
+    focal = focal_length(np.deg2rad(angle), width)
+    return replace(fisheye(width, height, 90), fx=focal, fy=1.1 * focal, projection="perspective", by_rays=True)
+
+
+def model_for(camera: Camera, count: int, seed: int) -> Gaussians:
+    """Gaussians all around, drawn as the camera does."""
+    return replace(all_around(count, seed), by_rays=camera.by_rays)
+
+
 CAMERAS = {
     "panorama": panorama(96, 48),
     "panorama of a width that is no multiple of a tile": panorama(70, 35),
@@ -59,6 +71,8 @@ CAMERAS = {
     "fisheye of 180 degrees": fisheye(60, 50, 180),
     "fisheye of 300 degrees": fisheye(60, 60, 300),
     "a whole sphere in a circle": fisheye(64, 64, 360),
+    "perspective": pinhole(60, 50, 100),
+    "perspective of 150 degrees": pinhole(60, 50, 150),
 }
 
 
@@ -77,12 +91,13 @@ def moved(camera: Camera) -> Camera:
 
 @cache
 def expected(name: str) -> every_pixel.Picture:
-    return every_pixel.render(all_around(300, 5), CAMERAS[name], BACKGROUND, moved(CAMERAS[name]))
+    return every_pixel.render(model_for(CAMERAS[name], 300, 5), CAMERAS[name], BACKGROUND, moved(CAMERAS[name]))
 
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_against_the_twin(device: Device, name: str) -> None:
-    camera, gaussians, wanted = CAMERAS[name], all_around(300, 5), expected(name)
+    camera, wanted = CAMERAS[name], expected(name)
+    gaussians = model_for(camera, 300, 5)
     after = moved(camera)
     image, found = Renderer(device).render_channels(gaussians, camera, FEATURES, after=after, background=BACKGROUND)
     # As of a frame; a direction of float32 is good to 1e-7, that of a pixel is 0.1.
@@ -104,9 +119,9 @@ def assert_close_channels(found: ChannelResult, wanted: every_pixel.Picture) -> 
 
 
 @EVERY_SHAPE
-@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees"])
+@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective of 150 degrees"])
 def test_the_same_bits_in_every_shape(device: Device, every: bool, name: str) -> None:
-    camera, gaussians = CAMERAS[name], all_around(2000, 6)
+    camera, gaussians = CAMERAS[name], model_for(CAMERAS[name], 2000, 6)
     first, *others = (
         Renderer(shaped(device, *shape)).render_channels(gaussians, camera, FEATURES, after=moved(camera))
         for shape in shapes_of(device, every=every)
@@ -210,6 +225,70 @@ def test_in_the_middle_a_long_fisheye_is_a_pinhole(device: Device) -> None:
     assert np.abs(got.image - wanted.image).max() < 0.01
 
 
+@pytest.mark.parametrize("projection", ["perspective", "fisheye"])
+def test_what_a_ray_shows_depends_on_no_camera(device: Device, projection: Projection) -> None:
+    """The pixel on the axis of a camera that is turned to where another pixel looks, in the same place."""
+    rng = np.random.default_rng(4)
+    camera = replace(scenes.straight_camera(65, 65), fx=40.0, fy=40.0, cx=32.5, cy=32.5, by_rays=True)
+    ratios, depths = rng.uniform(-0.7, 0.7, (80, 2)), rng.uniform(2.0, 6.0, (80, 1))
+    means = np.concatenate([ratios, np.ones((80, 1))], axis=1) * depths
+    scales = np.log(depths * np.exp(rng.uniform(np.log(0.1), np.log(0.4), (80, 3))))
+    gaussians = scenes.make_gaussians(
+        means, rng.normal(size=(80, 4)), scales, rng.uniform(0.1, 0.6, 80), scenes.random_sh(rng, 80)
+    )
+    renderer, differences = Renderer(device), {}
+    for by_rays in (True, False):
+        gaussians.by_rays = by_rays
+        wide = renderer.render(gaussians, camera).image
+        differences[by_rays] = 0.0
+        for u, v in ((4, 32), (60, 8), (20, 61), (32, 32)):
+            ahead = np.array([(u - 32) / 40, (v - 32) / 40, 1.0])
+            ahead /= np.linalg.norm(ahead)
+            right = np.cross([0.0, 1.0, 0.0], ahead)
+            right /= np.linalg.norm(right)
+            turn = np.stack([right, np.cross(ahead, right), ahead])
+            turned = replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation)
+            narrow = renderer.render(gaussians, replace(turned, projection=projection, by_rays=False)).image
+            differences[by_rays] = max(differences[by_rays], float(np.abs(wide[v, u] - narrow[32, 32]).max()))
+    # The low-pass alone, of 0.3 square pixels where a Gaussian has 16 and more; the image's plane bends them.
+    assert differences[True] < 0.015
+    assert projection == "fisheye" or differences[False] > 0.05
+
+
+def test_depths_along_rays_are_those_of_the_plane(device: Device) -> None:
+    """A wall at z = 2, whose distance at the picture's corners is 2.9."""
+    camera = replace(scenes.straight_camera(64, 64), fx=43.0, fy=43.0, cx=32.0, cy=32.0)
+    across = np.linspace(-3.0, 3.0, 61)
+    local = np.stack([*(axis.ravel() for axis in np.meshgrid(across, across)), np.full(61 * 61, 2.0)], axis=1)
+    means, count = (local - camera.translation) @ camera.rotation, len(local)
+    gaussians = scenes.make_gaussians(
+        means,
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), np.log(0.08)),
+        np.full(count, 0.9),
+        np.zeros((count, 1, 3)),
+    )
+    gaussians.by_rays = True
+    image, planes = Renderer(device).render_channels(gaussians, camera)
+    assert (image.alpha > 0.9).all()
+    for name in ("depth", "median", "first"):
+        # a Gaussian's distance and a pixel's angle: they are up to three deviations of 0.08 apart, at 46 degrees
+        assert_close(planes[name], np.full((64, 64), 2.0), absolute=0.3, name=name)
+        # the nearest come first, and they are on the axis' side; distances have a mean of 2.3
+        assert abs(planes[name].mean() - 2.0) < 0.1, name
+    slices = Renderer(device).render_deep(gaussians, camera, np.array([1.5], np.float32))
+    assert not slices[0].any()
+    least, most = slices[1, :, :, 4], slices[1, :, :, 5]
+    assert (least <= most).all()
+    assert_close(0.5 * (least + most), np.full((64, 64), 2.0), absolute=0.3)
+
+
+def test_by_rays_of_another_projection_is_none(default_device: Device) -> None:
+    camera = replace(panorama(64, 32), by_rays=True)
+    with pytest.raises(InputError, match="by_rays is True of a camera that is equirectangular, expected perspective"):
+        Renderer(default_device).render(all_around(4, 1), camera)
+
+
 def test_what_is_too_near_or_transparent_is_left_out(device: Device) -> None:
     gaussians = all_around(4, 1)
     gaussians.means[0] = 0.005 * gaussians.means[0] / np.linalg.norm(gaussians.means[0])
@@ -221,10 +300,10 @@ def test_what_is_too_near_or_transparent_is_left_out(device: Device) -> None:
 
 @pytest.mark.parametrize("group", ["means", "quaternions", "log_scales", "opacity_logits", "sh"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38, -3e38])
-@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees"])
+@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective of 150 degrees"])
 def test_what_is_not_finite_is_left_out_alone(default_device: Device, name: str, value: float, group: str) -> None:
     renderer, camera = Renderer(default_device), CAMERAS[name]
-    clean, broken = all_around(60, 9), all_around(60, 9)
+    clean, broken = model_for(camera, 60, 9), model_for(camera, 60, 9)
     clean.opacity_logits[7] = -20.0
     getattr(broken, group)[7] = value
     wanted, got = (renderer.render_channels(gaussians, camera, ("normal", "position")) for gaussians in (clean, broken))

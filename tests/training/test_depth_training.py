@@ -52,9 +52,9 @@ def wrong(trainer: Trainer) -> float:
     """Weighted mean difference of nearness over the training views."""
     total = weight = 0.0
     for index, view in enumerate(trainer.views):
-        aims = trainer.depths.aims(index, view.camera.width, view.camera.height, 1)
-        assert aims is not None
         camera = trainer.camera(index, view.camera.width, view.camera.height)
+        aims = trainer.depths.aims(index, camera, 1)
+        assert aims is not None
         frame = trainer.rasterizer.forward(trainer.parameters, camera, np.zeros(3, np.float32), nearness=True)
         assert frame.blended.nearness is not None
         total += float((aims.planes[1] * np.abs(frame.blended.nearness.get() - aims.planes[0])).sum())
@@ -81,15 +81,15 @@ def test_the_weight_falls_and_views_count_alike(scene: Scene) -> None:
     assert [weight_at(config, step) for step in (0, 500, 1000)] == pytest.approx([0.5, 0.05, 0.005])
     views = with_depths(scene, config.depth_use).train_views
     for size in (48, 24):
-        aims = Depths(config, views, 3.0).aims(0, size, size * 5 // 6, 500)
+        aims = Depths(config, views, 3.0).aims(0, views[0].camera.resized(size, size * 5 // 6), 500)
         assert aims is not None
         assert aims.factor * aims.planes[1].sum() == pytest.approx(0.05 * 3.0)
-    blind = [replace(views[0], depth=None)]
-    nothing = Depths(config, blind, 3.0).aims(0, 48, 40, 1)
+    blind, camera = [replace(views[0], depth=None)], views[0].camera.resized(48, 40)
+    nothing = Depths(config, blind, 3.0).aims(0, camera, 1)
     assert nothing is not None
     assert nothing.factor == 0
     assert not nothing.planes.any()
-    assert Depths(TrainConfig(), views, 3.0).aims(0, 48, 40, 1) is None
+    assert Depths(TrainConfig(), views, 3.0).aims(0, camera, 1) is None
 
 
 def test_without_weight_the_model_is_that_of_today(scene: Scene, default_device: Device, tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_a_bundle_has_the_depths(scene: Scene, default_device: Device, tmp_path:
     incident = Incident(12, 0, trainer.views[0].name, "loss", 1, "nothing", np.zeros(3, np.float32))
     bundle = read_bundle(write_bundle(tmp_path, trainer, incident))
     assert bundle.depth is not None
-    wanted = trainer.depths.aims(0, bundle.camera.width, bundle.camera.height, 12)
+    wanted = trainer.depths.aims(0, bundle.camera, 12)
     assert wanted is not None
     np.testing.assert_array_equal(bundle.depth.planes, wanted.planes)
     assert bundle.depth.factor == wanted.factor

@@ -73,15 +73,15 @@ def read(path: Path) -> Gaussians:
                 values = (steps / 256 - 0.5) * 8
                 result.sh[rows, 1:] = values.reshape(len(values), 3, -1).transpose(0, 2, 1)
     packing.require_finite(path, result)
-    result.antialiased = header.antialiased
+    result.antialiased, result.by_rays = header.antialiased, header.by_rays
     return result
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: comments, `antialiased`."""
+    """The format's part of `clsplat info`: comments, `antialiased`, `by_rays`."""
     with open_input(path, "a compressed PLY") as file:
         header = ply.read_header(file, path)
-    return {"comments": header.comments, "antialiased": header.antialiased}
+    return {"comments": header.comments, "antialiased": header.antialiased, "by_rays": header.by_rays}
 
 
 def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> None:
@@ -93,6 +93,7 @@ def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> 
     lines = ["ply", "format binary_little_endian 1.0", "comment clsplat"]
     lines += [f"comment {line}" for line in comments]
     lines += [" ".join(ply.MIP)] if gaussians.antialiased else []
+    lines += [" ".join(ply.ALONG_RAYS)] if gaussians.by_rays else []
     lines += [f"element chunk {-(-count // CHUNK)}", *(f"property float {name}" for name in BOUNDS)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
     lines += [f"element sh {count}", *(f"property uchar f_rest_{index}" for index in range(rest))] if rest else []

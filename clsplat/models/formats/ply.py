@@ -54,6 +54,8 @@ ORIGIN = ["comment", "clsplat", "origin"]
 NEAR_PLANE = ["comment", "clsplat", "near"]
 MIP = ["comment", "SplatRenderMode:", "mip"]
 """The comment of a model that is antialiased, in Brush's words. Some writers add the low-pass: mip-0.1."""
+ALONG_RAYS = ["comment", "clsplat", "rays"]
+"""The comment of a model that perspective cameras draw along rays."""
 FILTER = "filter_3D"
 """Mip-splatting's property: what its renderer adds to the scales."""
 LOCAL = "clsplat_local"
@@ -83,7 +85,7 @@ class Element:
 class Header:
     """path: of the file, for messages; format: "ascii" or a key of BYTE_ORDERS; size: the header's length in bytes,
     `end_header` included; origin: of the element LOCAL; near: the near plane, where it is not the usual one;
-    antialiased: as of `Gaussians`."""
+    antialiased, by_rays: as of `Gaussians`."""
 
     path: Path
     format: str
@@ -93,6 +95,7 @@ class Header:
     near: float = NEAR
     comments: list[str] = field(default_factory=list)
     antialiased: bool = False
+    by_rays: bool = False
 
     @property
     def vertex(self) -> Element:
@@ -141,7 +144,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         gaussians = _assemble(read_vertices(file, header, "Gaussian"), vertex.count, rest, path)
         if header.origin is not None:
             _count_from(header.origin, gaussians, _local_means(file, header), path)
-        gaussians.near, gaussians.antialiased = header.near, header.antialiased
+        gaussians.near, gaussians.antialiased, gaussians.by_rays = header.near, header.antialiased, header.by_rays
         return gaussians
 
 
@@ -161,14 +164,15 @@ def blocks(path: Path) -> Iterator[Gaussians]:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: encoding, comments, properties that are ignored, `near`, `antialiased`."""
+    """The format's part of `clsplat info`: encoding, comments, properties that are ignored, `near`, `antialiased`,
+    `by_rays`."""
     known = {*REQUIRED, "nx", "ny", "nz"}
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
     properties = header.vertex.properties
     ignored = [name for name, _ in properties if name not in known and not name.startswith("f_rest_")]
     described = {"encoding": header.format, "comments": header.comments, "ignored": ignored, "near": header.near}
-    return described | {"antialiased": header.antialiased}
+    return described | {"antialiased": header.antialiased, "by_rays": header.by_rays}
 
 
 def write(
@@ -197,6 +201,7 @@ def write(
     lines += [" ".join([*ORIGIN, *(repr(float(value)) for value in gaussians.origin)])] if far else []
     lines += [" ".join([*NEAR_PLANE, repr(float(gaussians.near))])] if gaussians.near != NEAR else []
     lines += [" ".join(MIP)] if gaussians.antialiased else []
+    lines += [" ".join(ALONG_RAYS)] if gaussians.by_rays else []
     lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
     lines += [f"element {LOCAL} {count}", *(f"property float {name}" for name in POSITION)] if far else []
     lines += ["end_header", ""]
@@ -232,7 +237,7 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     form = ""
     elements: list[Element] = []
     comments: list[str] = []
-    origin, near, antialiased = None, NEAR, False
+    origin, near, antialiased, by_rays = None, NEAR, False, False
     for _ in range(MAX_HEADER_LINES):
         line = file.readline(4096)
         if not line.endswith(b"\n"):
@@ -245,13 +250,14 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             if words[:3] == NEAR_PLANE:
                 near = float(given[0]) if len(given) == 1 and 0 < given[0] < np.inf else NEAR
             antialiased |= words[:2] == MIP[:2] and "".join(words[2:3]).startswith(MIP[2])
+            by_rays |= words == ALONG_RAYS
             comments += [" ".join(words[1:])] if words else []
             continue
         if words == ["end_header"]:
             if form not in ("ascii", *BYTE_ORDERS):
                 expected = "ascii, binary_little_endian or binary_big_endian"
                 raise InputError(f"{path}: PLY header has the format {form or 'missing'!r}, expected {expected}")
-            return Header(path, form, elements, file.tell(), origin, near, comments, antialiased)
+            return Header(path, form, elements, file.tell(), origin, near, comments, antialiased, by_rays)
         try:
             match words:
                 case ["format", name, _]:
