@@ -223,8 +223,8 @@ class Camera:
         return replace(self, by_rays=by_rays) if changes else self
 
     def depths_of_distances(self) -> Float32 | None:
-        """What depth, z, is in distances, for each pixel (height, width) of a perspective camera whose kernels have
-        distances; None where what they have is the depth."""
+        """Cosines (height, width) at the pixels of a perspective camera, where kernels have distances: times these they
+        are depths, z. None where kernels have the depth."""
         if not self.by_rays:
             return None
         x, y = (self.window.x, self.window.y) if self.window else (0, 0)

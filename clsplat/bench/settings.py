@@ -21,6 +21,7 @@ from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import PLAIN_SLOTS
+from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.progress import Progress, aligned, no_progress
 from clsplat.reference.blend import blend
@@ -95,6 +96,10 @@ def compare(
     image. Where both are among the settings, also how many times faster all exact switches together make them.
     """
     say = progress or no_progress
+    if subject.camera.kind.rays:
+        raise InputError(
+            f"{subject.name}: its pictures are drawn along rays, expected a model and a camera of the image's plane"
+        )
     tried = {name: config.switches() for name, config in (candidates or settings()).items()}
     trainer, camera = trainer_of(subject, device, PRESETS["exact"]), subject.camera
     model, work = trainer.parameters, trainer.rasterizer.work

@@ -94,4 +94,4 @@ def facing(gaussians: Gaussians, width: int, height: int) -> tuple[Gaussians, Ca
     distance = max(float(np.max(2 * focal * half[:2] / (width, height))) + float(half[2]), 0.1)
     position = middle - np.array([0.0, 0.0, distance])
     camera = Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), -position)
-    return replace(gaussians, origin=np.zeros(3)), camera
+    return replace(gaussians, origin=np.zeros(3)), camera.along_rays(gaussians.by_rays)
