@@ -7,8 +7,9 @@
 Both captures are made by the demo's ray caster from the same places: one through Kannala and Brandt's lens, one through
 a pinhole with as many pixels a radian on the axis, or --finer times fewer. What lies around the fisheye's circle is
 masked, as it has to be in any capture: other photographs show what is there. Both models are measured on the same
-held-out pinhole pictures, and on those pixels alone that a fisheye has too, which is all; then on the inner and the
-outer half of them, where a pinhole has up to 1 / cos^3 of the angle as many pixels for the same part of the scene.
+held-out pinhole pictures, each drawn as its file says, that of fisheyes along rays, and on those pixels alone that a
+fisheye has too, which is all; then on the inner and the outer half of them, where a pinhole has up to 1 / cos^3 of the
+angle as many pixels for the same part of the scene.
 Writes FOLDER/fisheye and FOLDER/pinhole, each with model.ply, which is taken again where it is there, and
 FOLDER/views.png: truth, fisheye's model, pinhole's, and the fisheye's own held-out picture. The loss is a mean over
 pixels, and density control counts in half images: in a fisheye's larger picture the same blur has a smaller gradient,

@@ -61,9 +61,7 @@ class Uploads:
             slot.arrived.wait()  # sent a while ago: the pinned memory is free
         host = slot.host[: values.nbytes].view(values.dtype).reshape(values.shape)
         host[...] = values
-        held = DeviceArray(self._device, slot.array.buffer, values.shape, values.dtype)
-        again = slot.held is not None and (slot.held.shape, slot.held.dtype) == (held.shape, held.dtype)
-        slot.held, slot.key = slot.held if again else held, key  # tapes know the object
+        slot.held, slot.key = DeviceArray(self._device, slot.array.buffer, values.shape, values.dtype), key
         before = None if slot.used is None else [slot.used]
         slot.arrived = cl.enqueue_copy(self._queue, slot.array.buffer, host, is_blocking=False, wait_for=before)
         slot.used = None

@@ -71,12 +71,3 @@ def test_other_sizes_and_kinds(device: Device) -> None:
         assert array is not None
         np.testing.assert_array_equal(array.get(), wanted)
     assert uploads.take("large") is None
-
-
-def test_the_same_again_is_the_same_object(device: Device) -> None:
-    """Tapes know arrays by it."""
-    uploads, seen = Uploads(device, pattern(0).nbytes), set()
-    for number in range(5 * SLOTS):
-        uploads.begin(number, pattern(number))
-        seen.add(id(uploads.take(number)))
-    assert len(seen) == SLOTS
