@@ -17,6 +17,7 @@
 #include "shared/splat.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
+#include "shared/subgroup.h"
 #include "shared/tile.h"
 #include "shared/cells.h"
 #include "shared/alpha.h"
@@ -178,16 +179,10 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
 #ifdef BY_GAUSSIAN
 #include "shared/walk.h"
 #elif ITEMS > 1
-// Pairs whose sums over the group's items are made together: each item leaves its part of a field in a row, and then
-// an item adds up a row, in an order that no driver changes. A row is padded so that rows begin in banks of their own.
-#define TOGETHER (ITEMS < 256 ? 3 : 1)
-#define ROW (ITEMS + 4)
-static inline float row_sum(__local const float *row) {
-  __local const float4 *four = (__local const float4 *)row;
-  float4 sum = four[0];
-  for (int i = 1; i < ITEMS / 4; ++i) sum += four[i];
-  return (sum.x + sum.y) + (sum.z + sum.w);
-}
+#include "shared/item_sums.h"
+
+// Pairs whose sums over the group's items are made together: as many as give most items a row.
+#define TOGETHER (SUBGROUP > 1 && ITEMS > SLOT_STRIDE ? ITEMS / SLOT_STRIDE : ITEMS < 256 ? 3 : 1)
 #endif
 
 // The gradient by a pixel's transmittance at the end; background: of what is behind.
@@ -199,18 +194,19 @@ static inline float row_sum(__local const float *row) {
 #define NEAR_PLANE 3
 #endif
 
-GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
-                               __global const uint *gaussian_from_sorted, __global const uint *slot_from_sorted,
-                               __global const float *splats, __global const float *background,
-                               __global const float *image_gradient, __global const float *transmittance,
-                               __global const int *stops, __global float *slots
+GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_x, const int height,
+                                          __global const uint *ranges, __global const uint *gaussian_from_sorted,
+                                          __global const uint *slot_from_sorted, __global const float *splats,
+                                          __global const float *background, __global const float *image_gradient,
+                                          __global const float *transmittance, __global const int *stops,
+                                          __global float *slots
 #ifdef RECORD_CELLS
-                               ,
-                               __global const uint *cells_from_sorted
+                                          ,
+                                          __global const uint *cells_from_sorted
 #endif
 #ifdef RAYS
-                               ,
-                               __constant float *camera
+                                          ,
+                                          __constant float *camera
 #endif
 ) {
   TILE_OF_GROUP
@@ -383,8 +379,7 @@ GROUP __kernel void blend_grad(const int first_tile, const int tiles_x, const in
         float sums[SLOT_STRIDE];
         for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
         TAKE_PAIR(FROM_OWN(s.blocks))
-        __local float *column = rows + j * (SLOT_STRIDE * ROW) + ITEM;
-        for (int field = 0; field < SLOT_STRIDE; ++field) column[field * ROW] = sums[field];
+        leave_sums(sums, rows + j * (SLOT_STRIDE * ROW));
       }
       BARRIER_LOCAL();
       for (int row = ITEM; row < together * SLOT_STRIDE; row += ITEMS)

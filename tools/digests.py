@@ -38,7 +38,9 @@ sys.path[:0] = [str(ROOT / part) for part in ("tests/support", "tools", ".")]
 import numpy as np  # noqa: E402
 from processor import processor  # noqa: E402
 
-SHAPES = ("8x1", "16x1", "1x1", "1x32", "1x64", "1x128", "1x256", "1x32g", "1x64g")
+SUBGROUPED = ("1x32s", "1x64s", "1x128s", "1x256s")
+"""Shapes with sub-groups, of drivers that have them; they have the gradients of the shapes without."""
+SHAPES = ("8x1", "16x1", "1x1", "1x32", "1x64", "1x128", "1x256", "1x32g", "1x64g", *SUBGROUPED)
 """Lanes x items, `g` for a gradient by Gaussian; the first is what the others are compared with."""
 TRAINED = ("8x1", "16x1", "1x1", "1x64")
 """Shapes in which a model is trained, twice: kernels of other groups differ from 1x64 in what gradients show."""
@@ -126,10 +128,14 @@ def jobs(folder: Path) -> list[Job]:
     from opencl_drivers import use_every_driver
 
     use_every_driver()
+    from clsplat.device.context import all_devices
+    from clsplat.device.quirks import subgroup_ways
+
     listed: list[Job] = []
     names = _names()
     for index, name in enumerate(names):
-        listed += [Job(name, index, shape, train=shape in TRAINED, environment={}) for shape in SHAPES]
+        shapes = [shape for shape in SHAPES if shape not in SUBGROUPED or subgroup_ways(all_devices()[index])]
+        listed += [Job(name, index, shape, train=shape in TRAINED, environment={}) for shape in shapes]
     for index, name in enumerate(names):
         if name.startswith("PoCL"):
             for method, shapes in METHODS.items():
@@ -268,7 +274,7 @@ def problems(rows: list[Row]) -> list[str]:
         if row.frame != first.frame:
             found.append(f"{at}: the frame is {row.frame}, on {first.driver}, {first.shape} it is {first.frame}")
         found += other_channels(row, first)
-        other = by_shape.setdefault(row.shape, row)
+        other = by_shape.setdefault(row.shape.removesuffix("s"), row)
         if row.gradient != other.gradient:
             found.append(
                 f"{at}: the gradient is {row.gradient}, on {other.driver} in that shape it is {other.gradient}"

@@ -71,14 +71,24 @@ class Source:
         return "-DBY_GAUSSIAN" in self.options
 
     @property
+    def subgroup(self) -> int:
+        """Items that exchange values, 1 where none do."""
+        return next((int(each.partition("=")[2]) for each in self.options if each.startswith("-DSUBGROUP=")), 1)
+
+    def options_for(self, target: str) -> tuple[str, ...]:
+        """The options, with the target's way to exchange values."""
+        shuffle = "-DSHUFFLE_PTX" if target.startswith("sm_") else "-DSHUFFLE_AMD"
+        return tuple(shuffle if each.startswith("-DSHUFFLE") else each for each in self.options)
+
+    @property
     def shape(self) -> str:
         """The kernels' shape, as CLSPLAT_SHAPE has it."""
-        return f"1x{self.items}{'g' if self.by_gaussian else ''}"
+        return f"1x{self.items}{'g' if self.by_gaussian else 's' if self.subgroup > 1 else ''}"
 
     @property
     def label(self) -> str:
         """The stem, with the defines beside the shape."""
-        shape = ("-DITEMS=", "-DLANES=", "-cl")
+        shape = ("-DITEMS=", "-DLANES=", "-DSUBGROUP=", "-DSHUFFLE", "-cl")
         defines = [each[2:].removesuffix("=1") for each in self.options if not each.startswith(shape)]
         return " ".join((self.stem, *defines))
 
@@ -162,7 +172,7 @@ def compile_source(source: Source, target: str, builtins: Path) -> list[Built]:
         text, assembly, cubin = (Path(scratch) / f"{source.stem}.{end}" for end in ("cl", "s", "cubin"))
         text.write_text(kernel_source(source.stem), encoding="utf-8")
         link = ("-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(builtins))
-        options = (*FLAGS, "-gline-tables-only", *target_flags(target), *source.options, *link)
+        options = (*FLAGS, "-gline-tables-only", *target_flags(target), *source.options_for(target), *link)
         run_checked([clang(), *options, "-S", str(text), "-o", str(assembly)], what)
         written = assembly.read_text()
         if missing := re.search(r"\b_Z(\d+)(\w+)", written):

@@ -28,12 +28,13 @@ side: a guess."""
 
 @dataclass(frozen=True)
 class Run:
-    """Numbers that the rounds of a loop depend on. items: of a group; wave: items that run in step; addends: pairs of a
-    visible Gaussian; listed: pairs of a tile; coefficients: of SH. Of the launch: groups, elements that they share, and
-    digits of a pass of the sort."""
+    """Numbers that the rounds of a loop depend on. items: of a group; wave: items that run in step; subgroup: items
+    that exchange values; addends: pairs of a visible Gaussian; listed: pairs of a tile; coefficients: of SH. Of the
+    launch: groups, elements that they share, and digits of a pass of the sort."""
 
     items: int
     wave: int = 32
+    subgroup: int = 1
     addends: float = 12.5
     listed: float = math.inf
     coefficients: int = 16
@@ -64,6 +65,8 @@ class Run:
     @property
     def together(self) -> int:
         """Pairs whose sums are made together, TOGETHER in blend_grad.cl."""
+        if self.subgroup > 1:
+            return self.items // PLAIN_SLOTS.floats
         return 3 if self.items < 256 else 1
 
     @property
@@ -160,10 +163,12 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule("for (int batch = last", lambda run: run.batches),
         Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
         Rule("for (int first = 0; first < count; first += TOGETHER)", lambda run: 1 / run.together),
-        Rule("for (int j = 0; j < together; ++j)", lambda run: 1, ends=("column[field * ROW] = sums[field];",)),
-        Rule("for (int i = 1; i < ITEMS / 4; ++i)", lambda run: run.items / 4 / run.together, mark=("shared", 1)),
-        Rule("for (int i = 1; i < ITEMS / 4; ++i)", lambda run: run.summing, part=True),
-        Rule("return (sum.x + sum.y)", lambda run: run.summing, part=True),
+        Rule(
+            "for (int j = 0; j < together; ++j)",
+            lambda run: 1,
+            ends=("rows[field * ROW + get_local_id(0)] = sums[field];",),
+        ),
+        Rule("return (four.x + four.y)", lambda run: run.summing, ends=("DOUBLED(",), part=True),
     ),
 }
 """Kernels that a group runs for a tile: rounds for a pair in each of the group's waves."""

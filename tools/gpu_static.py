@@ -47,7 +47,7 @@ from measuring import reporting, require
 from clsplat.progress import aligned
 
 SHAPES = ("1x32", "1x64", "1x128", "1x256")
-WALKS = ("1x32g", "1x64g")
+FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
 """Shapes with another form of blending's gradient alone."""
 FRAMES = Path(__file__).with_name("gpu_frames.json")
 CHECKED = (("1x64", "1x32g"), ("sm_89", "gfx1100"))
@@ -147,7 +147,7 @@ def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
     items, more_shared = launch or (source.items if built.kernel in BY_PAIR else 64, 0)
     pair, rules, unknown = None, frozenset[Rule](), ""
     if launch or built.kernel in BY_PAIR:
-        run = Run(source.items, ARCHITECTURES[built.target].wave)
+        run = Run(source.items, ARCHITECTURES[built.target].wave, source.subgroup)
         try:
             cost = cost_of(built, source.lines, WALK if source.by_gaussian else rules_of(built.kernel), run)
             rules, pair = cost.rules, by_pair(cost, run) if built.kernel in BY_PAIR else None
@@ -252,7 +252,7 @@ def run(arguments: list[str]) -> int:
     shapes = options.shapes.split(",")
     targets = TARGETS if options.targets == "all" else options.targets.split(",")
     for shape in shapes:
-        require(shape in SHAPES + WALKS, f"--shapes {shape}: expected one of {', '.join(SHAPES + WALKS)}")
+        require(shape in SHAPES + FORMS, f"--shapes {shape}: expected one of {', '.join(SHAPES + FORMS)}")
     for target in targets:
         require(target in TARGETS, f"--targets {target}: expected one of {', '.join(TARGETS)}")
     wanted = options.stems.split(",") if options.stems else []
@@ -319,10 +319,10 @@ def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], 
             for frame, step in zip(frames, steps, strict=True):
                 predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
     trained, _ = trained_and_picture(frames)
-    for shape in WALKS:
+    for shape in FORMS:
         sources = sources_of(ask_package("step", shape, trained[-1:])[0])
-        walks = {source: kernels for source, kernels in sources.items() if source.by_gaussian}
-        rows += compiled(walks, TARGETS, jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
+        formed = {source: kernels for source, kernels in sources.items() if source.shape == shape}
+        rows += compiled(formed, TARGETS, jobs, lambda text, shape=shape: note(f"{shape}: {text}"))
     if unused := unused_rules(used):
         raise UnknownLoopError("; ".join(unused))
     return rows, predictions

@@ -42,6 +42,10 @@ OPTIONS = "-cl-std=CL1.2 -cl-fp32-correctly-rounded-divide-sqrt"
 """Options of a build: NVIDIA's and AMD's drivers say that they can divide and take roots with correct rounding."""
 
 
+SUBGROUPS = {"SUBGROUP": 32, "SHUFFLE_PTX": True}
+"""Defines of a shape with sub-groups; what compiles them puts in the target's way to exchange values."""
+
+
 def noted(variant: Variant) -> dict[str, Any]:
     """A variant for JSON: stem and options."""
     return {"stem": variant.stem, "options": list(variant.options)}
@@ -129,6 +133,7 @@ class Rehearsed:
             note(array, "read")
 
         Device._built = built  # type: ignore[assignment,method-assign]  # noqa: SLF001
+        Device._with_subgroups = lambda device: dict(SUBGROUPS)  # type: ignore[method-assign]  # noqa: SLF001
         Device.enqueue = enqueue  # type: ignore[assignment,method-assign]
         profile.Recorder.add = add  # type: ignore[assignment,method-assign]
         buffers._Buffer = _Buffer  # type: ignore[assignment,misc]  # noqa: SLF001

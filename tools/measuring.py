@@ -55,7 +55,7 @@ def machine(device: Device, repeat: int) -> Result:
     return {
         "device": device.name,
         "driver": device.driver,
-        "shape": {name: getattr(device.shape, name) for name in ("lanes", "items", "by_gaussian")},
+        "shape": {name: getattr(device.shape, name) for name in ("lanes", "items", "by_gaussian", "subgroups")},
         "repeat": repeat,
         "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     }

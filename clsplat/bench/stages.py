@@ -93,7 +93,7 @@ def bench(
     return {
         "device": device.name,
         "driver": device.driver,
-        "shape": {name: getattr(device.shape, name) for name in ("lanes", "items", "by_gaussian")},
+        "shape": {name: getattr(device.shape, name) for name in ("lanes", "items", "by_gaussian", "subgroups")},
         "source": subject.name,
         "rasterizer": asdict(config),
         "gaussians": len(subject.gaussians),

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 from clsplat.config.checks import device_names
 from clsplat.device.account import Memory
@@ -21,13 +22,13 @@ from clsplat.device.known import tell_once
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Calls, Recorder
 from clsplat.device.program import Kernel, Kernels, build, variant_of
-from clsplat.device.quirks import compiles_by_size, no_device, title
+from clsplat.device.quirks import compiles_by_size, no_device, subgroup_ways, title
 from clsplat.device.rehearsal import Rehearsal
 from clsplat.device.shapes import Shape, asked_shape, default_shape, shape_of, shape_text
 from clsplat.device.source import kernel_source
 from clsplat.device.tape import Tape
 from clsplat.device.traits import pretended, traits_of
-from clsplat.errors import DeviceError, DriverError, switched_on
+from clsplat.errors import DeviceError, DriverError, KernelBuildError, switched_on
 
 T = TypeVar("T")
 
@@ -149,6 +150,7 @@ class Device:
         self.recorder = Recorder(self.queue)
         self.rehearsal = Rehearsal(device, self.index, self.shape.label)
         self._fma: list[dict[str, object]] = [] if traits.contraction else [{}]
+        self._subgroups: list[dict[str, object]] = []
 
     def kernels(self, stem: str, **defines: object) -> Kernels:
         """The kernels of `stem`.cl in this device's shape, built at the first call."""
@@ -157,6 +159,8 @@ class Device:
         if self._switches:
             text = kernel_source(stem)
             defines = {**{name: value for name, value in self._switches.items() if name in text}, **defines}
+        if self.shape.subgroups and "SUBGROUPED" in kernel_source(stem):
+            defines = {**self._with_subgroups(), **defines}
         key = (stem, tuple(sorted(defines.items())) if defines else ())
         kernels = self._kernels.get(key)
         if kernels is None:
@@ -176,7 +180,7 @@ class Device:
         """A device like this with another shape, by its label or by lanes, items and chunks."""
         shape = self.shape.relabelled(label) if label else self.shape
         if changes:
-            shape = replace(shape, by_gaussian=False)
+            shape = replace(shape, by_gaussian=False, subgroups=False)
         device = Device(self.cl_device, replace(shape, **changes), profile=self.profile, part=self._part)
         device.memory.limit = self.memory.limit
         return device
@@ -305,13 +309,42 @@ class Device:
         if self.shape.lanes == 1:
             return {}
         fused: dict[str, object] = {"FMA_BY_CONTRACTION": True}
-        kernel, results = self._built("probe", fused).probe_fma, np.empty(2 * self.shape.lanes, np.float32)
-        buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, results.nbytes)
-        values = (buffer, np.float32(1 + 2.0**-12), np.float32(-(1 + 2.0**-11)))
-        self.rehearsal.launch(kernel, (1,), (1,), values)
-        self.enqueue(kernel, (1,), (1,), values)
-        cl.enqueue_copy(self.queue, results, buffer, is_blocking=True)
+        numbers = (np.float32(1 + 2.0**-12), np.float32(-(1 + 2.0**-11)))
+        results = self._probed(self._built("probe", fused).probe_fma, 1, 2 * self.shape.lanes, *numbers)
         return fused if np.all(results == np.float32(2.0**-24)) else {}
+
+    def _with_subgroups(self) -> dict[str, object]:
+        """The defines of the first of `subgroup_ways` in which items exchange what they should. Raises DeviceError."""
+        if self._subgroups:
+            return self._subgroups[0]
+        for defines in subgroup_ways(self.cl_device):
+            bits = int(str(defines["SUBGROUP"])).bit_length() - 1
+            wanted = np.arange(self.shape.items) ^ (1 << np.arange(bits)[:, None])
+            try:
+                got = self._probed(
+                    self._built("probe_subgroup", defines).probe_subgroup, self.shape.items, wanted.shape
+                )
+            except (KernelBuildError, DriverError):
+                continue
+            if np.array_equal(got, wanted):
+                self._subgroups.append(defines)  # in place: copies of a device share it
+                return defines
+        raise DeviceError(
+            f"{title(self.cl_device)}: items of a sub-group do not exchange what they should; expected a shape without "
+            f"sub-groups, such as CLSPLAT_SHAPE={self.shape.label.removesuffix('s')}"
+        )
+
+    def _probed(
+        self, kernel: Kernel, items: int, shape: int | tuple[int, ...], *numbers: object
+    ) -> NDArray[np.float32]:
+        """An array of this shape, as a group of so many items writes it; numbers: the kernel's other arguments."""
+        results = np.empty(shape, np.float32)
+        buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, results.nbytes)
+        values = (buffer, *numbers)
+        self.rehearsal.launch(kernel, (items,), (items,), values)
+        self.enqueue(kernel, (items,), (items,), values)
+        cl.enqueue_copy(self.queue, results, buffer, is_blocking=True)
+        return results
 
     def __repr__(self) -> str:
         return f"<Device {self.name} | {self.driver.split('  ')[0].strip()} | {self.shape.label}>"

@@ -37,6 +37,8 @@ VARIABLES = (_VENDORS, _ICD_FILENAMES, _POCL_CACHE, "POCL_DEVICES", "RUSTICL_ENA
 """Variables of loaders and drivers that change which devices there are, or how they work."""
 MAKERS = {0x10DE: "NVIDIA", 0x1002: "AMD", 0x8086: "Intel"}
 """Makers of GPUs by their number on the PCI bus."""
+_SUBGROUP_SIZES = (16, 32, 8)
+"""Items of a sub-group where the kernel may choose, the first to try first."""
 _GPU_PACKAGES = {
     "NVIDIA": {
         "debian": "apt install nvidia-opencl-icd, beside the driver; in a container the host's libraries, with "
@@ -88,6 +90,23 @@ def most_lanes(device: cl.Device) -> int:
     if _is_rusticl(device):  # with vectors llvmpipe does not come back from the larger kernels
         return 1
     return 8 if _pocl_version(device) == (3, 0) else 16  # PoCL 3.0 aborts on some float16 built-ins
+
+
+def subgroup_ways(device: cl.Device) -> list[dict[str, object]]:
+    """Defines for kernels with sub-groups, the first to try first; none where a device offers no sub-groups of a size
+    that is known when a kernel is built. What they exchange is probed before it is used (`Device.kernels`)."""
+    extensions = device.extensions.split()
+    if "cl_nv_device_attribute_query" in extensions:  # by inline PTX, as NVIDIA's OpenCL has no such functions
+        return [{"SUBGROUP": 32, "SHUFFLE_PTX": True}]
+    if "cl_amd_device_attribute_query" in extensions:  # by the compiler's own functions
+        return [{"SUBGROUP": 32, "SHUFFLE_AMD": True}]
+    functions = {"cl_khr_subgroup_shuffle": "SHUFFLE_KHR", "cl_intel_subgroups": "SHUFFLE_INTEL"}
+    offered = [define for extension, define in functions.items() if extension in extensions]
+    if "cl_intel_required_subgroup_size" not in extensions:
+        return []
+    return [
+        {"SUBGROUP": size, define: True, "SUBGROUP_IS_ASKED": True} for define in offered for size in _SUBGROUP_SIZES
+    ]
 
 
 def misnames_processors(device: cl.Device) -> bool:

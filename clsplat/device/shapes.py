@@ -14,7 +14,7 @@ import pyopencl as cl
 
 from clsplat.device import known
 from clsplat.device.child import regardless
-from clsplat.device.quirks import most_lanes, title
+from clsplat.device.quirks import most_lanes, subgroup_ways, title
 from clsplat.device.traits import traits_of
 from clsplat.errors import DeviceError, reason_of
 from clsplat.files import atomic_write, parse_json
@@ -23,6 +23,9 @@ LANES = (1, 4, 8, 16)
 """Pixels that a vector can have."""
 WALKS = ((1, 32), (1, 64))
 """Lanes and items of the shapes that are also there by Gaussian."""
+EXCHANGES = (*WALKS, (1, 128), (1, 256))
+"""Lanes and items of the shapes that are also there with sub-groups."""
+_FORMS = {"g": WALKS, "s": EXCHANGES}
 
 
 @dataclass(frozen=True)
@@ -32,31 +35,34 @@ class Shape:
     lanes: pixels per vector in the blend kernels (1 on GPUs); items: work-items per work-group in kernels that
     co-operate (1 on CPUs, where a group is one sequential loop); chunks: pieces that a scan or sort is cut into at
     `items` == 1; by_gaussian: an item of blending's gradient has a Gaussian and walks the pixels, not pixels that the
-    Gaussians come to (docs/decisions/0023-a-group-shares-a-tile.md), with 1 lane and items as in WALKS.
+    Gaussians come to (docs/decisions/0023-a-group-shares-a-tile.md), with 1 lane and items as in WALKS; subgroups:
+    items make these sums by what sub-groups exchange, to the same bits, as in EXCHANGES.
     """
 
     lanes: int
     items: int
     chunks: int
     by_gaussian: bool = False
+    subgroups: bool = False
 
     @property
     def label(self) -> str:
-        """LANESxITEMS, and a `g` behind it by Gaussian, the form that CLSPLAT_SHAPE takes."""
-        return f"{self.lanes}x{self.items}{'g' if self.by_gaussian else ''}"
+        """LANESxITEMS, with a `g` behind it by Gaussian, an `s` with sub-groups: the form that CLSPLAT_SHAPE takes."""
+        return f"{self.lanes}x{self.items}{'g' if self.by_gaussian else 's' if self.subgroups else ''}"
 
     @property
     def words(self) -> str:
         """The label in words."""
-        return f"{self.lanes} lanes x {self.items} items{', by Gaussian' if self.by_gaussian else ''}"
+        form = ", by Gaussian" if self.by_gaussian else ", with sub-groups" if self.subgroups else ""
+        return f"{self.lanes} lanes x {self.items} items{form}"
 
     def relabelled(self, label: str) -> Shape:
         """A shape like this with another label. Raises ValueError for what is none."""
-        match = re.fullmatch(r"(\d+)x(\d+)(g?)", label.strip())
-        lanes, items, by_gaussian = (int(match[1]), int(match[2]), bool(match[3])) if match else (0, 0, False)
-        if lanes not in LANES or items < 1 or items & (items - 1) or (by_gaussian and (lanes, items) not in WALKS):
+        match = re.fullmatch(r"(\d+)x(\d+)([gs]?)", label.strip())
+        lanes, items, form = (int(match[1]), int(match[2]), match[3]) if match else (0, 0, "")
+        if lanes not in LANES or items < 1 or items & (items - 1) or (form and (lanes, items) not in _FORMS[form]):
             raise ValueError(f"{label}: no shape")
-        return replace(self, lanes=lanes, items=items, by_gaussian=by_gaussian)
+        return replace(self, lanes=lanes, items=items, by_gaussian=form == "g", subgroups=form == "s")
 
     @property
     def digit_bits(self) -> int:
@@ -103,7 +109,8 @@ def candidates(device: cl.Device) -> list[Shape]:
         others = [replace(default, lanes=lanes) for lanes in (16, 8)]
     else:
         others = [replace(default, items=items) for items in (32, 128, 256) if items <= most_items(device)]
-        others += [default.relabelled(f"{lanes}x{items}g") for lanes, items in WALKS if items <= most_items(device)]
+        forms = "gs" if subgroup_ways(device) else "g"
+        others += [default.relabelled(f"{n}x{k}{form}") for form in forms for n, k in WALKS if k <= most_items(device)]
     return [default, *(shape for shape in others if shape != default)]
 
 
@@ -113,7 +120,8 @@ def asked_shape() -> str:
     if text and _parsed(text, Shape(1, 1, 1)) is None:
         raise DeviceError(
             f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16; a g behind "
-            f"{' and '.join(f'{lanes}x{items}' for lanes, items in WALKS)} is for a gradient by Gaussian"
+            f"{' and '.join(f'{lanes}x{items}' for lanes, items in WALKS)} is for a gradient by Gaussian, an s behind "
+            f"{', '.join(f'{lanes}x{items}' for lanes, items in EXCHANGES)} for sub-groups"
         )
     return text
 
@@ -123,9 +131,15 @@ def wanted_shape(device: cl.Device) -> Shape:
     that makes no sense, or that the device has no room for."""
     default, text = default_shape(device), asked_shape()
     shape = _parsed(text or saved_shapes().get(known.device_key(device), ""), default)
-    if shape is None or (not text and shape.items > most_items(device)):
+    lacking = shape is not None and shape.subgroups and not subgroup_ways(device)
+    if shape is None or (not text and (lacking or shape.items > most_items(device))):
         return default
     name, traits = device.name.strip(), traits_of(device)
+    if lacking:
+        raise DeviceError(
+            f"CLSPLAT_SHAPE={text}: {name} has no sub-groups whose items exchange values; expected a shape without the "
+            f"s, such as {text.strip()[:-1]}"
+        )
     if shape.items > traits.group:
         raise DeviceError(f"CLSPLAT_SHAPE={text}: {name} has at most {traits.group} items in a work-group")
     if shape.items > most_items(device):
@@ -159,7 +173,7 @@ def shape_text(device: cl.Device) -> str:
     try:
         shape, _ = shape_of(device)
     except DeviceError:
-        return f"too small for CLSPLAT_SHAPE={asked_shape()}"
+        return f"cannot take CLSPLAT_SHAPE={asked_shape()}"
     return shape.words
 
 

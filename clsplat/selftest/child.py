@@ -51,7 +51,7 @@ def stored_digests() -> dict[str, Any]:
 
 def shape_label(device: Device) -> str:
     """Lanes and items as the gradient's sums go."""
-    return replace(device.shape, items=tile_items(device)).label
+    return replace(device.shape, items=tile_items(device), subgroups=False).label
 
 
 def run(

@@ -16,6 +16,7 @@ from pipeline import shaped
 
 from clsplat.bench import shapes as tune
 from clsplat.cli.main import main
+from clsplat.device import shapes
 from clsplat.device.context import Device, list_devices
 from clsplat.device.shapes import (
     Shape,
@@ -78,7 +79,9 @@ def test_the_environment_goes_first(default_device: Device, monkeypatch: pytest.
     assert shape_of(device)[0] == replace(default_shape(device), lanes=1, items=64)
 
 
-@pytest.mark.parametrize("text", ["fast", "8", "3x1", "8x0", "8x3", "8x-1", "8x1g", "1x16g", "1x64gg"])
+@pytest.mark.parametrize(
+    "text", ["fast", "8", "3x1", "8x0", "8x3", "8x-1", "8x1g", "1x16g", "1x64gg", "8x1s", "1x16s", "1x64gs"]
+)
 def test_a_shape_that_makes_no_sense(text: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setenv("CLSPLAT_SHAPE", text)
     assert main(["devices"]) == 2
@@ -109,13 +112,32 @@ def test_a_gradient_by_gaussian_is_a_shape_of_its_own(default_device: Device, mo
     assert [shape.label for shape in candidates(gpu(32, 48))] == ["1x32", "1x32g"]
 
 
+def test_a_shape_with_sub_groups(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is a candidate where a device has some; where it has none, a tuned one is passed over and one that was asked
+    for is an error."""
+    device = default_device.cl_device
+    some = replace(default_shape(device), lanes=1, items=64, subgroups=True)
+    save_shape(device, some)
+    monkeypatch.setattr(shapes, "subgroup_ways", lambda device: [{"SUBGROUP": 8}])
+    assert shape_of(device)[0] == some and (some.label, some.words) == ("1x64s", "1 lanes x 64 items, with sub-groups")
+    assert not default_device.with_shape("1x64s").with_shape(items=32).shape.subgroups
+    labels = [shape.label for shape in candidates(gpu(1024, 48))]
+    assert labels == ["1x64", "1x32", "1x128", "1x256", "1x32g", "1x64g", "1x32s", "1x64s"]
+    monkeypatch.setattr(shapes, "subgroup_ways", lambda device: [])
+    assert shape_of(device)[0] == default_shape(device)
+    monkeypatch.setenv("CLSPLAT_SHAPE", "1x128s")
+    message = "CLSPLAT_SHAPE=1x128s: .* has no sub-groups .* expected a shape without the s, such as 1x128$"
+    with pytest.raises(DeviceError, match=message):
+        shape_of(device)
+
+
 def gpu(items: int, local_kib: int) -> Any:
     """A device that is none, with these limits."""
     platform = SimpleNamespace(name="none", version="OpenCL 1.2 none")
     return SimpleNamespace(
         type=cl.device_type.GPU, max_work_group_size=items, local_mem_size=local_kib << 10, max_compute_units=4,
         name="a GPU", driver_version="1", platform=platform, native_vector_width_float=1,
-        single_fp_config=0, max_mem_alloc_size=1 << 28,
+        single_fp_config=0, max_mem_alloc_size=1 << 28, extensions="",
     )  # fmt: skip
 
 

@@ -104,7 +104,7 @@ def test_a_shape_that_one_device_cannot_take(elsewhere: Path, monkeypatch: pytes
     monkeypatch.setattr(shapes, "most_items", lambda device: 256 if device == small else 4096)
     assert main(["devices", "--json"]) == 0
     told = {each["index"]: each["shape"] for each in json.loads(capsys.readouterr().out)}
-    assert told.pop(0) == "too small for CLSPLAT_SHAPE=1x1024"
+    assert told.pop(0) == "cannot take CLSPLAT_SHAPE=1x1024"
     assert set(told.values()) <= {"1 lanes x 1024 items"}
     with pytest.raises(DeviceError, match=r"CLSPLAT_SHAPE=1x1024: .* expected at most 256 items"):
         context.open_device("0")

@@ -17,6 +17,7 @@ from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.layout import SlotFields
+from clsplat.device.quirks import subgroup_ways
 from clsplat.gaussians import Gaussians
 from clsplat.reference import render as reference
 from clsplat.rendering.build_flags import kernel_defines
@@ -129,6 +130,30 @@ def test_the_gradient_by_gaussian(device: Device, count: int) -> None:
         pairs.append((screen.contributions.get(), wanted_screen.contributions.get()))
         for a, b in pairs:
             assert np.linalg.norm(a - b) <= 2e-6 * np.linalg.norm(b)  # as of groups above
+
+
+@pytest.mark.parametrize("items", quick([32, 64, 128, 256], 64))
+@pytest.mark.parametrize("fields", [SlotFields(), SlotFields(absolute=True, contributions=True)], ids=["plain", "all"])
+def test_sums_by_sub_groups_have_the_bits_of_rows(device: Device, items: int, fields: SlotFields) -> None:
+    """Of every size of sub-groups, by each way that the driver has: items end with one field, with a few, or share
+    one; sums of all of a group, or parts of them."""
+    if not (offered := subgroup_ways(device.cl_device)):
+        pytest.skip("the driver has no sub-groups of a size that is known")
+    rows, slots = shaped(device, 1, items), {}
+    scene = scenes.random_cloud(900, 8, 75, 50)
+    shuffles = {name for way in offered for name in way if name.startswith("SHUFFLE")}
+    sizes = (4, 8, 16, 32)
+    asked = [{"SUBGROUP": size, name: True, "SUBGROUP_IS_ASKED": True} for name in sorted(shuffles) for size in sizes]
+    for switches in ({}, *asked):
+        opened = rows.with_switches(switches)
+        frame = (run := Pipeline.run(opened, scene)).frame
+        values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
+        of = (opened, run.rasterizer.work, frame.part.lists, frame.projected.splats, frame.background, frame.blended)
+        slots[str(switches)] = blend_grad(*of, upload(opened, values), fields=fields).get()
+    wanted, *others = slots.values()
+    assert wanted.any() and len(others) >= 4
+    for got in others:
+        assert_same_bits(got, wanted)
 
 
 @pytest.mark.slow

@@ -25,6 +25,7 @@ from gpu_model import Stage, predict
 from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, WALK, Rule, Run
 from gpu_static import FRAMES, MOST_A_PAIR, MOST_BY_GAUSSIAN, NO_STACK, Row, broken, sources_of
 
+from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import ClsplatError
 
@@ -305,14 +306,18 @@ def test_rules_are_of_lines_that_kernels_have() -> None:
 def test_rules_have_the_kernels_own_sizes(items: int) -> None:
     """Numbers of the rules that stand in the kernels too."""
 
-    def defined(path: str, name: str) -> int:
+    def defined(path: str, name: str, **others: int) -> int:
         text = (kernel_root() / path).read_text()
         (value,) = re.findall(rf"^#define {name} (.*ITEMS.*|\d{{2,}})$", text, re.MULTILINE)
-        words = re.sub(r"(.*?) \? (.*?) : ", r"(\2) if (\1) else ", value.strip("()")).replace("/", "//")
-        return int(eval(words, {"ITEMS": items}))  # of a file of this repository
+        words = re.sub(r"(.*?) \? (.*?) : ", r"(\2) if (\1) else ", value.strip("()"))
+        words = words.replace("/", "//").replace("&&", "and")
+        return int(eval(words, {"ITEMS": items, **others}))  # of a file of this repository
 
     run = Run(items)
-    assert run.together == defined("blend_grad.cl", "TOGETHER")
+    fields = PLAIN_SLOTS.floats
+    for one in (run, Run(items, subgroup=32)):
+        known = {"SUBGROUP": one.subgroup, "SLOT_STRIDE": fields}
+        assert one.together == defined("blend_grad.cl", "TOGETHER", **known)
     assert run.batch == defined("shared/blocks.h", "BATCH")
     assert run.loss_rows == defined("loss.cl", "ROWS")
     assert defined("sort_radix.cl", "RUN") == gpu_rules.PER_ITEM

@@ -1,0 +1,71 @@
+// Sums over a group's items, of neighbours first, then of pairs, of fours and so on: one order, and the same bits,
+// whether items leave their addends in local memory or exchange them in sub-groups of SUBGROUP items.
+#define PARTS (ITEMS / SUBGROUP) // addends of a row in local memory
+
+// A row is padded so that rows begin in banks of their own.
+#define ROW (PARTS < 4 ? PARTS : PARTS + 4)
+
+static inline float sum_of_1(__local const float *row) { return row[0]; }
+static inline float sum_of_4(__local const float *row) {
+  const float4 four = *(__local const float4 *)row;
+  return (four.x + four.y) + (four.z + four.w);
+}
+#define DOUBLED(half, whole)                                                                                           \
+  static inline float sum_of_##whole(__local const float *row) {                                                       \
+    return sum_of_##half(row) + sum_of_##half(row + half);                                                             \
+  }
+DOUBLED(1, 2)
+DOUBLED(4, 8)
+DOUBLED(8, 16)
+DOUBLED(16, 32)
+DOUBLED(32, 64)
+DOUBLED(64, 128)
+DOUBLED(128, 256)
+
+// The sum of a row.
+static inline float row_sum(__local const float *row) {
+  return PARTS == 1     ? sum_of_1(row)
+         : PARTS == 2   ? sum_of_2(row)
+         : PARTS == 4   ? sum_of_4(row)
+         : PARTS == 8   ? sum_of_8(row)
+         : PARTS == 16  ? sum_of_16(row)
+         : PARTS == 32  ? sum_of_32(row)
+         : PARTS == 64  ? sum_of_64(row)
+         : PARTS == 128 ? sum_of_128(row)
+                        : sum_of_256(row);
+}
+
+#if SUBGROUP > 1
+// Adds up a pair's fields over a sub-group: in each step an item gives half of what it has to a neighbour, and gets the
+// neighbour's addends of the other half, until it has one field, or a few. These go to the sub-group's places of the
+// fields' rows, from `rows` on.
+static inline void leave_sums(const float *sums, __local float *rows) {
+  const int item = get_local_id(0);
+  float held[SLOT_STRIDE];
+  int n = SLOT_STRIDE, begin = 0, end = SLOT_STRIDE; // this item has the fields from begin to before end
+  _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field) held[field] = sums[field];
+  _Pragma("unroll") for (int step = 1; step < SUBGROUP; step *= 2) {
+    const int upper = (item & step) != 0;
+    if (n > 1) {
+      const int kept = (n + 1) / 2;
+      _Pragma("unroll") for (int k = 0; k < kept; ++k) {
+        const float low = held[k], high = k + kept < n ? held[k + kept] : 0.0f;
+        const float given = upper ? low : high;
+        held[k] = (upper ? high : low) + EXCHANGED(given, step);
+      }
+      end = upper ? end : min(begin + kept, end);
+      begin = upper ? begin + kept : begin;
+      n = kept;
+    } else {
+      held[0] += EXCHANGED(held[0], step);
+      end = upper ? begin : end;
+    }
+  }
+  _Pragma("unroll") for (int k = 0; k < n; ++k) if (begin + k < end) rows[(begin + k) * ROW + item / SUBGROUP] =
+      held[k];
+}
+#else
+static inline void leave_sums(const float *sums, __local float *rows) {
+  for (int field = 0; field < SLOT_STRIDE; ++field) rows[field * ROW + get_local_id(0)] = sums[field];
+}
+#endif

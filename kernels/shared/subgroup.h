@@ -1,0 +1,34 @@
+// Sub-groups of SUBGROUP items that exchange values, 1 where kernels do without. The item's place in its sub-group is
+// in the lowest bits of its number in the group (device/context.py probes that).
+#ifndef SUBGROUP
+#define SUBGROUP 1
+#endif
+#ifdef SUBGROUP_IS_ASKED // a driver that has sub-groups of several sizes is told the size
+#define SUBGROUPED __attribute__((intel_reqd_sub_group_size(SUBGROUP)))
+#else
+#define SUBGROUPED
+#endif
+
+// EXCHANGED: the x of the item whose number differs from this one's in the bit `step`. Every item comes here.
+#if defined(SHUFFLE_KHR)
+#pragma OPENCL EXTENSION cl_khr_subgroup_shuffle : enable
+#define EXCHANGED(x, step) sub_group_shuffle_xor(x, (uint)(step))
+#elif defined(SHUFFLE_INTEL)
+#pragma OPENCL EXTENSION cl_intel_subgroups : enable
+#define EXCHANGED(x, step) intel_sub_group_shuffle_xor(x, (uint)(step))
+#elif defined(SHUFFLE_PTX)
+#define EXCHANGED(x, step) exchanged(x, step)
+static inline float exchanged(float x, int step) {
+  int got;
+  __asm__ volatile("shfl.sync.bfly.b32 %0, %1, %2, 31, -1;" : "=r"(got) : "r"(as_int(x)), "r"(step));
+  return as_float(got);
+}
+#elif defined(SHUFFLE_AMD) // waves may have twice as many items
+#define EXCHANGED(x, step) exchanged(x, step)
+static inline float exchanged(float x, int step) {
+  const int lane = __builtin_amdgcn_mbcnt_hi(-1, __builtin_amdgcn_mbcnt_lo(-1, 0));
+  return as_float(__builtin_amdgcn_ds_bpermute(4 * (lane ^ step), as_int(x)));
+}
+#elif SUBGROUP == 1
+#define EXCHANGED(x, step) (x)
+#endif
