@@ -264,6 +264,16 @@ def measure(path: Path, setting: Setting, parts: dict[str, Callable[[Setting], A
     return int(failed)
 
 
+def starter(version: str) -> str:
+    """The script of an archive, for this version of Python: from any folder, with the archive's scenes if no others
+    are asked for."""
+    return f"""#!/bin/sh
+here=$(cd "$(dirname "$0")" && pwd) || exit 2
+scenes=$(find "$here/scenes" -mindepth 1 -maxdepth 1 -type d 2> /dev/null | sort | paste -s -d , -)
+PYTHONPATH=$here/packages:$here exec python{version} "$here/tools/measure_gpu.py" --scenes "$scenes" "$@"
+"""
+
+
 def pack(archive: Path, scenes: Sequence[Path]) -> int:
     """Write the archive; 1 if it is larger than PACK_LIMIT."""
     with tempfile.TemporaryDirectory() as folder:
@@ -280,10 +290,7 @@ def pack(archive: Path, scenes: Sequence[Path]) -> int:
         stripped = [str(path) for path in (top / "packages").rglob("*.so*")]
         subprocess.run(["strip", "--strip-unneeded", *stripped], check=False, capture_output=True)
         version = sysconfig.get_python_version()
-        (top / "measure").write_text(
-            '#!/bin/sh\ncd "$(dirname "$0")" || exit 2\nPYTHONPATH=$PWD/packages:$PWD exec '
-            f'python{version} tools/measure_gpu.py "$@" --scenes "$(ls -d "$PWD"/scenes/* | paste -sd ,)"\n'
-        )
+        (top / "measure").write_text(starter(version))
         subprocess.run(["tar", "-cJf", str(archive.resolve()), "-C", folder, "clsplat"], check=True)
     size = archive.stat().st_size
     print(f"{archive}: {size / 1e6:.1f} MB, for Python {version} on {platform.machine()}")

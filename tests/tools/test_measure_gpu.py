@@ -11,7 +11,7 @@ from typing import Any
 
 import measure_gpu
 import pytest
-from measure_gpu import Setting, find, libraries, measure, parts_of
+from measure_gpu import Setting, find, libraries, measure, parts_of, starter
 
 
 def setting(folder: Path, limit: float = 60.0) -> Setting:
@@ -103,3 +103,29 @@ def test_calls_that_make_no_sense(
         measure_gpu.main(words)
     assert ending.value.code == 2
     assert text in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("scenes", "words", "wanted"),
+    [
+        ((), (), ""),
+        (("fox", "a scene"), (), "{top}/scenes/a scene,{top}/scenes/fox"),
+        (("fox",), ("--scenes", "b"), "b"),
+    ],
+)
+def test_the_script_of_an_archive(scenes: tuple[str, ...], words: tuple[str, ...], wanted: str, tmp_path: Path) -> None:
+    """It writes the file into the folder that it is called in, and says nothing of its own."""
+    top, called_in = tmp_path / "un packed" / "clsplat", tmp_path / "elsewhere"
+    (top / "tools").mkdir(parents=True)
+    called_in.mkdir()
+    for scene in scenes:
+        (top / "scenes" / scene).mkdir(parents=True)
+    tool = "import os, sys; print(os.getcwd(), os.environ['PYTHONPATH'], *sys.argv[1:], sep='|')"
+    (top / "tools" / "measure_gpu.py").write_text(tool)
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    (top / "measure").write_text(starter(version).replace(f"exec python{version}", f"exec {sys.executable}"))
+    command = ["sh", "../un packed/clsplat/measure", "gpu.json", *words]
+    done = subprocess.run(command, cwd=called_in, capture_output=True, text=True, check=True)
+    folder, path, *got = done.stdout.strip().split("|")
+    assert (folder, path, done.stderr) == (str(called_in), f"{top}/packages:{top}", "")
+    assert got[-1 if "--scenes" in words else 1] == wanted.format(top=top) and "gpu.json" in got
