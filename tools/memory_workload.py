@@ -114,6 +114,27 @@ def frames(device: Device) -> None:
             )
 
 
+def subgroups(device: Device) -> None:
+    """The probe of sub-groups, and the gradient of blending with them, where items are grouped. Oclgrind has none: an
+    item stands for what it should have got, so that the sums are wrong, but places and order of what is written are
+    those of sub-groups of 8."""
+    if device.shape.items == 1:
+        return
+    opened = device.with_shape(f"{device.shape.label}s")
+    opened._subgroups.append({"SUBGROUP": 8, "EXCHANGED(x,step)": "(x)"})  # noqa: SLF001
+    items = opened.shape.items
+    out = allocate(opened, (3, items), np.float32)
+    launch.launch_groups(opened, opened.kernels("probe_subgroup").probe_subgroup, 1, items, out)
+    view = camera(33, 17)
+    rasterizer, held = Rasterizer(opened), upload_gaussians(opened, cloud(40, view))
+    frame = rasterizer.forward(held, view, upload(opened, np.zeros(3, np.float32)), nearness=True)
+    gradient = np.zeros((4, *frame.blended.image.shape[1:]), np.float32)
+    gradient[:, :17, :33] = np.random.default_rng(1).normal(size=(4, 17, 33))
+    slots = rasterizer.pair_gradients(frame, upload(opened, gradient), fields=WIDEST_SLOTS)
+    if not (np.isfinite(out.get()).all() and np.isfinite(slots.values.get()).all()):
+        raise SystemExit("a sum by sub-groups is not finite")
+
+
 def by_two_launches(device: Device) -> None:
     """Adam by gradients that are in memory, as where a step is looked at: all rows, and those in view. Gradients of
     several views."""
@@ -376,7 +397,7 @@ def by_elements(source: str, lanes: int) -> str:
 PARTS = {
     "training": (training,),
     "methods": (methods,),
-    "passes": (sorts, limits, frames, by_two_launches, rendering, pictures, density),
+    "passes": (sorts, limits, frames, subgroups, by_two_launches, rendering, pictures, density),
 }
 """The workload in parts that take a child each, by name."""
 
