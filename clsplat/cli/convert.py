@@ -42,8 +42,8 @@ MAX_MATRIX = 1 << 16
 class Convert(Verb):
     """Write a model in another format, by the files' endings, and say what was lost; or edit it on the way.
 
-    Edits are made in this order: merge, crop, prune, transform, scale, drop-sh. A device is needed for --scene and
-    --prune-contribution alone. docs/formats.md has the formats.
+    Edits are made in this order: merge, crop, prune, transform, rotate, scale, translate, drop-sh. A device is needed for
+    --scene and --prune-contribution alone. docs/formats.md has the formats.
     """
 
     source: RunOrModel
@@ -68,10 +68,19 @@ class Convert(Verb):
     transform: Annotated[str | None, arg(metavar="FILE|M00,M01,...")] = None
     """Move the model by a 4 x 4 matrix of rotation, one scale and translation (a mirror is allowed too), row by row:
     16 numbers with commas, or a text file with them. Spherical harmonics are turned too."""
+    rotate: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    """Turn the model by these degrees about the world's x axis, then its y, then its z axis, by the right-hand rule.
+    Spherical harmonics are turned too. Write --rotate=-90,0,0 if it begins with a negative number."""
     scale: Annotated[float | None, arg(metavar="FLOAT")] = None
     """Multiply positions and sizes by this factor, about the world's origin."""
+    translate: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    """Move the model by this much. Write --translate=-1,0,0 if it begins with a negative number."""
     drop_sh: Annotated[int | None, arg(metavar="DEGREE")] = None
     """Leave out the spherical harmonics (colour by direction) beyond this degree, 0 to 3."""
+    up: Annotated[Literal["y", "z"] | None, arg(metavar="y|z")] = None
+    """Axis that a USD stage names as up; y if not given. The model stays as it is, --rotate turns it."""
+    spz_version: Annotated[Literal[2, 3, 4] | None, arg(metavar="2|3|4")] = None
+    """Version of an SPZ file, for programs that do not read the newest, which is 4; 4 if not given."""
     scene: ScenePath = None
     """Measure PSNR on this scene's held-out views before and after, and of the two renders against each other. Of the
     scene of a run, pixels that its masks leave out do not count."""
@@ -100,10 +109,13 @@ def run(verb: Convert, services: Services) -> int:
     check_new(verb.target, overwrite=verb.overwrite, sources=[source, *merged])
     for companion in target_format.side_files(verb.target):
         check_new(companion, overwrite=verb.overwrite)
+    options = _of_format(verb, target_format)
     original, space = load(source), colour.recorded_space(source)
     edited = _edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
+    if not target_format.floats:
+        edited = edit.without_empty_bands(edited)
     comments = () if space == colour.SRGB else (colour.comment(space),)
-    save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK))
+    save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK), **options)
     if space != colour.recorded_space(verb.target):
         warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
     read = load(verb.target)
@@ -189,6 +201,19 @@ def _edited(
     return gaussians if verb.drop_sh is None else edit.drop_sh(gaussians, verb.drop_sh)
 
 
+def _of_format(verb: Convert, target: Format) -> dict[str, Any]:
+    """Options of the target's format alone. Raises InputError for one that is of another format."""
+    options: dict[str, Any] = {}
+    for flag, value, name, format_name in (
+        ("up", verb.up and verb.up.upper(), "up_axis", "OpenUSD"),
+        ("spz-version", verb.spz_version, "version", "SPZ"),
+    ):
+        if value is not None and target.name != format_name:
+            raise InputError(f"--{flag}: is of {format_name} files, {verb.target} is {target.name}")
+        options |= {name: value} if value is not None else {}
+    return options
+
+
 def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
     """Warn where a model that is merged is in another colour space, or far from the source."""
     import numpy as np
@@ -212,22 +237,32 @@ def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
 
 
 def _similarity(verb: Convert) -> Float64 | None:
-    """--transform, then --scale, as one (4, 4); None without them. Raises InputError."""
+    """--transform, --rotate, --scale and --translate, in this order, as one (4, 4); None without them. Raises
+    InputError."""
     import numpy as np
 
     from clsplat.models import edit
 
-    if verb.transform is None and verb.scale is None:
-        return None
-    matrix: Float64 = np.eye(4)
+    steps: list[Float64] = []
     if (text := verb.transform) is not None:
         words = read_document(Path(text), "a text file of 16 numbers", MAX_MATRIX) if is_file(text) else text
-        matrix = np.array(_numbers("transform", words, 16)).reshape(4, 4)
-    try:
-        edit.decompose(matrix)
-    except InputError as error:
-        raise InputError(f"--transform {verb.transform}: {error}") from None
-    return matrix if verb.scale is None else edit.scaling(verb.scale) @ matrix
+        steps.append(np.array(_numbers("transform", words, 16)).reshape(4, 4))
+        try:
+            edit.decompose(steps[0])
+        except InputError as error:
+            raise InputError(f"--transform {text}: {error}") from None
+    if verb.rotate is not None:
+        steps.append(edit.turning(_numbers("rotate", verb.rotate, 3)))
+    if verb.scale is not None:
+        steps.append(edit.scaling(verb.scale))
+    if verb.translate is not None:
+        steps.append(edit.shifting(_numbers("translate", verb.translate, 3)))
+    if not steps:
+        return None
+    matrix: Float64 = np.eye(4)
+    for step in steps:
+        matrix = step @ matrix
+    return matrix
 
 
 def _numbers(flag: str, text: str, count: int) -> list[float]:

@@ -59,6 +59,15 @@ def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
     return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
 
 
+def without_empty_bands(gaussians: Gaussians) -> Gaussians:
+    """The model without its highest SH bands that are all zero; the same where there are none. A format that rounds
+    would write other values than zero for them."""
+    degree = gaussians.sh_degree
+    while degree and not gaussians.sh[:, degree**2 :].any():
+        degree -= 1
+    return gaussians if degree == gaussians.sh_degree else drop_sh(gaussians, degree)
+
+
 def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
     """The model with each channel of its colours times a gain, (3,), at least 0."""
     factors = np.asarray(gains, np.float64)
@@ -139,6 +148,22 @@ def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILAR) ->
 def scaling(factor: float) -> Float64:
     """(4, 4) that scales the world about its origin."""
     return np.diag([factor, factor, factor, 1.0])
+
+
+def turning(degrees: Sequence[float]) -> Float64:
+    """(4, 4) that turns the world about its x, then its y, then its z axis, by the right-hand rule; degrees (3,)."""
+    from scipy.spatial.transform import Rotation
+
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    return matrix
+
+
+def shifting(offset: Sequence[float]) -> Float64:
+    """(4, 4) that moves the world by `offset` (3,)."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = offset
+    return matrix
 
 
 def transform_camera(camera: Camera, matrix: Float64) -> Camera:

@@ -87,6 +87,57 @@ def test_edits_are_made_in_the_order_of_the_help(model: Path, tmp_path: Path, ca
     capsys.readouterr()
 
 
+def test_a_model_is_turned_scaled_and_moved(model: Path, capsys: Capture) -> None:
+    """By --rotate about x, then y, then z; --scale and --translate follow, and --transform comes first."""
+    target = model.with_name("out.ply")
+    quarter = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # x to y by z, after y to z by x
+    wanted = np.eye(4)
+    wanted[:3, :3], wanted[:3, 3] = 2 * quarter, (1, -2, 3)
+    assert convert(model, target, "--rotate", "90,0,90", "--scale", 2, "--translate", "1,-2,3") == 0
+    whole, read = Gaussians.load(model), Gaussians.load(target)
+    x, y, z = whole.means.T
+    assert np.allclose(read.means, np.column_stack([2 * z + 1, 2 * x - 2, 2 * y + 3]), atol=1e-6)  # float32 of about 3
+    assert_equal(read, edit.transform(whole, edit.shifting((1, -2, 3)) @ edit.scaling(2) @ edit.turning((90, 0, 90))))
+    assert np.allclose(edit.turning((90, 0, 90))[:3, :3], quarter, atol=1e-12)
+    half, back = model.with_name("half.ply"), model.with_name("back.ply")
+    assert convert(model, half, "--scale", 0.5) == 0
+    first = "--transform=" + ",".join(map(str, np.diag([4, 4, 4, 1.0]).ravel()))
+    assert convert(half, back, "--translate=1,0,0", first) == 0
+    assert np.allclose(Gaussians.load(back).means, 2 * whole.means + (1, 0, 0), atol=1e-6)
+    capsys.readouterr()
+
+
+def test_bands_that_are_zero_are_not_rounded(tmp_path: Path, capsys: Capture) -> None:
+    """A format that rounds has no zero among its steps, so empty bands are left out first; one of floats keeps them."""
+    model = random_gaussians(300, 3)
+    model.sh[:, 4:] = 0
+    source = tmp_path / "model.ply"
+    model.save(source)
+    for name, degree in (("a.compressed.ply", 1), ("a.spz", 1), ("a.sog", 1), ("a.glb", 3), ("b.ply", 3)):
+        assert convert(source, tmp_path / name, "--json") == 0
+        assert json.loads(capsys.readouterr().out)["target"]["sh_degree"] == degree
+    model.sh[7, 15, 2] = 1e-3
+    model.save(source)
+    assert edit.without_empty_bands(model) is model
+    model.sh[:, 1:] = 0
+    assert edit.without_empty_bands(model).sh_degree == 0
+
+
+def test_what_formats_have_beside_the_model(model: Path, capsys: Capture) -> None:
+    """--spz-version and --up, which changes no Gaussian."""
+    for version in (2, 3, 4):
+        target = model.with_name(f"{version}.spz")
+        assert convert(model, target, "--spz-version", version) == 0
+        assert formats.spz.describe(target)["version"] == version
+    pytest.importorskip("pxr")
+    for up in ("y", "z"):
+        target = model.with_name(f"{up}.usda")
+        assert convert(model, target, "--up", up) == 0
+        assert formats.usd.describe(target)["up_axis"] == up.upper()
+    assert np.array_equal(Gaussians.load(target).means, Gaussians.load(model).means)
+    capsys.readouterr()
+
+
 def test_pruning_by_contribution_leaves_what_the_cameras_see(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     """Half of the model is behind the cameras' backs or far below a pixel: it goes, and the frames stay."""
     seen = hidden_model()
@@ -153,6 +204,10 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
         (["--prune-contribution", "1"], "--prune-contribution and --cameras go together"),
         (["--cameras", "x"], "--prune-contribution and --cameras go together"),
         (["--merge", "nowhere.ply"], "nowhere.ply: no such file"),
+        (["--rotate", "90"], "--rotate 90: expected 3 numbers"),
+        (["--translate", "1,2,inf"], "--translate 1,2,inf: expected 3 numbers"),
+        (["--up", "z"], "out.ply is 3DGS PLY"),
+        (["--spz-version", "3"], "--spz-version: is of SPZ files, "),
     ],
 )
 def test_wrong_calls_are_one_line_and_write_nothing(
