@@ -42,8 +42,8 @@ MAX_MATRIX = 1 << 16
 class Convert(Verb):
     """Write a model in another format, by the files' endings, and say what was lost; or edit it on the way.
 
-    Edits are made in this order: merge, crop, prune, transform, rotate, scale, translate, drop-sh. A device is needed for
-    --scene and --prune-contribution alone. docs/formats.md has the formats.
+    Edits are made in this order: merge, crop, prune, transform, rotate, scale, translate, drop-sh. A device is
+    needed for --scene and --prune-contribution alone. docs/formats.md has the formats.
     """
 
     source: RunOrModel

@@ -43,6 +43,7 @@ from clsplat.progress import FrameProgress
 
 if TYPE_CHECKING:
     from clsplat.cli.render_job import Job
+    from clsplat.gaussians import Gaussians
     from clsplat.images.video import VideoWriter
     from clsplat.sequence.task import Record, RenderOptions, Task
     from clsplat.shots import Shot
@@ -63,16 +64,21 @@ class Render(Verb):
 
     model: RunOrModel
     """A run's folder or a model file."""
-    cameras: Annotated[Path, arg(metavar="PATH")]
-    """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
-    nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
     """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG; or the name
     of a video of all frames, such as turn.mp4. {name} is the image's name without its extension, sub-folders included,
     or else the frame's number; ####, %04d and {frame} are the frame's number."""
+    cameras: Annotated[Path | None, arg(metavar="PATH")] = None
+    """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
+    nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each. Not
+    needed with --path turntable or spiral."""
     path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
     """A path made from the cameras, in place of the cameras themselves: around what they look at, the same twice while
-    rising and sinking, or through them in their order, smoothed. Its frames count from 1."""
+    rising and sinking, or through them in their order, smoothed. Its frames count from 1. Without --cameras it goes
+    around the model, or what a scene has most detail of."""
+    up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
+    """Direction that is up on a path without --cameras: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a
+    COLMAP scene. Write --up=-z if it begins with a minus."""
     count: OptionalInt = None
     """Frames of the path; 120 if not given."""
     frames: Annotated[str | None, arg(metavar="1-100,200-300:2,...")] = None
@@ -195,16 +201,13 @@ def _read_job(verb: Render) -> Job:
     from clsplat.runs.run import model_file
     from clsplat.sequence import existing
     from clsplat.sequence.task import digest_of, make_tasks
-    from clsplat.shots import choose_shot
 
     options = _options(verb)
     verb.rasterizer.check()
     limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
     devices = _devices(verb)
-    size = (verb.width, verb.height)
-    of_cameras: dict[str, Any] = {"usd_camera": verb.usd_camera, "lenses": verb.lenses or "undistort"}
-    whole = choose_shot(verb.cameras, path=verb.path, count=verb.count, size=size, **of_cameras)
+    whole, gaussians = _whole_shot(verb)
     chosen = whole if verb.frames is None else whole.only(verb.frames)
     sampling = options.pictures.sampling
     tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
@@ -217,7 +220,7 @@ def _read_job(verb: Render) -> Job:
         warn(text)
     model = model_file(verb.model)
     gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else ()
-    gaussians = Gaussians.load(model)
+    gaussians = Gaussians.load(model) if gaussians is None else gaussians
     tasks = [task.seen_by(gaussians) for task in tasks]
     recorded = recorded_space(model)
     colours = Colours(options.pictures.colour, recorded)
@@ -234,6 +237,25 @@ def _read_job(verb: Render) -> Job:
     return Job(
         options, verb.rasterizer, model, gaussians, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing
     )
+
+
+def _whole_shot(verb: Render) -> tuple[Shot, Gaussians | None]:
+    """All frames that there are, whatever --frames says, and the model where they follow from it. Raises
+    InputError."""
+    from clsplat.gaussians import Gaussians
+    from clsplat.runs.run import model_file
+    from clsplat.shots import choose_shot, shot_around
+
+    size: dict[str, Any] = {"count": verb.count, "size": (verb.width, verb.height)}
+    if verb.cameras is not None:
+        if verb.up is not None:
+            raise InputError(f"--up {verb.up}: is of paths around the model, expected no --cameras with it")
+        of_cameras: dict[str, Any] = {"usd_camera": verb.usd_camera, "lenses": verb.lenses or "undistort"}
+        return choose_shot(verb.cameras, path=verb.path, **size, **of_cameras), None
+    if verb.usd_camera is not None:
+        raise InputError(f"--usd-camera {verb.usd_camera}: expected the USD stage in --cameras with it")
+    gaussians = Gaussians.load(model_file(verb.model))
+    return shot_around(gaussians, verb.path, up=verb.up, **size), gaussians
 
 
 def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:

@@ -4,17 +4,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from clsplat.camera import Camera
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples
+from clsplat.gaussians import Gaussians
 from clsplat.scenes.colmap import find_model, read_cameras
 from clsplat.scenes.transforms import load_document, read_poses
+from clsplat.shots.around import COLMAP_UP, cameras_around, parse_up
 from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
 from clsplat.shots.generated import PATHS
 from clsplat.shots.nerfstudio import read_camera_path
-from clsplat.shots.shot import MOST_FRAMES, Shot, named, numbered
+from clsplat.shots.shot import MOST_FRAMES, Frame, Shot, named, numbered
 from clsplat.shots.usd import read_usd
 
 COUNT = 120
@@ -70,21 +74,50 @@ def choose_shot(
     """
     if count is not None and path is None:
         raise InputError(f"--count {count}: expected --path with it, the files of cameras have their own frames")
-    if count is not None and not 1 <= count <= MOST_FRAMES:
-        raise InputError(f"--count {count}: expected 1 to {MOST_FRAMES:,} frames")
+    _check_count(count)
     shot = read_shot(cameras, size=size, usd_camera=usd_camera, lenses=lenses)
     if path is not None:
         if not (first := shot.frames[0].camera).kind.flat:
             raise InputError(
                 f"{cameras}: its cameras are {first.projection}, --path needs perspective or orthographic ones"
             )
-        made = numbered(PATHS[path](shot.cameras, COUNT if count is None else count))
-        shot = Shot(made, shot.warnings, unapplied=shot.unapplied)
+        shot = Shot(_path(path, shot.cameras, count), shot.warnings, unapplied=shot.unapplied)
     far = min(frame.camera.far for frame in shot.frames)
     unapplied = (*((f"far plane ({far:g})",) if far < math.inf else ()), *shot.unapplied)
     if unapplied:
         shot = replace(shot, warnings=(*shot.warnings, f"{cameras}: not applied: {', '.join(unapplied)}"))
     return shot
+
+
+def shot_around(
+    gaussians: Gaussians,
+    path: str | None,
+    *,
+    count: int | None = None,
+    size: tuple[int | None, int | None] = (None, None),
+    up: str | None = None,
+) -> Shot:
+    """The shot that --path, --count and --up ask for without --cameras: around the model, as `cameras_around`. Raises
+    InputError."""
+    if path is None:
+        raise InputError(
+            "--cameras is missing, expected cameras to render from; or --path turntable or spiral alone, for a path "
+            "around the model"
+        )
+    if path == "through":
+        raise InputError("--path through: goes through cameras, expected --cameras with it")
+    _check_count(count)
+    found = cameras_around(gaussians, COLMAP_UP if up is None else parse_up(up), size)
+    return Shot(_path(path, found, count))
+
+
+def _check_count(count: int | None) -> None:
+    if count is not None and not 1 <= count <= MOST_FRAMES:
+        raise InputError(f"--count {count}: expected 1 to {MOST_FRAMES:,} frames")
+
+
+def _path(path: str, cameras: Sequence[Camera], count: int | None) -> tuple[Frame, ...]:
+    return numbered(PATHS[path](cameras, COUNT if count is None else count))
 
 
 def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:
