@@ -118,7 +118,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     if verb.view:
         from clsplat.cli.view import training_view
 
-        page = training_view(verb.page, verb.config)
+        page = training_view(verb.page)
     source = verb.scene
     if verb.resume:
         earlier = Run.open(verb.output)
@@ -169,7 +169,10 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
 
     how = {"device": devices, "run": run, "resume": run.resuming, "on_plan": print_plan}
     try:
-        with page(scene) if page else nullcontext() as between, TrainProgress(run.config.iterations) as progress:
+        with (
+            page(scene, run.config) if page else nullcontext() as between,
+            TrainProgress(run.config.iterations) as progress,
+        ):
             services.train(scene, run.config, **how, on_step=progress, between=between)
     except KeyboardInterrupt as error:
         steps = run.checkpoints()

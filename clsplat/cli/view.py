@@ -100,7 +100,7 @@ def run(verb: View, services: Services) -> int:
     return 0
 
 
-def training_view(options: PageOptions, config: TrainConfig) -> Callable[[Scene], AbstractContextManager[TrainingView]]:
+def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]]:
     """The page of a training, which is open as long as the context is. Raises InputError where it cannot be served, at
     once, before anything is trained or written."""
     from clsplat.images.alpha import background_colour
@@ -114,7 +114,7 @@ def training_view(options: PageOptions, config: TrainConfig) -> Callable[[Scene]
     address.check()
 
     @contextmanager
-    def page(scene: Scene) -> Iterator[TrainingView]:
+    def page(scene: Scene, config: TrainConfig) -> Iterator[TrainingView]:
         box = extent_of(scene.points) if len(scene.points) else scene.bounds
         start = start_of([view.camera for view in scene.views], scene.points)
         world = World(scene.name, start, scene.origin, box, config.sh_degree, scene.views)

@@ -7,10 +7,13 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from clsplat.config.presets import scheduled
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.scenes.findings import Finding, Kind
 
+SCHEDULE = "schedule"
+"""Name of a bundle of settings among those of an answer."""
 ANSWERS: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "exposure": ({"appearance": "exposure"},),
     "scales": ({"antialiased": True},),
@@ -18,9 +21,11 @@ ANSWERS: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "cut out": ({"masks": "transparent"}, {"masks": "ignore"}),
     "alpha": ({"alpha": "transparent"}, {"alpha": "ignore"}),
     "fisheye": ({"lenses": "native"},),
-    "few views": ({"thinning": 0.2},),
+    "few views": ({"thinning": 0.2, SCHEDULE: "short", "iterations": 2000}, {"thinning": 0.2}),
 }
 """Settings by the finding that they answer, the best first: the first that goes with the other settings is taken."""
+SCHEDULED = ("sh_degree_every", "optimiser", "density")
+"""Settings that a schedule has, beside the number of steps."""
 ADVICE: Mapping[Kind, str] = {
     "sky": "--sky 1000 starts with points far away for it",
     "blur": "leave them out where others show the same",
@@ -66,18 +71,31 @@ def answered(
     answers = []
     for finding in found:
         options = ANSWERS.get(finding.kind, ())
-        own = any(name in given for option in options for name in option)
+        free = [option for option in options if not any(name in given for name in option)]
         taken: Mapping[str, Any] = {}
-        for option in () if own else options:
-            trial = replace(config, **option)
+        for option in free:
             try:
-                trial.check()
+                config = with_settings(config, option)
             except InputError:
                 continue
-            taken, config = option, trial
+            taken = option
             break
-        answers.append(Answer(finding, taken, own))
+        answers.append(Answer(finding, taken, given=bool(options) and not free))
     return answers, config
+
+
+def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConfig:
+    """The settings with those of an answer. Raises InputError where they do not go together, and for a schedule where
+    these are not the paper's."""
+    changes = dict(settings)
+    if (name := changes.pop(SCHEDULE, None)) is not None:
+        paper, bundle = scheduled("paper", config.iterations), scheduled(name, changes["iterations"])
+        if any(getattr(config, each) != getattr(paper, each) for each in SCHEDULED):
+            raise InputError(f"--schedule {name}: the run has settings of its own in place of the paper's schedule")
+        changes |= {each: getattr(bundle, each) for each in SCHEDULED}
+    config = replace(config, **changes)
+    config.check()
+    return config
 
 
 def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool) -> str:

@@ -16,10 +16,11 @@ from tiny import HEIGHT, VIEWS, WIDTH, write_scene
 from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.masks import MaskUse
+from clsplat.config.presets import bundled, scheduled
 from clsplat.config.training import TrainConfig
 from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
-from clsplat.scenes.answers import ADVICE, ANSWERS, answered, paragraph
+from clsplat.scenes.answers import ADVICE, ANSWERS, answered, paragraph, with_settings
 from clsplat.scenes.data_set import Lens
 from clsplat.scenes.findings import FEW, Finding, findings
 from clsplat.scenes.glance import Glance, glance_at, sharpness_of
@@ -205,9 +206,7 @@ def test_masks_that_are_not_used(tmp_path: Path, part: float, kind: str) -> None
 def test_every_answer_is_a_setting_that_can_be() -> None:
     for kind, options in ANSWERS.items():
         for option in options:
-            config = replace(TrainConfig(), **option)
-            config.check()
-            assert config != TrainConfig(), kind
+            assert with_settings(TrainConfig(), option) != TrainConfig(), kind
     assert not ANSWERS.keys() & ADVICE.keys()
 
 
@@ -225,6 +224,24 @@ def test_answers_that_do_not_go_together() -> None:
     answers, config = answered(found[:1], transparent)
     assert config == transparent
     assert "does not go with the other settings" in answers[0].words
+
+
+def test_few_views_are_trained_for_fewer_steps() -> None:
+    """By the short schedule for so many, unless steps, a schedule or rates are somebody's own."""
+    few = [Finding("few views", "a")]
+    (answer,), config = answered(few, TrainConfig(antialiased=True))
+    steps = int(answer.settings["iterations"])
+    assert answer.words == f"a (--thinning 0.2 --schedule short --iterations {steps})"
+    assert config == replace(scheduled("short", steps), thinning=0.2, antialiased=True)
+    own = replace(TrainConfig(), optimiser=replace(TrainConfig().optimiser, means_rate=1e-4))
+    for mine, given in (
+        (TrainConfig(), {"iterations"}), (TrainConfig(), {"schedule"}), (own, {"optimiser.means_rate"}),
+        (bundled("fast", None, 7000), {"preset"}), (TrainConfig(eval_at=(steps + 1,)), {"eval_at"}),
+    ):  # fmt: skip
+        (answer,), config = answered(few, mine, given)
+        assert answer.settings == {"thinning": 0.2} and config == replace(mine, thinning=0.2)
+    (answer,), config = answered(few, TrainConfig(), {"thinning"})
+    assert (answer.words, config) == ("a (--thinning is given)", TrainConfig())
 
 
 @pytest.mark.slow
