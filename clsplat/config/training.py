@@ -229,6 +229,10 @@ class TrainConfig:
     """For few photographs (DropGaussian): share of the Gaussians, drawn at random, that is left out of the last step, 0
     to 0.9; it rises from 0 at the first. The others are more opaque in that step. 0.2 is as published; 0 leaves none
     out."""
+    penalty: float = 0.0
+    """Weight in the loss of the mean opacity and of the mean size, in parts of the scene's extent, by the Gaussians
+    that the step's view shows; 0.01 is of use against fog where there are few photographs. With --density.growth mcmc
+    its own weights say that."""
     antialiased: bool = False
     """Train for pictures of any size (Mip-Splatting): a narrower low-pass that leaves a Gaussian its light, and no
     Gaussian smaller than the photographs show. The model is drawn so too, and its file says it."""
@@ -327,7 +331,11 @@ class TrainConfig:
             (("appearance_rate",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
             (("dssim_weight",), lambda value: 0 <= value <= 1, "0 to 1"),
             (("thinning",), lambda value: 0 <= value <= 0.9, "0 to 0.9"),
-            (("alpha_weight", "depth_weight"), lambda value: 0 <= value < inf, "a finite number, at least 0"),
+            (
+                ("alpha_weight", "depth_weight", "penalty"),
+                lambda value: 0 <= value < inf,
+                "a finite number, at least 0",
+            ),
             (("pose_reach",), lambda value: 0 < value <= 30, "over 0 and at most 30 degrees"),
             (("lens_reach",), lambda value: 0 < value <= 50, "over 0 and at most 50 hundredths"),
             (("depth_unit",), lambda value: 0 < value < inf, "a finite number, more than 0"),
@@ -355,6 +363,11 @@ class TrainConfig:
         if self.appearance != "none" and "transparent" in (self.masks, self.alpha):
             raise InputError(
                 f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
+            )
+        if self.penalty and self.density.growth == "mcmc":
+            raise InputError(
+                f"--penalty {self.penalty}: --density.growth mcmc has weights of its own, expected "
+                "--density.opacity-weight and --density.scale-weight"
             )
         if self.refine_lenses and self.perspective == "rays":
             raise InputError("--refine-lenses: rays have no gradient by the lens, expected --perspective plane with it")

@@ -47,7 +47,7 @@ CONFIGS = {
     "all": replace(
         short(iterations=60, density=MCMC), thinning=0.3, appearance="exposure", antialiased=True, masks="ignore"
     ),
-    "depth": replace(PLAIN, depth="maps", thinning=0.2),
+    "depth": replace(PLAIN, depth="maps", thinning=0.2, penalty=0.01),
     "batch": replace(PLAIN, batch=2, thinning=0.3),
 }
 """Each with density control, rising SH degrees and sizes of photographs."""

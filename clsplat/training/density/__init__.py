@@ -79,6 +79,12 @@ class ModelState:
     edges: Callable[[int], Float32] | None = None
 
 
+def penalties(opacity: float, scale: float, count: int, extent: float) -> Exploration:
+    """Weights of the sums over the Gaussians in view, by those of the means over all `count`; scales count in parts of
+    the scene's extent (docs/gradients.md, (91))."""
+    return Exploration(opacity=opacity / count, scale=scale / (3 * count * extent))
+
+
 HALVED = ("means", "quaternions", "log_scales")
 """Groups that halves are made by, if no others are told."""
 

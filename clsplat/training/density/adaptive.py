@@ -11,10 +11,11 @@ from math import inf
 import numpy as np
 
 from clsplat.arrays import Float32, Float64
+from clsplat.config.exploring import Exploration
 from clsplat.config.marking import MarkRules, edge
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
-from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy
+from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy, penalties
 
 LONG_OFFSET, LONG_SCALE, SHORT_SCALE, LONG_OPACITY = 1.35, 0.55, 0.893, 0.6
 """Of halves along the longest axis: the distance of their means from the middle, in standard deviations; what is left
@@ -25,7 +26,7 @@ class Adaptive(Strategy):
     """The strategy of Kerbl et al., with what `DensityConfig` adds to it."""
 
     def __init__(self, config: TrainConfig) -> None:
-        self.config, self.white = config.density, config.background == "white"
+        self.config, self.white, self.penalty = config.density, config.background == "white", config.penalty
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
         """Gradients as long as Gaussians are densified, the others where some pruning at the end of this step or later
@@ -41,6 +42,10 @@ class Adaptive(Strategy):
             threshold=config.gradient_threshold,
             contributions=prunes or prunes_a_share,
         )
+
+    def exploration(self, step: int, means_rate: float, count: int, extent: float) -> Exploration | None:  # noqa: ARG002
+        """Penalties alone, whatever the step."""
+        return penalties(self.penalty, self.penalty, count, extent) if self.penalty > 0 else None
 
     def is_due(self, step: int) -> bool:
         """True if Gaussians are densified or pruned, or opacities are reset."""

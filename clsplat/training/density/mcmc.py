@@ -5,6 +5,7 @@ which is not as published (docs/decisions/0027-the-long-axis.md). Policy only: n
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from math import inf
@@ -17,7 +18,7 @@ from clsplat.config.exploring import Exploration, step_key
 from clsplat.config.marking import MarkRules
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
-from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
+from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy, penalties
 from clsplat.training.density.adaptive import draw_offsets, is_due
 
 MOST = 51
@@ -103,9 +104,8 @@ class Mcmc(Strategy):
         """Penalties whatever the step, noise until the cooldown begins; in units in which the scene's extent is 1."""
         config, train = self.config, self.train
         cools = step > train.iterations - train.optimiser.cooldown
-        return Exploration(
-            opacity=config.opacity_weight / count,
-            scale=config.scale_weight / (3 * count * extent),
+        return replace(
+            penalties(config.opacity_weight, config.scale_weight, count, extent),
             amount=0.0 if cools else config.noise_rate * means_rate / extent**2,
             dead=config.min_opacity,
             key=step_key(train.seed, step),

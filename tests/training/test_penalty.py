@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Penalties on opacity and size without MCMC: what they do to a model, and the same bytes again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
+from tiny import short, write_scene
+
+from clsplat.config.exploring import Exploration
+from clsplat.config.training import DensityConfig, TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.training.density.choice import strategy_of
+
+CONFIG = replace(short(iterations=40), penalty=0.5)
+"""With a penalty so large that a short training shows it."""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+def test_weights_are_shares_of_the_means() -> None:
+    """The same in any unit of length, and whatever the number of Gaussians; none without the setting."""
+    wanted = Exploration(opacity=0.5 / 100, scale=0.5 / (3 * 100 * 4.0))
+    assert strategy_of(CONFIG).exploration(7, 1e-3, 100, 4.0) == wanted
+    assert not wanted.amount and wanted.penalised, "no noise"
+    assert strategy_of(replace(CONFIG, penalty=0.0)).exploration(7, 1e-3, 100, 4.0) is None
+
+
+def test_the_model_is_fainter_and_its_gaussians_smaller(scene: Scene, default_device: Device, tmp_path: Path) -> None:
+    still = replace(CONFIG, density=DensityConfig(every=0))  # the same Gaussians in both
+    means = []
+    for penalty in (0.0, 0.5):
+        model_bytes(scene, replace(still, penalty=penalty), default_device, tmp_path / str(penalty))
+        model = Gaussians.load(tmp_path / str(penalty) / "model.ply")
+        opacities = 1 / (1 + np.exp(-model.opacity_logits.astype(np.float64)))
+        means.append((len(model), opacities.mean(), np.exp(model.log_scales.astype(np.float64)).mean()))
+    (count, opacity, scale), (same, fainter, smaller) = means
+    assert same == count
+    assert fainter < 0.98 * opacity
+    assert smaller < 0.98 * scale
+
+
+def test_stopping_and_going_on_gives_the_same_bytes(
+    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
+) -> None:
+    assert interrupted(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
+
+
+def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:
+    check_on_two_devices(scene, CONFIG, default_device, 12)
+
+
+@pytest.mark.slow
+def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
+    scene = load_scene(write_scene(tmp_path / "scene", points=False))
+    check_in_less_memory(scene, replace(CONFIG, random_points=1500), default_device, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (TrainConfig(penalty=-0.1), "--penalty -0.1: expected a finite number, at least 0"),
+        (TrainConfig(penalty=0.01, density=DensityConfig(growth="mcmc", max_gaussians=100)),
+         "--penalty 0.01: --density.growth mcmc has weights of its own"),
+    ],
+)  # fmt: skip
+def test_penalties_that_make_no_sense(config: TrainConfig, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        config.check()
