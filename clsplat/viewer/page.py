@@ -18,9 +18,10 @@ from clsplat.arrays import Float64
 from clsplat.errors import ClsplatError, InputError, plain
 from clsplat.rotations import quaternion_of
 from clsplat.scenes.marked import masked
+from clsplat.shots.around import parse_up
 from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
 from clsplat.viewer.path_recorder import FPS, add_key, path_document, save_path
-from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose, Start
+from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose, Start, leaning
 from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
 
@@ -32,6 +33,8 @@ THUMBNAIL = 240
 """Longest side of a photo on the page."""
 FRUSTUM = 0.05
 """Size of a camera in relation to its distance from what is looked at."""
+UPS = ("as the scene", "y", "-y", "z", "-z", "x", "-x")
+"""Choices of what is up."""
 CAMERAS = ("hidden", "frames", "photos")
 """Ways to draw the scene's cameras."""
 CAMERA_COLOURS = {"train": (80, 160, 255), "test": (255, 160, 60), "key": (255, 60, 90)}
@@ -119,8 +122,24 @@ class ViserPage:
 
         for control in (mode, degree, size, opacity, crop, *sides):
             control.on_update(changed)
+        self._add_up(gui)
         if self.world.views:
             self._add_cameras(gui)
+
+    def _add_up(self, gui: Any) -> None:
+        up = gui.add_dropdown("Up", UPS, initial_value=UPS[0], hint="What is up while the camera goes around.")
+        roll = gui.add_slider("Roll", -180.0, 180.0, 1.0, 0.0, hint="Degrees clockwise, about where the camera looks.")
+
+        async def changed(_: Any) -> None:
+            camera = self.client.camera
+            axis = self.world.start.up if up.value == UPS[0] else np.array(parse_up(up.value))
+            if (leant := leaning(axis, camera.look_at - camera.position, roll.value)) is None:
+                self.client.add_notification("clsplat", "the camera looks straight up or down there")
+            else:
+                camera.up_direction = leant
+
+        for control in (up, roll):
+            control.on_update(changed)
 
     def _draw_box(self, look: Look) -> None:
         scene = self.client.scene

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera, focal_length
@@ -100,6 +101,16 @@ def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
     middle = 0.5 * (low + high)
     distance = 0.6 * float(np.linalg.norm(high - low)) / math.tan(FIELD / 2) or 1.0
     return Start(middle - [0.0, 0.0, distance], middle, np.array([0.0, -1.0, 0.0]), FIELD)
+
+
+def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
+    """What is up for a camera that looks `ahead` and is rolled, clockwise as seen from behind it: `up` turned about
+    that axis, a unit vector (3,). None for a camera that looks along `up`."""
+    length = float(np.linalg.norm(ahead) * np.linalg.norm(up))
+    if not float(np.linalg.norm(np.cross(ahead, up))) > 1e-3 * length:
+        return None
+    turn = Rotation.from_rotvec(math.radians(degrees) * ahead / np.linalg.norm(ahead))
+    return np.asarray(turn.apply(up / np.linalg.norm(up)))
 
 
 def looking(start: Start, size: tuple[int, int]) -> Pose:

@@ -170,6 +170,38 @@ def test_orbit_depth_and_a_path_that_is_rendered(
     assert read_image(frames / "0001.png").max() > 0.2
 
 
+def roll_of(page: Any, folder: Path) -> np.ndarray:
+    """The camera's right and down in the world, (2, 3), of a key that is added here."""
+    camera = choose_shot(record(page, folder), path=None, count=None).frames[0].camera
+    page.get_by_role("tab", name="View").click()
+    return camera.rotation[:2]
+
+
+def test_up_and_roll(browser: Any, served: tuple[str, Path], tmp_path: Path) -> None:
+    """A roll of 90 degrees has to the right what was down; what is up is level with the camera."""
+    page = opened(browser, served[0])
+    try:
+        before = picture(page, kept(tmp_path, "level.png"))
+        right, down = roll_of(page, tmp_path)
+        row = page.locator("div.mantine-Flex-root", has=page.get_by_text("Roll", exact=True))
+        field = row.locator("input[inputmode=decimal]").last
+        field.fill("90")
+        field.press("Enter")
+        page.wait_for_timeout(500)
+        assert np.abs(picture(page, kept(tmp_path, "rolled.png")) - before).mean() > 0.02
+        np.testing.assert_allclose(roll_of(page, tmp_path), [down, -right], atol=1e-3)  # the browser's float32
+        field.fill("0")
+        field.press("Enter")
+        for name, axis in (("z", (0, 0, 1)), ("-x", (-1, 0, 0))):
+            choose(page, "Up", name)
+            page.wait_for_timeout(500)
+            across, below = roll_of(page, tmp_path)
+            assert abs(across @ axis) < 1e-3
+            assert below @ axis < 0
+    finally:
+        page.close()
+
+
 def test_two_pages_have_their_own_cameras(browser: Any, served: tuple[str, Path], tmp_path: Path) -> None:
     one, other = opened(browser, served[0]), opened(browser, served[0])
     try:
