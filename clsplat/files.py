@@ -37,6 +37,7 @@ PROBE = 1 << 16
 WINDOWS = os.name == "nt"
 IGNORES_CASE = sys.platform in ("win32", "darwin")
 """True if the system's usual file systems take A.png and a.png for one file, and an accented letter for its parts."""
+CLAIM_SUFFIX = ".clsplat-claim"
 PATIENCE = 2.0
 """Seconds in which a file on Windows that another program has open is tried again: a virus scanner or an indexer lets
 go of a new file within one."""
@@ -234,6 +235,33 @@ def locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
                     remove(lock)
 
 
+def claim(target: Path) -> Path | None:
+    """A file beside `target` that tells other processes that this one makes it, for `give_back`; None where another
+    has claimed it. That of a process that has ended is taken over. On a file system that cannot, two may both have it.
+    Raises OSError where the folder cannot be written."""
+    path, token = _claim_of(target), f"{_machine()}{os.getpid():08x}"
+    for _ in range(2):
+        if _take(path, token.encode()):
+            return path
+        try:
+            if not _is_abandoned(path, path.read_text("ascii", "replace") or token):
+                return None
+            path.unlink()
+        except (FileNotFoundError, PermissionError):  # given back, or taken over
+            continue
+    return None
+
+
+def _claim_of(target: Path) -> Path:
+    return target.with_name(f".{target.name}{CLAIM_SUFFIX}")
+
+
+def give_back(claimed: Path) -> None:
+    """Let others make what was claimed."""
+    with suppress(FileNotFoundError):
+        remove(claimed)
+
+
 def _take(lock: Path, token: bytes) -> bool:
     try:
         with lock.open("xb") as file:
@@ -305,8 +333,8 @@ def identity(path: PurePath, *, ignores_case: bool = IGNORES_CASE) -> str:
 
 
 def abandoned(targets: Iterable[Path]) -> list[Path]:
-    """The temporary files that writers of these files have left: their process has ended, or they are of another
-    machine and have not been written to for ABANDONED seconds."""
+    """The temporary files and claims that writers of these files have left: their process has ended, or they are of
+    another machine and have not been written to for ABANDONED seconds."""
     names: dict[Path, set[str]] = {}
     for target in targets:
         real = Path(os.path.realpath(target))
@@ -317,6 +345,11 @@ def abandoned(targets: Iterable[Path]) -> list[Path]:
             for entry in os.scandir(folder):
                 match = _TEMPORARY.fullmatch(entry.name)
                 if match and match[1] in wanted and _is_abandoned(path := Path(entry.path), match[2]):
+                    result.append(path)
+        for name in wanted:
+            path = _claim_of(folder / name)
+            with suppress(OSError):
+                if _is_abandoned(path, path.read_text("ascii", "replace")):
                     result.append(path)
     return sorted(result)
 

@@ -368,6 +368,7 @@ def _devices(verb: Render) -> tuple[str | None, ...]:
 def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
     from clsplat.cli.render_job import check_foreign, frames_there
     from clsplat.sequence import existing, workers
+    from clsplat.sequence.sharing import Sharing
 
     tasks, options = job.tasks, job.options
     there = frames_there(job)
@@ -395,7 +396,9 @@ def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
             if job.on_farm:
                 _on_farm(verb, job, left, done, video)
             else:
-                workers.run_tasks(left, renderers, options, done, video)
+                workers.run_tasks(
+                    left, renderers, options, done, video, Sharing(options) if job.skip_existing else None
+                )
     except KeyboardInterrupt as error:
         count = f"{len(records)} of {len(tasks)} frames"
         advice = "nothing is left of the video" if job.is_video else "go on with --skip-existing"

@@ -50,7 +50,7 @@ class Job:
 
 def frames_there(job: Job) -> set[int]:
     """The numbers of the frames that `--skip-existing` leaves out. Warns of files that do not record the settings they
-    were made with."""
+    were made with, and of those that are rendered again."""
     if not job.skip_existing:
         return set()
     there = existing.complete(job.tasks, job.options)
@@ -58,6 +58,11 @@ def frames_there(job: Job) -> set[int]:
         warn(
             f"--skip-existing: {len(unknown)} of the frames that are there do not say how they were made, such as "
             f"{unknown[0]}: they are kept, whatever their cameras, precision and other settings are"
+        )
+    if changed := existing.changed([task for task in job.tasks if task.number not in there], job.options):
+        warn(
+            f"--skip-existing: {len(changed)} of the frames that are there were made of another model, or with other "
+            f"cameras or settings, such as {changed[0]}: they are rendered again"
         )
     return there
 

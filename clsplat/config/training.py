@@ -231,7 +231,7 @@ class TrainConfig:
     out."""
     penalty: float = 0.0
     """Weight in the loss of the mean opacity and of the mean size, in parts of the scene's extent, by the Gaussians
-    that the step's view shows; 0.01 is of use against fog where there are few photographs. With --density.growth mcmc
+    that the step's view shows; 0.02 is of use against fog where there are few photographs. With --density.growth mcmc
     its own weights say that."""
     antialiased: bool = False
     """Train for pictures of any size (Mip-Splatting): a narrower low-pass that leaves a Gaussian its light, and no

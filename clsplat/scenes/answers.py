@@ -21,7 +21,11 @@ ANSWERS: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "cut out": ({"masks": "transparent"}, {"masks": "ignore"}),
     "alpha": ({"alpha": "transparent"}, {"alpha": "ignore"}),
     "fisheye": ({"lenses": "native"},),
-    "few views": ({"thinning": 0.2, SCHEDULE: "short", "iterations": 2000}, {"thinning": 0.2}),
+    "few views": (
+        {"thinning": 0.2, "penalty": 0.02, SCHEDULE: "short", "iterations": 2000},
+        {"thinning": 0.2, "penalty": 0.02},
+        {"thinning": 0.2},
+    ),
 }
 """Settings by the finding that they answer, the best first: the first that goes with the other settings is taken."""
 SCHEDULED = ("sh_degree_every", "optimiser", "density")

@@ -66,6 +66,17 @@ def untold(tasks: Sequence[Task]) -> list[Path]:
     return [task.path for task in _those(tasks, lambda task: attribute(task.path, SETTINGS) is None)]
 
 
+def changed(tasks: Sequence[Task], options: RenderOptions) -> list[Path]:
+    """The tasks' files that were made of another model, or with other cameras or settings."""
+
+    def differs(task: Task) -> bool:
+        wanted = {**options.attributes, SETTINGS: settings_digest(task, options)}
+        found = {name: attribute(task.path, name) for name in (*WHAT_IT_IS, SETTINGS)}
+        return any(value not in (None, wanted.get(name)) for name, value in found.items())
+
+    return [task.path for task in _those(tasks, differs)]
+
+
 def foreign(tasks: Sequence[Task]) -> list[Path]:
     """The tasks' files that are pictures of other programs than clsplat."""
     return [task.path for task in _those(tasks, lambda task: is_file(task.path) and is_foreign(task.path))]

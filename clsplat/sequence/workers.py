@@ -28,6 +28,7 @@ from clsplat.images import frame_files
 from clsplat.images.video import VideoWriter, frame_planes, video_writer
 from clsplat.sequence.existing import MOST_WRITERS
 from clsplat.sequence.frame_renderer import RenderedFrame, RenderFrame
+from clsplat.sequence.sharing import FrameQueue, Sharing
 from clsplat.sequence.task import Record, RenderOptions, Task, header, picture_camera
 
 YuvPlanes = NDArray[np.uint8]
@@ -85,9 +86,12 @@ def run_tasks(
     options: RenderOptions,
     on_done: Callable[[Record], None],
     video: VideoWriter | None = None,
+    sharing: Sharing | None = None,
 ) -> None:
     """Render the frames and write them meanwhile, or add them to the video. Each renderer has a thread, which takes the
     next frame that is free.
+
+    sharing: other jobs may make some of these frames meanwhile; theirs are waited for at the end.
 
     on_done: called in this thread for each frame when its file is complete, not always in the frames' order; for a
     video in order, when the frame has been encoded. The first error of any thread is raised here, after all of them
@@ -96,7 +100,7 @@ def run_tasks(
     if not tasks:
         return
     writers, held = frames_ahead(tasks, options, len(renderers))
-    room, stop, turn, left = threading.Semaphore(held), threading.Event(), threading.Lock(), iter(tasks)
+    room, frames = threading.Semaphore(held), FrameQueue(tasks, sharing)
     finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
     encoders = ThreadPoolExecutor(writers, "clsplat-write")
     devices = ThreadPoolExecutor(len(renderers), "clsplat-render")
@@ -104,16 +108,15 @@ def run_tasks(
     def render(renderer: RenderFrame) -> None:
         while True:  # until there are no more frames
             room.acquire()
-            with turn:
-                task = None if stop.is_set() else next(left, None)
-            if task is None:
+            if (task := frames.take(lambda task: finished.put(_skipped(task, options)))) is None:
                 return
             encoders.submit(encode, task, renderer(task)).add_done_callback(finished.put)
 
     def encode(task: Task, frame: RenderedFrame) -> Result | None:
         try:
-            return None if stop.is_set() else encode_frame(task, frame, options)
+            return None if frames.stop.is_set() else encode_frame(task, frame, options)
         finally:
+            frames.end(task)
             if video is None:
                 room.release()
 
@@ -132,11 +135,19 @@ def run_tasks(
         abandon()  # a thread may wait for a driver that hangs
         raise
     finally:
-        stop.set()
+        frames.stop.set()
         for _ in renderers:
             room.release()
         devices.shutdown()
         encoders.shutdown()
+        frames.close()
+
+
+def _skipped(task: Task, options: RenderOptions) -> Future[Result]:
+    """The outcome of a frame that is there already."""
+    outcome: Future[Result] = Future()
+    outcome.set_result((record_of(task, options, skipped=True), None))
+    return outcome
 
 
 def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter | None) -> Iterator[Record]:

@@ -11,19 +11,24 @@ from clsplat.errors import InputError
 from clsplat.files import identity, name_trouble
 
 MOST_FRAMES = 10_000_000
-RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?")
-FIELD = re.compile(r"(#+)|%(0\d+)?d|\{(\w*)(?::(0\d+)d?)?\}", re.ASCII)
+RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?:[:x](\d+))?)?")
+FIELD = re.compile(
+    r"(?P<digits>#+|@{2,})|%(?P<printed>0\d+)?d|\{(?P<word>\w*)(?::(?P<padded>0\d+)d?)?\}"
+    r"|\$F(?P<houdini>\d+)?(?!\w)|<F(?P<angled>\d+)?>",
+    re.ASCII,
+)
+"""A frame's number or name in a file's, as render programs and compositors write it."""
 
-KNOWN = "{name}, {frame}, #### or %04d"
-ODD = re.compile(r"%[-+ ]?\d*\.?\d*[diouxXeEfgGcsV]|[{}][^{}]*\}?")
+KNOWN = "{name}, {frame}, ####, @@@@, %04d, $F4 or <F4>"
+ODD = re.compile(r"%[-+ ]?\d*\.?\d*[diouxXeEfgGcsV]|[{}][^{}]*\}?|\$F\w*|<\w*>")
 """Text that is meant as a field, and is none."""
 
 
 def parse_frames(text: str) -> list[int]:
-    """The frames of a list such as 1-100, 1-100:2 or 7,12,30-40, each once, in rising order.
+    """The frames of a list such as 1-100, 1-100:2, 1-100x2, 10-1 or 7,12,30-40, each once, in rising order.
 
     A step counts from a range's begin and must be at least 1. Negative numbers are frames like any other: -5--1 is five
-    of them. Raises InputError for anything else, and for a range that ends before it begins.
+    of them. Raises InputError for anything else.
     """
     frames: set[int] = set()
     for word in text.split(","):
@@ -36,11 +41,9 @@ def parse_frames(text: str) -> list[int]:
         last, step = int(match[2] or first), int(match[3] or 1)
         if step < 1:
             raise InputError(f"--frames {text}: {word.strip()!r} has the step {step}, expected at least 1")
-        if last < first:
-            raise InputError(f"--frames {text}: the range {word.strip()!r} is empty, expected its end after its begin")
-        if (last - first) // step + len(frames) >= MOST_FRAMES:
+        if abs(last - first) // step + len(frames) >= MOST_FRAMES:
             raise InputError(f"--frames {text}: lists more than {MOST_FRAMES:,} frames; is a digit too many in it?")
-        frames.update(range(first, last + 1, step))
+        frames.update(range(first, last + 1, step) if first <= last else range(first, last - 1, -step))
     return sorted(frames)
 
 
@@ -59,15 +62,15 @@ def ranges(frames: Sequence[int]) -> str:
 def path_of(pattern: str, frame: int, name: str) -> Path:
     """The file of a frame. Raises InputError for a name that leads out of the output folder.
 
-    `####` and `%04d` are the frame's number in at least four digits, `{frame}` and `%d` in as few as it has,
-    `{frame:04}` in four again; `{name}` is its name without extension, with its folders.
+    `####`, `@@@@`, `%04d`, `{frame:04}`, `$F4` and `<F4>` are the frame's number in at least four digits, `%d`,
+    `{frame}`, `$F` and `<F>` in as few as it has; `{name}` is its name without extension, with its folders.
     """
 
     def fill(match: re.Match[str]) -> str:
-        if match[3] == "name":
+        if match["word"] == "name":
             return _stem(name)
-        width = len(match[1]) if match[1] else int(match[2] or match[4] or 0)
-        return f"{frame:0{width}d}"
+        width = match["printed"] or match["padded"] or match["houdini"] or match["angled"]
+        return f"{frame:0{int(width or len(match['digits'] or ''))}d}"
 
     # one pass: a name may have # or % in it
     return Path(FIELD.sub(fill, pattern))
@@ -87,7 +90,7 @@ def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
     """The file of every frame (number, name). Raises InputError where two would be one, or one would leave the
     folder, or the pattern is none."""
     for match in FIELD.finditer(pattern):
-        if match[3] not in (None, "frame") and not (match[3] == "name" and match[4] is None):
+        if match["word"] not in (None, "frame") and not (match["word"] == "name" and match["padded"] is None):
             raise InputError(f"{pattern}: {match[0]} is not known, expected {KNOWN}")
     if odd := ODD.search(FIELD.sub("", Path(pattern).name)):
         raise InputError(f"{pattern}: {odd[0]} is not known, expected {KNOWN}")

@@ -169,6 +169,42 @@ def test_gaps_alone_are_rendered(shot: list[str], tmp_path: Path, capsys: Captur
     assert "took" in out[-1]  # another size is not what is wanted
 
 
+def test_frames_made_otherwise_are_told_and_rendered_again(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    """By their cameras, precision or model; a frame that is broken is rendered without a word."""
+    assert render(shot, tmp_path) == 0
+    capsys.readouterr()
+    assert render(shot, tmp_path, "--skip-existing") == 0
+    assert capsys.readouterr().err == ""
+    for change in (("--frames", "1-4", "--exr", "half"), ("--background", "white"), ("--rasterizer.alpha-min", "0.01")):
+        assert render(shot, tmp_path, "--skip-existing", *change) == 0
+        count = 4 if "half" in change else COUNT
+        said = capsys.readouterr()
+        assert f"warning: --skip-existing: {count} of the frames that are there were made of another model" in said.err
+        assert said.out.count(" s\n") == count
+    hidden_model(30).save(tmp_path / "other.ply")
+    assert render([str(tmp_path / "other.ply"), *shot[1:]], tmp_path, "--skip-existing", "--dry-run") == 0
+    assert f"{COUNT} of the frames" in capsys.readouterr().err
+    (tmp_path / "a.0003.exr").write_bytes(b"")
+    assert render(shot, tmp_path, "--skip-existing", "--rasterizer.alpha-min", "0.01") == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_two_jobs_started_together_write_each_frame_once(shot: list[str], tmp_path: Path) -> None:
+    """At most two frames more, and both end well with all frames there."""
+    count = 60
+    words = [sys.executable, "-m", "clsplat", "render", *shot[:-1], str(count), "-o", str(tmp_path / "a.####.png")]
+    jobs = [
+        subprocess.Popen([*words, "--skip-existing", "--json"], stdout=subprocess.PIPE, text=True) for _ in range(2)
+    ]
+    written = 0
+    for job in jobs:
+        records = json.loads(job.communicate(timeout=300)[0])
+        assert job.returncode == 0 and len(records) == count
+        written += sum(not record["skipped"] for record in records)
+    assert count <= written <= count + 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"a.{number:04d}.png" for number in range(1, count + 1)]
+
+
 def test_progress_beside_json(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     assert render(shot, tmp_path, "--json", "--progress", "json", "--frames", "1-2", "--profile") == 0
     captured = capsys.readouterr()
@@ -218,7 +254,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
     cases = [
         ("--channels rgb,colour", "--channels rgb,colour: has 'colour', expected some of rgb, alpha"),
         ("--channels alpha --background white", "--channels alpha and --background exclude each other"),
-        ("--frames 3-1", "--frames 3-1: the range '3-1' is empty"),
+        ("--frames 3-", "--frames 3-: '3-' is no frame or range"),
         ("--frames 100-200", "--frames 100-200: holds none of the frames to render"),
         ("--quality 0", "--quality 0: expected 1 to 100"),
         ("--workers 0", "--workers 0: expected at least 1"),

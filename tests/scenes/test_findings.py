@@ -17,7 +17,7 @@ from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.masks import MaskUse
 from clsplat.config.presets import bundled, scheduled
-from clsplat.config.training import TrainConfig
+from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
 from clsplat.scenes.answers import ADVICE, ANSWERS, answered, paragraph, with_settings
@@ -231,15 +231,18 @@ def test_few_views_are_trained_for_fewer_steps() -> None:
     few = [Finding("few views", "a")]
     (answer,), config = answered(few, TrainConfig(antialiased=True))
     steps = int(answer.settings["iterations"])
-    assert answer.words == f"a (--thinning 0.2 --schedule short --iterations {steps})"
-    assert config == replace(scheduled("short", steps), thinning=0.2, antialiased=True)
+    assert answer.words == f"a (--thinning 0.2 --penalty 0.02 --schedule short --iterations {steps})"
+    assert config == replace(scheduled("short", steps), thinning=0.2, penalty=0.02, antialiased=True)
     own = replace(TrainConfig(), optimiser=replace(TrainConfig().optimiser, means_rate=1e-4))
     for mine, given in (
         (TrainConfig(), {"iterations"}), (TrainConfig(), {"schedule"}), (own, {"optimiser.means_rate"}),
         (bundled("fast", None, 7000), {"preset"}), (TrainConfig(eval_at=(steps + 1,)), {"eval_at"}),
     ):  # fmt: skip
         (answer,), config = answered(few, mine, given)
-        assert answer.settings == {"thinning": 0.2} and config == replace(mine, thinning=0.2)
+        assert answer.settings == {"thinning": 0.2, "penalty": 0.02}
+        assert config == replace(mine, thinning=0.2, penalty=0.02)
+    mcmc = TrainConfig(density=DensityConfig(growth="mcmc", max_gaussians=1000))
+    assert answered(few, mcmc)[1] == replace(mcmc, thinning=0.2), "which has penalties of its own"
     (answer,), config = answered(few, TrainConfig(), {"thinning"})
     assert (answer.words, config) == ("a (--thinning is given)", TrainConfig())
 
@@ -255,7 +258,7 @@ def test_auto_takes_what_answers(tmp_path: Path, capfd: Capture) -> None:
     assert Run.open(tmp_path / "plain").config.alpha == "blend"
     assert main(["train", str(folder), "-o", str(tmp_path / "auto"), *short, "--auto"]) == 0
     taken = capfd.readouterr().err.partition("--auto takes ")[2].splitlines()[0]
-    assert taken == "--thinning 0.2 --alpha transparent"
+    assert taken == "--thinning 0.2 --penalty 0.02 --alpha transparent"
     assert Run.open(tmp_path / "auto").config.alpha == "transparent"
     assert main(["train", "-o", str(tmp_path / "auto"), "--resume", "--auto"]) == 2
     assert "--auto and --resume exclude each other" in capfd.readouterr().err

@@ -20,6 +20,10 @@ from clsplat.shots.frame_numbers import output_paths, parse_frames, path_of, ran
         ("1-5", [1, 2, 3, 4, 5]),
         ("1-10:3", [1, 4, 7, 10]),
         ("1-9:3", [1, 4, 7]),
+        ("1-10x2", [1, 3, 5, 7, 9]),
+        ("10-1", [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]),
+        ("10-1x4", [2, 6, 10]),
+        ("3,-1--5:2", [-5, -3, -1, 3]),
         ("5-5", [5]),
         ("7,12,30-32", [7, 12, 30, 31, 32]),
         ("30-32, 7 ,12", [7, 12, 30, 31, 32]),
@@ -45,9 +49,9 @@ def test_frames(text: str, frames: list[int]) -> None:
         ("1.5", "'1.5' is no frame or range"),
         ("1-10:-1", "'1-10:-1' is no frame or range"),
         ("1-10:0", "the step 0, expected at least 1"),
-        ("10-1", "the range '10-1' is empty"),
-        ("3,-1--5", "the range '-1--5' is empty"),
+        ("1-10x-1", "'1-10x-1' is no frame or range"),
         ("1-99999999", "lists more than 10,000,000 frames"),
+        ("99999999-1", "lists more than 10,000,000 frames"),
     ],
 )
 def test_frames_that_are_none(text: str, message: str) -> None:
@@ -79,6 +83,12 @@ def test_ranges_are_read_again(frames: set[int]) -> None:
         ("{frame:05d}.png", "00042.png"),
         ("{name}.png", "cam#1/%04d.v2.png"),
         ("{frame}/{name}_##.png", "42/cam#1/%04d.v2_42.png"),
+        ("shot/beauty.@@@@.exr", "shot/beauty.0042.exr"),
+        ("shot/beauty.$F4.exr", "shot/beauty.0042.exr"),
+        ("shot/beauty.$F.exr", "shot/beauty.42.exr"),
+        ("shot/beauty.<F4>.exr", "shot/beauty.0042.exr"),
+        ("<F>_<F6>.exr", "42_000042.exr"),
+        ("me@home/$FINAL/$4/x_##.png", "me@home/$FINAL/$4/x_42.png"),
         ("100%/50%%/x.png", "100%/50%%/x.png"),
     ],
 )
@@ -93,10 +103,22 @@ def test_more_digits_than_the_pattern_has_and_negative_ones() -> None:
 
 @pytest.mark.parametrize(
     "pattern",
-    ["{nmae}.png", "{}.png", "{name:04}.png", "{frames}.png", "a.%x.png", "a.%4d.png", "{frame:4d}.png", "{a b}.png"],
+    [
+        "{nmae}.png",
+        "{}.png",
+        "{name:04}.png",
+        "{frames}.png",
+        "a.%x.png",
+        "a.%4d.png",
+        "{frame:4d}.png",
+        "{a b}.png",
+        "a.$FF.png",
+        "a.<f4>.png",
+        "a.<UDIM>.png",
+    ],
 )
 def test_fields_that_are_not_known(pattern: str) -> None:
-    with pytest.raises(InputError, match=r"is not known, expected \{name\}, \{frame\}, #### or %04d"):
+    with pytest.raises(InputError, match=r"is not known, expected \{name\}, \{frame\}, ####, @@@@, %04d, "):
         output_paths(pattern, [(1, "a")])
 
 
