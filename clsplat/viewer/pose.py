@@ -104,8 +104,8 @@ def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
 
 
 def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
-    """What is up for a camera that looks `ahead` and is rolled, clockwise as seen from behind it: `up` turned about
-    that axis, a unit vector (3,). None for a camera that looks along `up`."""
+    """The direction that is up for a camera that looks `ahead` and is rolled, clockwise as seen from behind it: `up`
+    turned about that axis, a unit vector (3,). None for a camera that looks along `up`."""
     length = float(np.linalg.norm(ahead) * np.linalg.norm(up))
     if not float(np.linalg.norm(np.cross(ahead, up))) > 1e-3 * length:
         return None

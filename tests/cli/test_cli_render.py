@@ -143,7 +143,7 @@ def test_cameras_that_cannot_be_rendered(model: str, pipeline: Pipeline, tmp_pat
         ({}, [*out, "--path", "turntable", "--count", "0"], "--count 0: expected 1 to 100,000 frames"),
         ({}, [*out, "--usd-camera", "c"], "is no USD stage"),
         ({}, ["-o", str(tmp_path / "shot" / "a.exr")], "or a frame number such as ####"),
-        ({}, ["-o", str(tmp_path / "shot" / "{nam}.exr")], "{nam} is not known, expected {name}, {frame}, #### or"),
+        ({}, ["-o", str(tmp_path / "shot" / "{nam}.exr")], "{nam} is not known, expected {name}, {frame}, ####, "),
     ]
     for changes, arguments, message in cases:
         cameras.write_text(json.dumps({**PATH, **changes}))
