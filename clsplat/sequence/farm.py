@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import signal
 import threading
+import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from typing import Any
 
 import clsplat
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError, InputError, warn
 from clsplat.files import digest
 from clsplat.gaussians import Gaussians
 from clsplat.images.video import VideoWriter
@@ -33,6 +34,8 @@ HELD = 3
 """Frames that a worker holds at once, whatever threads it has."""
 PATIENCE = 20
 """Seconds in which a scheduler has to answer."""
+REMINDER = 10.0
+"""Seconds from one line to the next while a scheduler has no workers."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ def render_on_farm(
         raise ValueError("no channels")
     placed = [replace(task, path=task.path.absolute(), before=stamp(task.path)) for task in tasks]
     names = {task.number: str(task.path) for task in tasks}
-    with _client(scheduler, workers) as client:
+    with _client(scheduler, workers) as client, _telling_of_no_workers(client, scheduler):
         results = _results(client, placed, job, video)
         for record in encoded(placed, results, video):
             on_done(replace(record, path=names[record.frame]))
@@ -165,6 +168,41 @@ def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWri
         for another in submit((done if video is None else video.frames) + window - sent):
             pending.add(another)
             sent += 1
+
+
+@contextmanager
+def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]:
+    """Inside, a warning says so at once and every REMINDER seconds while the scheduler has no workers. Nothing for a
+    cluster that is made here."""
+    if scheduler is None:
+        yield
+        return
+    stop = threading.Event()
+
+    def watch() -> None:
+        since: float | None = None
+        while not stop.is_set():
+            try:
+                there = bool(client.nthreads())
+            except (OSError, RuntimeError, TimeoutError):  # the loop over the frames tells of a scheduler that is lost
+                return
+            now = time.monotonic()
+            since = None if there else since or now
+            if since is not None and not stop.is_set():
+                waited = f", for {now - since:.0f} s now" if now - since >= 1 else ""
+                warn(
+                    f"--scheduler {scheduler}: has no workers{waited}; frames wait until one is there, started with "
+                    f"dask worker {scheduler}"
+                )
+            stop.wait(REMINDER)
+
+    watcher = threading.Thread(target=watch, name="clsplat-farm", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        watcher.join(REMINDER)
 
 
 def dask_setup(_: Any) -> None:

@@ -167,6 +167,28 @@ def test_no_scheduler(shot: list[str], tmp_path: Path, capsys: Capture, monkeypa
     assert "--scheduler nonsense://x: no scheduler answers there" in error_line(capsys)
 
 
+@pytest.mark.needs("distributed")
+def test_a_scheduler_without_workers(
+    shot: list[str], whole: dict[str, bytes], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is said at once and again, until a worker comes, who does the work."""
+    import distributed
+
+    monkeypatch.setattr(farm, "REMINDER", 1.0)
+    with distributed.LocalCluster(n_workers=0, processes=True, dashboard_address=None) as empty:
+        come = threading.Timer(4.0, lambda: empty.scale(1))
+        come.start()
+        try:
+            assert render(shot, tmp_path, "--scheduler", empty.scheduler_address, "--frames", "1-3") == 0
+        finally:
+            come.cancel()
+    lines = [line for line in capsys.readouterr().err.splitlines() if "has no workers" in line]
+    assert len(lines) >= 2
+    assert f"--scheduler {empty.scheduler_address}: has no workers; frames wait until one is there" in lines[0]
+    assert all("for " in line for line in lines[1:])
+    assert contents(tmp_path) == {name: data for name, data in whole.items() if name < "a.0004"}
+
+
 def test_without_the_extra(shot: list[str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert render(shot, tmp_path, "--workers", "1") == 2
