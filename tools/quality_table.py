@@ -90,7 +90,9 @@ def antialiasing_rows() -> list[Row]:
 
 
 TRAININGS: dict[str, Callable[[], list[Row]]] = {"growth": growth_rows, "antialiasing": antialiasing_rows}
-FEW_VIEWS = ("--seeds", "0,1", "--try", "thinning:thinning=0.2")
+FEW_VIEWS = ("--iterations", "{iterations}", "--seeds", "0,1", "--try", "thinning:thinning=0.2")
+AUTO = ("--try", "auto:thinning=0.2,penalty=0.02,iterations=2000")
+"""Settings that --auto takes for few photographs."""
 TOOLS: dict[str, tuple[str, ...]] = {
     "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", "--iterations", "{iterations}"),
     "fisheye": ("quality_fisheye.py", "{work}", "--iterations", "{iterations}"),
@@ -98,8 +100,8 @@ TOOLS: dict[str, tuple[str, ...]] = {
     "lenses": ("quality_poses.py", "{work}", "--width", "320", "--lens", "2", "--iterations", "{iterations}"),
     "points": ("quality_points.py", "{work}", "--iterations", "{iterations}"),
     "real points": ("quality_points.py", "{work}", "--rgbd", "{scenes}/rgbd_7scenes", "--iterations", "{iterations}"),
-    "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *FEW_VIEWS),
-    "few views of bonsai": ("quality_views.py", "{scenes}/bonsai", "{work}", *FEW_VIEWS),
+    "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *FEW_VIEWS, *AUTO),
+    "few views of bonsai": ("quality_views.py", "{scenes}/bonsai", "{work}", *FEW_VIEWS, *AUTO),
 }
 """Tables that tools of their own print: the commands, with the folder of scenes, one to work in, and the steps."""
 

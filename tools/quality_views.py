@@ -7,7 +7,8 @@
 
 The photographs are picked evenly from the training views by name, so that they are the same each time; the points are
 those of the whole scene. Each --try is a row of the table beside that of `--schedule short`, in the settings' names of
-config.toml. FOLDER/views.json keeps what is measured, and a call goes on from there.
+config.toml; its iterations, if there are any, are those of its schedule. FOLDER/views.json keeps what is measured, and
+a call goes on from there.
 """
 
 from __future__ import annotations
@@ -38,14 +39,18 @@ def picked(scene: Scene, count: int) -> Scene:
     return replace(scene, views=[view for view in scene.views if view.split == "test" or view.name in kept])
 
 
-def with_settings(config: TrainConfig, settings: str) -> TrainConfig:
-    """The settings with others, `name=value` with commas between; values as in JSON, other words as they are."""
+def with_settings(iterations: int, settings: str) -> TrainConfig:
+    """The short schedule of so many steps, with these settings, `name=value` with commas between; values as in JSON,
+    other words as they are."""
+    values: dict[str, Any] = {}
     for setting in filter(None, settings.split(",")):
         name, _, text = setting.partition("=")
         try:
-            value: Any = json.loads(text)
+            values[name] = json.loads(text)
         except json.JSONDecodeError:
-            value = text
+            values[name] = text
+    config = scheduled("short", values.pop("iterations", iterations))
+    for name, value in values.items():
         *group, field = name.replace("-", "_").split(".")
         part = replace(getattr(config, group[0]) if group else config, **{field: value})
         config = replace(config, **{group[0]: part}) if group else part
@@ -112,11 +117,11 @@ def main() -> None:
         for seed in options.seeds:
             for method, settings in methods.items():
                 key = f"{method} {count} {seed}"
-                config = scheduled("short", options.iterations)
+                config = with_settings(options.iterations, settings)
                 config = replace(config, seed=seed, resolution=options.resolution, report=False)
                 if key not in rows:
                     name = key.replace(" ", "_") + ".png"
-                    rows[key] = measured(few, with_settings(config, settings), device, options.folder / name)
+                    rows[key] = measured(few, config, device, options.folder / name)
                     file.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
                     print(f"{key}: {rows[key]['psnr']:.2f} dB, {rows[key]['gaussians']:,} Gaussians", flush=True)
     print(table(rows, list(methods), options.views, options.seeds))
