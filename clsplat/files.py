@@ -244,7 +244,7 @@ def claim(target: Path) -> Path | None:
         if _take(path, token.encode()):
             return path
         try:
-            if not _is_abandoned(path, path.read_text("ascii", "replace") or token):
+            if not _is_abandoned(path, path.read_text(encoding="ascii", errors="replace") or token):
                 return None
             path.unlink()
         except (FileNotFoundError, PermissionError):  # given back, or taken over
@@ -349,7 +349,7 @@ def abandoned(targets: Iterable[Path]) -> list[Path]:
         for name in wanted:
             path = _claim_of(folder / name)
             with suppress(OSError):
-                if _is_abandoned(path, path.read_text("ascii", "replace")):
+                if _is_abandoned(path, path.read_text(encoding="ascii", errors="replace")):
                     result.append(path)
     return sorted(result)
 

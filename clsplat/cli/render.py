@@ -201,7 +201,10 @@ def _read_job(verb: Render) -> Job:
     from clsplat.runs.run import model_file
     from clsplat.sequence import existing
     from clsplat.sequence.task import digest_of, make_tasks
+    from clsplat.shots import check_around
 
+    if verb.cameras is None:
+        check_around(verb.path)
     options = _options(verb)
     verb.rasterizer.check()
     limit = parse_bytes(verb.max_device_mem)

@@ -99,6 +99,14 @@ def shot_around(
 ) -> Shot:
     """The shot that --path, --count and --up ask for without --cameras: around the model, as `cameras_around`. Raises
     InputError."""
+    path = check_around(path)
+    _check_count(count)
+    found = cameras_around(gaussians, COLMAP_UP if up is None else parse_up(up), size)
+    return Shot(_path(path, found, count))
+
+
+def check_around(path: str | None) -> str:
+    """The path, which goes around a model. Raises InputError for one that needs cameras, and for none."""
     if path is None:
         raise InputError(
             "--cameras is missing, expected cameras to render from; or --path turntable or spiral alone, for a path "
@@ -106,9 +114,7 @@ def shot_around(
         )
     if path == "through":
         raise InputError("--path through: goes through cameras, expected --cameras with it")
-    _check_count(count)
-    found = cameras_around(gaussians, COLMAP_UP if up is None else parse_up(up), size)
-    return Shot(_path(path, found, count))
+    return path
 
 
 def _check_count(count: int | None) -> None:
