@@ -38,6 +38,8 @@ WINDOWS = os.name == "nt"
 IGNORES_CASE = sys.platform in ("win32", "darwin")
 """True if the system's usual file systems take A.png and a.png for one file, and an accented letter for its parts."""
 CLAIM_SUFFIX = ".clsplat-claim"
+LONGEST_CLAIM = 3600.0
+"""Seconds after which a file that is claimed may be made by another process too."""
 PATIENCE = 2.0
 """Seconds in which a file on Windows that another program has open is tried again: a virus scanner or an indexer lets
 go of a new file within one."""
@@ -244,12 +246,20 @@ def claim(target: Path) -> Path | None:
         if _take(path, token.encode()):
             return path
         try:
-            if not _is_abandoned(path, path.read_text(encoding="ascii", errors="replace") or token):
+            if not _is_given_up(path):
                 return None
             path.unlink()
         except (FileNotFoundError, PermissionError):  # given back, or taken over
             continue
     return None
+
+
+def _is_given_up(claimed: Path) -> bool:
+    """True for the claim of a process that has ended, and for one so old that its number may be another's by now."""
+    if time.time() - claimed.stat().st_mtime > LONGEST_CLAIM:
+        return True
+    token = claimed.read_text(encoding="ascii", errors="replace")
+    return bool(token) and _is_abandoned(claimed, token)  # without one it is just being written
 
 
 def _claim_of(target: Path) -> Path:
@@ -349,7 +359,7 @@ def abandoned(targets: Iterable[Path]) -> list[Path]:
         for name in wanted:
             path = _claim_of(folder / name)
             with suppress(OSError):
-                if _is_abandoned(path, path.read_text(encoding="ascii", errors="replace")):
+                if _is_given_up(path):
                     result.append(path)
     return sorted(result)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
@@ -51,6 +52,20 @@ def test_what_a_killed_process_has_claimed_is_taken_over(tmp_path: Path, monkeyp
     assert claim(first.path) is None
     monkeypatch.setattr(files, "ABANDONED", -1.0)
     assert claim(first.path) is not None
+
+
+def test_an_old_claim_holds_nobody_up(tmp_path: Path) -> None:
+    """The number of its process may be that of another one by now, which is alive; a new one holds, also while it is
+    being written."""
+    target = tmp_path / "a.exr"
+    held = claim(target)
+    assert held is not None
+    held.write_bytes(b"")
+    assert claim(target) is None
+    hours_ago = time.time() - 2 * 3600
+    os.utime(held, (hours_ago, hours_ago))
+    assert abandoned([target]) == [held]
+    assert claim(target) == held
 
 
 def test_two_jobs_render_each_frame_once(tmp_path: Path) -> None:
