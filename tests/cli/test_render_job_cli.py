@@ -189,6 +189,7 @@ def test_frames_made_otherwise_are_told_and_rendered_again(shot: list[str], tmp_
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_two_jobs_started_together_write_each_frame_once(shot: list[str], tmp_path: Path) -> None:
     """At most two frames more, and both end well with all frames there."""
     count = 60

@@ -168,6 +168,7 @@ def test_no_scheduler(shot: list[str], tmp_path: Path, capsys: Capture, monkeypa
 
 
 @pytest.mark.needs("distributed")
+@pytest.mark.slow
 def test_a_scheduler_without_workers(
     shot: list[str], whole: dict[str, bytes], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

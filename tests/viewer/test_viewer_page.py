@@ -177,6 +177,7 @@ def roll_of(page: Any, folder: Path) -> np.ndarray:
     return camera.rotation[:2]
 
 
+@pytest.mark.slow
 def test_up_and_roll(browser: Any, served: tuple[str, Path], tmp_path: Path) -> None:
     """A roll of 90 degrees has to the right what was down; what is up is level with the camera."""
     page = opened(browser, served[0])
