@@ -38,8 +38,8 @@ WINDOWS = os.name == "nt"
 IGNORES_CASE = sys.platform in ("win32", "darwin")
 """True if the system's usual file systems take A.png and a.png for one file, and an accented letter for its parts."""
 CLAIM_SUFFIX = ".clsplat-claim"
-LONGEST_CLAIM = 3600.0
-"""Seconds after which a file that is claimed may be made by another process too."""
+_PROCESS = secrets.token_hex(4)
+"""Mark that tells this process from one of the same number, before it or on another machine."""
 PATIENCE = 2.0
 """Seconds in which a file on Windows that another program has open is tried again: a virus scanner or an indexer lets
 go of a new file within one."""
@@ -239,11 +239,11 @@ def locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
 
 def claim(target: Path) -> Path | None:
     """A file beside `target` that tells other processes that this one makes it, for `give_back`; None where another
-    has claimed it. That of a process that has ended is taken over. On a file system that cannot, two may both have it.
-    Raises OSError where the folder cannot be written."""
-    path, token = _claim_of(target), f"{_machine()}{os.getpid():08x}"
+    has claimed it. It has to be touched now and then: one that has not been for ABANDONED seconds is taken over, as is
+    that of a process that has ended. Raises OSError where the folder cannot be written."""
+    path = _claim_of(target)
     for _ in range(2):
-        if _take(path, token.encode()):
+        if _take(path, f"{_machine()}{os.getpid():08x}{_PROCESS}".encode()):
             return path
         try:
             if not _is_given_up(path):
@@ -254,16 +254,21 @@ def claim(target: Path) -> Path | None:
     return None
 
 
-def _is_given_up(claimed: Path) -> bool:
-    """True for the claim of a process that has ended, and for one so old that its number may be another's by now."""
-    if time.time() - claimed.stat().st_mtime > LONGEST_CLAIM:
-        return True
-    token = claimed.read_text(encoding="ascii", errors="replace")
-    return bool(token) and _is_abandoned(claimed, token)  # without one it is just being written
-
-
 def _claim_of(target: Path) -> Path:
     return target.with_name(f".{target.name}{CLAIM_SUFFIX}")
+
+
+def _is_given_up(claimed: Path) -> bool:
+    if time.time() - claimed.stat().st_mtime > ABANDONED:
+        return True
+    token = claimed.read_text(encoding="ascii", errors="replace")
+    if not token:  # it is just being written
+        return False
+    if (
+        token[:12] == f"{_machine()}{os.getpid():08x}"
+    ):  # a process before this one, of the same number, as in containers
+        return token[12:] != _PROCESS
+    return _is_abandoned(claimed, token)
 
 
 def give_back(claimed: Path) -> None:
@@ -274,14 +279,19 @@ def give_back(claimed: Path) -> None:
 
 def _take(lock: Path, token: bytes) -> bool:
     try:
-        with lock.open("xb") as file:
-            file.write(token)
+        file = lock.open("xb", buffering=0)
     except FileExistsError:
         return False
     except PermissionError:  # Windows says so of a file that is being removed
         if not WINDOWS:
             raise
         return False
+    try:
+        with file:
+            file.write(token)
+    except OSError:
+        lock.unlink()
+        raise
     return True
 
 

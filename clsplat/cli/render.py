@@ -163,6 +163,8 @@ class Render(Verb):
         from clsplat.models.formats import model_path
         from clsplat.runs.run import Run, is_run
 
+        if "lenses" in given and self.cameras is None:
+            raise InputError(f"--lenses {self.lenses}: is of the cameras of photographs, expected --cameras with it")
         bundle, lenses = PRESETS["default"], self.lenses or "undistort"
         if self.model.is_dir() and (is_run(self.model) or model_path(self.model) == self.model):
             config = Run.open(self.model).config  # refuses a folder that is neither run nor model

@@ -48,11 +48,15 @@ class Thumbnail(Verb):
 
 def run(verb: Thumbnail, services: Services) -> int:
     """The first frame of a turntable around the model."""
+    from clsplat.images.frame_files import check_format
+    from clsplat.shots.frame_numbers import FIELD, ODD
+
     if not SMALLEST <= verb.size <= LARGEST:
         raise InputError(f"--size {verb.size}: expected {SMALLEST} to {LARGEST} pixels")
     output = verb.output or Path(f"{verb.model.resolve().name}.png")
-    if any(mark in output.name for mark in ("{", "#", "%")):
-        raise InputError(f"{output}: expected the name of one picture, without a place for frames' numbers")
+    check_format(str(output), ("rgb",))
+    if FIELD.search(str(output)) or ODD.search(output.name):
+        raise InputError(f"{output}: has a place for frames' numbers, expected the name of one picture, given with -o")
     same: dict[str, Any] = {name: getattr(verb, name) for name in ("up", "background", "alpha", "overwrite", "device")}
     if output.suffix.lower() != ".exr":  # a model of linear colours has a picture too
         same["colour"] = ColourConfig(colorspace="sRGB")

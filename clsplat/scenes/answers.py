@@ -75,7 +75,7 @@ def answered(
     answers = []
     for finding in found:
         options = ANSWERS.get(finding.kind, ())
-        free = [option for option in options if not any(name in given for name in option)]
+        free = [option for option in options if not _touches(option, given)]
         taken: Mapping[str, Any] = {}
         for option in free:
             try:
@@ -86,6 +86,12 @@ def answered(
             break
         answers.append(Answer(finding, taken, given=bool(options) and not free))
     return answers, config
+
+
+def _touches(option: Mapping[str, Any], given: Collection[str]) -> bool:
+    """True if an answer has a setting that is given, its schedule's too."""
+    names = {*option, *(SCHEDULED if SCHEDULE in option else ())}
+    return any(name.partition(".")[0] in names for name in given)
 
 
 def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConfig:

@@ -17,6 +17,8 @@ from clsplat.files import claim, give_back
 from clsplat.sequence.existing import is_complete
 from clsplat.sequence.task import RenderOptions, Task
 
+HEARTBEAT = 60.0
+"""Seconds after which a claim is touched again."""
 LOOK_AGAIN = 0.25
 """Seconds after which frames of another job are looked at again."""
 PATIENCE = 10.0
@@ -30,7 +32,8 @@ class Sharing:
     def __init__(self, options: RenderOptions) -> None:
         self.options = options
         self._claims: dict[int, Path] = {}
-        self._changing = threading.Lock()
+        self._changing, self._closed = threading.Lock(), threading.Event()
+        threading.Thread(target=self._hold, name="clsplat-claims", daemon=True).start()
 
     def begin(self, task: Task) -> State:
         """ours: the frame is to be rendered here; done: its file is complete by now; theirs: another process is at
@@ -46,6 +49,14 @@ class Sharing:
             self._claims[task.number] = claimed
         return "ours"
 
+    def _hold(self) -> None:
+        """Touch the claims as long as the job runs: a frame may take hours."""
+        while not self._closed.wait(HEARTBEAT):
+            with self._changing:
+                for claimed in self._claims.values():
+                    with suppress(OSError):
+                        claimed.touch(exist_ok=True)
+
     def end(self, task: Task) -> None:
         """The frame's file is there, or will not be."""
         with self._changing:
@@ -55,6 +66,7 @@ class Sharing:
 
     def close(self) -> None:
         """Give back what is not done."""
+        self._closed.set()
         with self._changing:
             claims, self._claims = list(self._claims.values()), {}
         for claimed in claims:

@@ -32,6 +32,9 @@ DETAILED = 0.35
 SCENE = 0.2
 """Radius of that region, in the model's, under which the model is a scene with a thing in it; 0.3 and more in models of
 a thing alone, 0.05 in one of a room with a table in the middle."""
+TINY, SMALLEST = 0.02, 1e-4
+"""Sizes below which a Gaussian shows no more detail: of this part of the Gaussians, and in the model's radius. Files
+have some of no size at all."""
 MARGIN = 1.3
 """Radius to be seen of a scene, in that of its most detailed region."""
 ROOM = 1.1
@@ -43,7 +46,7 @@ RING = 24
 
 
 def parse_up(text: str) -> tuple[float, float, float]:
-    """The direction in `x`, `-y` and so on, or in three numbers with commas. Raises InputError."""
+    """The direction in `x`, `-y` and so on, or in three numbers with commas, of length 1. Raises InputError."""
     expected = InputError(f"--up {text[:80]}: expected x, y, z, -x, -y, -z or three numbers with commas, not all 0")
     name, sign = text.strip().removeprefix("-"), -1.0 if text.strip().startswith("-") else 1.0
     if name in ("x", "y", "z"):
@@ -52,9 +55,12 @@ def parse_up(text: str) -> tuple[float, float, float]:
         x, y, z = (float(word) for word in text.split(","))
     except ValueError:
         raise expected from None
-    if not 0 < math.hypot(x, y, z) < math.inf:
+    most = max(abs(x), abs(y), abs(z))
+    if not (0 < most < math.inf and math.isfinite(x + y + z)):
         raise expected
-    return x, y, z
+    x, y, z = x / most, y / most, z / most  # before squares are out of range
+    length = math.hypot(x, y, z)
+    return x / length, y / length, z / length
 
 
 def cameras_around(
@@ -115,7 +121,10 @@ def _subject(gaussians: Gaussians) -> tuple[Float64, float]:
     middle, whole = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
     if whole == 0:
         return middle + gaussians.origin, 3 * float(np.exp(largest.max()))
-    detail = np.exp(largest.min() - largest) / (1 + np.exp(-gaussians.opacity_logits[rows].astype(np.float64)))
+    least = max(float(np.quantile(largest, TINY)), math.log(SMALLEST * whole))
+    detail = np.exp(least - np.maximum(largest, least)) / (
+        1 + np.exp(-gaussians.opacity_logits[rows].astype(np.float64))
+    )
     kept = ((means >= low) & (means <= high)).all(axis=1)
     means, detail = means[kept], detail[kept]
     centre, radius = middle, whole

@@ -57,8 +57,16 @@ def test_a_model_of_linear_colours_has_a_thumbnail(model: Path, capsys: Capture)
         (["render", "model.ply", "-o", "a.png", "--cameras", "x", "--up", "y"], "--up y: is of paths around the"),
         (["thumbnail", "model.ply", "--up", "north"], "--up north: expected x, y, z"),
         (["thumbnail", "model.ply", "--size", "8"], "--size 8: expected 16 to 8192"),
-        (["thumbnail", "model.ply", "-o", "a.##.png"], "a.##.png: expected the name of one picture"),
-        (["thumbnail", "model.ply", "-o", "a.gif"], "a.gif"),
+        (["thumbnail", "model.ply", "-o", "a.##.png"], "a.##.png: has a place for frames' numbers, expected the name"),
+        (["thumbnail", "model.ply", "-o", "shot#1/a.png"], "shot#1/a.png: has a place for frames' numbers"),
+        (["thumbnail", "model.ply", "-o", "a.$F.png"], "a.$F.png: has a place for frames' numbers"),
+        (["thumbnail", "a@@b.ply"], "a@@b.ply.png: has a place for frames' numbers"),
+        (["thumbnail", "model.ply", "-o", "a.gif"], "a.gif: has the extension '.gif', expected one of .exr, .png"),
+        (["thumbnail", "model.ply", "-o", "a.mp4"], "a.mp4: has the extension '.mp4', expected one of .exr, .png"),
+        (
+            ["render", "model.ply", "-o", "a.png", "--path", "spiral", "--lenses", "native"],
+            "--lenses native: is of the",
+        ),
         (["thumbnail", "nowhere.ply"], "nowhere.ply: no such file"),
     ],
 )

@@ -236,6 +236,7 @@ def test_few_views_are_trained_for_fewer_steps() -> None:
     own = replace(TrainConfig(), optimiser=replace(TrainConfig().optimiser, means_rate=1e-4))
     for mine, given in (
         (TrainConfig(), {"iterations"}), (TrainConfig(), {"schedule"}), (own, {"optimiser.means_rate"}),
+        (TrainConfig(), {"density.stop"}), (TrainConfig(), {"sh_degree_every"}),
         (bundled("fast", None, 7000), {"preset"}), (TrainConfig(eval_at=(steps + 1,)), {"eval_at"}),
     ):  # fmt: skip
         (answer,), config = answered(few, mine, given)

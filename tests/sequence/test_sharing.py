@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import subprocess
 import sys
@@ -54,18 +56,54 @@ def test_what_a_killed_process_has_claimed_is_taken_over(tmp_path: Path, monkeyp
     assert claim(first.path) is not None
 
 
-def test_an_old_claim_holds_nobody_up(tmp_path: Path) -> None:
-    """The number of its process may be that of another one by now, which is alive; a new one holds, also while it is
-    being written."""
+def test_a_claim_that_nobody_touches_holds_nobody_up(tmp_path: Path) -> None:
+    """Whatever its process is; one that is just being written holds."""
     target = tmp_path / "a.exr"
     held = claim(target)
     assert held is not None
     held.write_bytes(b"")
     assert claim(target) is None
-    hours_ago = time.time() - 2 * 3600
-    os.utime(held, (hours_ago, hours_ago))
+    long_ago = time.time() - 2 * files.ABANDONED
+    os.utime(held, (long_ago, long_ago))
     assert abandoned([target]) == [held]
     assert claim(target) == held
+
+
+def test_a_process_of_the_same_number_before_this_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container that begins again: its claims are not this process's, though its number is."""
+    target = tmp_path / "a.exr"
+    with monkeypatch.context() as before:
+        before.setattr(files, "_PROCESS", "00000000")
+        assert claim(target) is not None
+    assert abandoned([target]) != []
+    assert claim(target) is not None and claim(target) is None
+
+
+def test_claims_are_touched_while_a_job_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sharing, "HEARTBEAT", 0.02)
+    (task,) = tasks_in(tmp_path, 1)
+    shared = Sharing(OPTIONS)
+    assert shared.begin(task) == "ours"
+    (held,) = tmp_path.iterdir()
+    long_ago = time.time() - 2 * files.ABANDONED
+    os.utime(held, (long_ago, long_ago))
+    until = time.monotonic() + 10
+    while held.stat().st_mtime < long_ago + 1 and time.monotonic() < until:
+        time.sleep(0.01)
+    assert claim(task.path) is None
+    shared.close()
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_disk_without_room_leaves_no_claim(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(io.FileIO):
+        def write(self, _: object) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "open", lambda path, mode, buffering: Full(path, "x"))
+    with pytest.raises(OSError, match="No space left"):
+        claim(tmp_path / "a.exr")
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_two_jobs_render_each_frame_once(tmp_path: Path) -> None:

@@ -62,6 +62,15 @@ def test_a_scene_is_looked_at_where_its_detail_is() -> None:
         assert 0.5 < middle[2] < 4, "and near"
 
 
+@pytest.mark.parametrize("size", [-103.0, -25.0, -np.inf])
+def test_gaussians_of_no_size_are_no_detail(size: float) -> None:
+    model = cloud(ball(2000, 0.5))
+    wanted = cameras_around(model)[0].position
+    model.log_scales[7] = size
+    model.log_scales[9:12] = size
+    assert np.allclose(cameras_around(model)[0].position, wanted)
+
+
 def test_what_the_world_counts_from_moves_the_cameras_along() -> None:
     model = cloud(ball(500, 1))
     far = replace(model, origin=np.array([4e5, -5e6, 100.0]))
@@ -105,3 +114,9 @@ def test_paths_around_a_model() -> None:
 def test_what_is_no_direction(text: str) -> None:
     with pytest.raises(InputError, match=f"--up {text}: expected x, y, z"):
         parse_up(text)
+
+
+def test_a_direction_has_length_one() -> None:
+    for text in ("0,-3,4", "0,-3e200,4e200", "0,-3e-200,4e-200"):
+        assert np.allclose(parse_up(text), (0, -0.6, 0.8))
+    assert parse_up("-z") == (0, 0, -1)
