@@ -59,10 +59,11 @@ def run(verb: View, services: Services) -> int:
     from clsplat.runs.appearance import gains_of
     from clsplat.runs.run import model_file, run_of
     from clsplat.selftest.result import FORWARD
+    from clsplat.shots.viewpoints import extent_of
     from clsplat.viewer.appearance import Look
     from clsplat.viewer.models import HeldModel
     from clsplat.viewer.page import World
-    from clsplat.viewer.pose import extent_of, looking, start_of
+    from clsplat.viewer.pose import looking, start_of
     from clsplat.viewer.scheduler import Viewing
     from clsplat.viewer.server import Address, Server
     from clsplat.viewer.training_view import LONGEST_WAIT
@@ -104,8 +105,9 @@ def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], Abstra
     """The page of a training, which is open as long as the context is. Raises InputError where it cannot be served, at
     once, before anything is trained or written."""
     from clsplat.images.alpha import background_colour
+    from clsplat.shots.viewpoints import extent_of
     from clsplat.viewer.page import World
-    from clsplat.viewer.pose import extent_of, start_of
+    from clsplat.viewer.pose import start_of
     from clsplat.viewer.scheduler import Viewing
     from clsplat.viewer.server import Address, Server
     from clsplat.viewer.training_view import TrainingView

@@ -11,18 +11,14 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.shots.viewpoints import look_at
+from clsplat.shots.viewpoints import COLMAP_UP, extent_of, look_at
 
-COLMAP_UP = (0.0, -1.0, 0.0)
-"""Up in the world of a photograph that was taken level: COLMAP's y is down."""
 SIZE = (1280, 720)
 """Width and height of pictures where none are asked for."""
 FIELD = math.radians(40.0)
 """Angle of view of the shorter side, in radians."""
 SAMPLED = 100_000
 """Gaussians that tell where a model is; more move its middle by less than a pixel."""
-INSIDE = 0.96
-"""Part of the Gaussians along each axis that is the model; the rest are strays."""
 FEW = 100
 """Gaussians under which none is a stray."""
 SHRINK = 0.9
@@ -116,8 +112,7 @@ def _subject(gaussians: Gaussians) -> tuple[Float64, float]:
     rows = slice(None, None, max(1, len(gaussians) // SAMPLED))
     means = gaussians.means[rows].astype(np.float64)
     largest = gaussians.log_scales[rows].max(axis=1).astype(np.float64)
-    beyond = 0.5 - INSIDE / 2 if len(means) >= FEW else 0.0
-    low, high = np.quantile(means, [beyond, 1 - beyond], axis=0)
+    low, high = extent_of(means) if len(means) >= FEW else extent_of(means, 1.0)
     middle, whole = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
     if whole == 0:
         return middle + gaussians.origin, 3 * float(np.exp(largest.max()))

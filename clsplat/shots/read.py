@@ -14,12 +14,13 @@ from clsplat.errors import InputError, examples
 from clsplat.gaussians import Gaussians
 from clsplat.scenes.colmap import find_model, read_cameras
 from clsplat.scenes.transforms import load_document, read_poses
-from clsplat.shots.around import COLMAP_UP, cameras_around, parse_up
+from clsplat.shots.around import cameras_around, parse_up
 from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
 from clsplat.shots.generated import PATHS
 from clsplat.shots.nerfstudio import read_camera_path
 from clsplat.shots.shot import MOST_FRAMES, Frame, Shot, named, numbered
 from clsplat.shots.usd import read_usd
+from clsplat.shots.viewpoints import COLMAP_UP
 
 COUNT = 120
 """Frames of a generated path: five seconds at 24 a second."""

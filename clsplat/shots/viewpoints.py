@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
+COLMAP_UP = (0.0, -1.0, 0.0)
+"""Up in the world of a photograph that was taken level: COLMAP's y is down."""
 WIDEST_GAP = np.deg2rad(100.0)
 """Widest gap of the cameras around the middle, in radians, that a turntable still goes across; beyond it swings."""
 
@@ -68,3 +72,12 @@ def covered_arc(azimuths: Float64) -> tuple[float, float]:
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
     widest = int(np.argmax(gaps))
     return float(ordered[(widest + 1) % len(ordered)]), float(2 * np.pi - gaps[widest])
+
+
+def extent_of(points: NDArray[Any], inside: float = 0.96) -> tuple[Float64, Float64]:
+    """Two corners (3,) of the box that holds this part of the points along each axis: strays are many in models."""
+    if not len(points):
+        return -np.ones(3), np.ones(3)
+    some = points[:: max(1, len(points) // 100_000)]
+    low, high = np.quantile(some.astype(np.float64), [0.5 - inside / 2, 0.5 + inside / 2], axis=0)
+    return low, high

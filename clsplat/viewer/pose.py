@@ -6,16 +6,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera, focal_length
 from clsplat.rotations import quaternion_of, rotation_from_quaternion
-from clsplat.shots.viewpoints import focus_point, look_at, up_axis
+from clsplat.shots.viewpoints import COLMAP_UP, extent_of, focus_point, look_at, up_axis
 
 MOST_PIXELS = 4096 * 2304
 """Most pixels of a picture on a page, whatever size the browser asks for."""
@@ -100,7 +98,7 @@ def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
     low, high = extent_of(points)
     middle = 0.5 * (low + high)
     distance = 0.6 * float(np.linalg.norm(high - low)) / math.tan(FIELD / 2) or 1.0
-    return Start(middle - [0.0, 0.0, distance], middle, np.array([0.0, -1.0, 0.0]), FIELD)
+    return Start(middle - [0.0, 0.0, distance], middle, np.array(COLMAP_UP), FIELD)
 
 
 def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
@@ -117,15 +115,6 @@ def looking(start: Start, size: tuple[int, int]) -> Pose:
     """The pose of the start on a page of this size."""
     rotation, _ = look_at(start.position, start.target, start.up)
     return Pose(rotation.T, start.position, start.fov, *size)
-
-
-def extent_of(points: NDArray[Any], inside: float = 0.96) -> tuple[Float64, Float64]:
-    """Two corners (3,) of the box that holds this part of the points along each axis: strays are many in models."""
-    if not len(points):
-        return -np.ones(3), np.ones(3)
-    some = points[:: max(1, len(points) // 100_000)]
-    low, high = np.quantile(some.astype(np.float64), [0.5 - inside / 2, 0.5 + inside / 2], axis=0)
-    return low, high
 
 
 def fitted(width: int, height: int, scale: float, most: float = MOST_PIXELS) -> tuple[int, int]:

@@ -19,6 +19,7 @@ from clsplat.errors import InputError
 from clsplat.images.writing import steps_of
 from clsplat.rotations import quaternion_of
 from clsplat.shots import choose_shot
+from clsplat.shots.viewpoints import extent_of
 from clsplat.viewer.appearance import (
     LARGEST_OPACITY,
     SCALE,
@@ -31,7 +32,7 @@ from clsplat.viewer.appearance import (
     read_look,
 )
 from clsplat.viewer.path_recorder import MOST_KEYS, add_key, path_document, save_path
-from clsplat.viewer.pose import Pose, extent_of, fitted, looking, read_pose, start_of
+from clsplat.viewer.pose import Pose, fitted, looking, read_pose, start_of
 from clsplat.viewer.refinement import PATIENCE, SETTLE, SMALLEST, START, TARGET, Level, Refinement, Share, next_scale
 from clsplat.viewer.scheduler import Viewer, Viewing
 
