@@ -4,6 +4,7 @@ it."""
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import deque
@@ -55,7 +56,7 @@ class Sharing:
             with self._changing:
                 for claimed in self._claims.values():
                     with suppress(OSError):
-                        claimed.touch(exist_ok=True)
+                        os.utime(claimed)  # and no touch, which would make a file that is gone
 
     def end(self, task: Task) -> None:
         """The frame's file is there, or will not be."""
