@@ -2,15 +2,15 @@
 // zeros outside the image. The window is separable: vertical first, into local memory, then horizontal. A second pair
 // of windows convolves the three partial derivatives, the adjoint of the first.
 //
-// Owner: A group owns blocks of one channel. At ITEMS == 1 it goes down a block row by row, keeps the derivatives of
+// Owner: A group owns blocks of one channel. At ITEMS == 1 it goes down a block by ROWS rows, keeps the derivatives of
 //   LOSS_RING rows, and works out anew those that other blocks have too. Else a block is ROWS x COLUMNS pixels, and the
 //   derivatives of the image are written between two launches.
 // Launch: At ITEMS == 1 any number of groups, which share the blocks out; else a group of ITEMS for each block. Blocks
 //   are numbered across, then down, then by channel.
 // Buffers: image, target (3, rows, stride) in colour, padded to whole tiles, zero in the padding; partials at
-//   ITEMS == 1 (groups, LOSS_RING, 3, field), else (3, 3, height, stride), kind first; gradient
-//   (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its square: one a block,
-//   at ITEMS == 1 one for each of its rows.
+//   ITEMS == 1 (groups, LOSS_RING, 3, field), else (3, 3, height, stride), kind first;
+//   gradient (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its square: one
+//   a block, at ITEMS == 1 one for each of its rows.
 // Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79).
 //
 // E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So whatever a window is added up of counts from the
@@ -35,7 +35,7 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
 // Columns on either side of a block that a window reaches, in whole vectors.
 #define MARGIN ((REACH + LANES - 1) / LANES * LANES)
 #if ITEMS == 1
-#define ROWS 1
+#define ROWS LOSS_ROWS
 #define COLUMNS LOSS_COLUMNS // at most
 #define NEAR_MARGIN (2 * MARGIN)
 #define RING_ROW(y) ((y) & (LOSS_RING - 1))
@@ -69,14 +69,25 @@ typedef struct {
 #define PIXEL_AT(block, x, y) ((uint)(block).stride * (uint)(y) + (uint)(x))
 #define PARTIALS_AT(block, x, y) ((block).pitch * (uint)RING_ROW(y) + (uint)((x) - (block).x_partials))
 
-// Body for the vectors of ROWS rows that the item owns, with `margin` columns on either side: x, row, and `near_at`.
-#define FOR_VECTORS(block, margin)                                                                                     \
+// Body for the item's vectors of `rows` rows, with `margin` columns on either side: x, row, and `near_at`. One item
+// goes down the rows first, as their vertical windows share pixels, and has a row after the other for horizontal ones
+// (LINES).
+#if ITEMS == 1
+#define LINES 1
+#define FOR_VECTORS(block, margin, rows)                                                                               \
+  for (int x = (block).x0 - (margin); x < (block).x1 + (margin); x += LANES)                                           \
+    for (int row = 0; row < (rows); ++row)
+#define VECTOR(block) __local float *near_at = near + (row * NEAR_WIDTH + x - (block).x0 + NEAR_MARGIN);
+#else
+#define LINES ROWS
+#define FOR_VECTORS(block, margin, rows)                                                                               \
   const int x_first = (block).x0 - (margin), across = ((block).x1 - (block).x0 + 2 * (margin)) / LANES;                \
-  for (int i = get_local_id(0); i < ROWS * across; i += ITEMS)
+  for (int i = get_local_id(0); i < (rows) * across; i += ITEMS)
 #define VECTOR(block)                                                                                                  \
   const int row = ROWS == 1 ? 0 : i / across, x = x_first + (i - row * across) * LANES;                                \
   __local float *near_at = near + (row * NEAR_WIDTH + x - (block).x0 + NEAR_MARGIN);
-#define OUTSIDE(block, x, y) ((x) < 0 || (x) >= (block).stride || (y) >= (block).height)
+#endif
+#define OUTSIDE(block, x, y) ((x) < 0 || (x) >= (block).stride || (y) < 0 || (y) >= (block).height)
 
 // The taps of a window around the row y that are inside the image, one past the last in y.
 static inline int2 taps_inside(const Block block, const int y) {
@@ -86,7 +97,7 @@ static inline int2 taps_inside(const Block block, const int y) {
 // near = the vertical windows around y and the rows below: means of x and y, variances of x and y, covariance; 0
 // outside the image.
 static inline void moments(const Block block, const int margin, const int y, __local float *near) {
-  FOR_VECTORS(block, margin) {
+  FOR_VECTORS(block, margin, ROWS) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) {
       for (int field = 0; field < 5; ++field) STORE_NEAR((floatL)(0.0f), near_at + field * NEAR_FIELD);
@@ -118,11 +129,11 @@ static inline void moments(const Block block, const int margin, const int y, __l
   }
 }
 
-// near -> partials: dSSIM by the mean of x as far as it counts from the pixel in the middle, by the variance and by the
-// covariance, 0 right of the image. Returns the item's sum of SSIM over the block's own columns.
+// near -> partials: dSSIM by the mean of x as far as it counts from the pixel in the middle, twice that by the
+// variance, and by the covariance, 0 right of the image. Returns the item's sum of SSIM over the block's own columns.
 static inline float derivatives(const Block block, const int margin, const int y, __local float *near) {
   floatL total = (floatL)(0.0f);
-  FOR_VECTORS(block, margin) {
+  FOR_VECTORS(block, margin, LINES) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) continue;
     const uint here = PIXEL_AT(block, x, y + row);
@@ -156,7 +167,7 @@ static inline float derivatives(const Block block, const int margin, const int y
     if (x >= block.x0 && x < block.x1) total += inside ? ssim : zero;
     __global float *out = block.partials + PARTIALS_AT(block, x, y + row);
     STOREL(inside ? by_mean : zero, out);
-    STOREL(inside ? by_variance : zero, out + block.field);
+    STOREL(inside ? 2.0f * by_variance : zero, out + block.field);
     STOREL(inside ? by_covariance : zero, out + 2 * block.field);
   }
   return sumL(total);
@@ -165,7 +176,7 @@ static inline float derivatives(const Block block, const int margin, const int y
 // near = the partials' vertical windows, the first with what the pixels differ by from the one in the middle; image and
 // target; 0 outside the image.
 static inline void adjoint_moments(const Block block, const int margin, const int y, __local float *near) {
-  FOR_VECTORS(block, margin) {
+  FOR_VECTORS(block, margin, ROWS) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) {
       for (int field = 0; field < 5; ++field) STORE_NEAR((floatL)(0.0f), near_at + field * NEAR_FIELD);
@@ -183,7 +194,7 @@ static inline void adjoint_moments(const Block block, const int margin, const in
       const floatL p = LOADL(block.image + at) - p0, q = LOADL(block.target + at) - q0;
       const floatL w = (floatL)(window[tap]);
       const floatL v = w * LOADL(variances + in), c = w * LOADL(covariances + in);
-      by_mean = fmaL(w, LOADL(means + in), by_mean) - fmaL(2.0f * p, v, q * c);
+      by_mean = fmaL(w, LOADL(means + in), by_mean) - fmaL(p, v, q * c);
       by_variance += v;
       by_covariance += c;
     }
@@ -200,7 +211,7 @@ static inline void adjoint_moments(const Block block, const int margin, const in
 static inline float2 differences(const Block block, const int y, const float l1_scale, const float ssim_scale,
                                  __local float *near, __global float *gradient) {
   floatL absolute = (floatL)(0.0f), squares = absolute;
-  FOR_VECTORS(block, 0) {
+  FOR_VECTORS(block, 0, LINES) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) continue;
     const uint here = PIXEL_AT(block, x, y + row);
@@ -208,7 +219,7 @@ static inline float2 differences(const Block block, const int y, const float l1_
     floatL ssim = (floatL)(0.0f);
     for (int tap = 0; tap < TAPS; ++tap) {
       __local const float *in = near_at + (tap - REACH);
-      const floatL by_p = 2.0f * (p - LOAD_NEAR(in + 3 * NEAR_FIELD));
+      const floatL by_p = p - LOAD_NEAR(in + 3 * NEAR_FIELD);
       const floatL by_q = q - LOAD_NEAR(in + 4 * NEAR_FIELD);
       const floatL both = fmaL(by_q, LOAD_NEAR(in + 2 * NEAR_FIELD), LOAD_NEAR(in));
       ssim = fmaL((floatL)(window[tap]), fmaL(by_p, LOAD_NEAR(in + NEAR_FIELD), both), ssim);
@@ -246,17 +257,22 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
     block.x0 = index % across * columns, block.x1 = min(block.x0 + columns, stride);
     block.x_partials = block.x0 - MARGIN;
     __global float *ssims = sums + (size_t)height * across * channel + index % across;
-    int next = max(0, y0 - REACH); // the row whose derivatives come next
-    for (int y = y0; y < y1; ++y) {
-      for (; next < min(height, y + REACH + 1); ++next) {
+    int next = y0 - REACH; // the row whose derivatives come next, above the image too: so the ring has room for all
+    for (int y = y0; y < y1; y += ROWS) {
+      for (; next < min(height, y + ROWS + REACH); next += ROWS) {
         moments(block, 2 * MARGIN, next, near);
-        const float ssim = derivatives(block, MARGIN, next, near);
-        if (next >= y0 && next < y1) ssims[(size_t)across * next] = ssim;
+        for (int row = next; row < next + ROWS; ++row) {
+          const float ssim = derivatives(block, MARGIN, row, near + (row - next) * NEAR_WIDTH);
+          if (row >= y0 && row < y1) ssims[(size_t)across * row] = ssim;
+        }
       }
       adjoint_moments(block, MARGIN, y, near);
-      const float2 errors = differences(block, y, l1_scale, ssim_scale, near, gradient + (size_t)plane * channel);
-      ssims[kind + (size_t)across * y] = errors.x;
-      ssims[2 * kind + (size_t)across * y] = errors.y;
+      for (int row = y; row < min(y + ROWS, y1); ++row) {
+        const float2 errors = differences(block, row, l1_scale, ssim_scale, near + (row - y) * NEAR_WIDTH,
+                                          gradient + (size_t)plane * channel);
+        ssims[kind + (size_t)across * row] = errors.x;
+        ssims[2 * kind + (size_t)across * row] = errors.y;
+      }
     }
   }
 }

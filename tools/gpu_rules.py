@@ -262,17 +262,17 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     ),
     "ranges": (),
     "loss_ssim": (
-        Rule("FOR_VECTORS(block, margin)", _loss(2 * REACH), function=" moments("),
+        Rule("FOR_VECTORS(block, margin, ROWS)", _loss(2 * REACH), function=" moments("),
         Rule("for (int tap = 0; tap < taps.x; ++tap) beyond", _never),  # at the picture's edges
         Rule("for (int tap = taps.y; tap < TAPS; ++tap) beyond", _never),
         Rule("for (int tap = taps.x; tap < taps.y;", _loss(2 * REACH, WINDOW), mark=("global", 2)),
-        Rule("FOR_VECTORS(block, margin)", _loss(0), function=" derivatives("),
+        Rule("FOR_VECTORS(block, margin, LINES)", _loss(0), function=" derivatives("),
         Rule("for (int tap = 0; tap < TAPS; ++tap) {", _loss(0, WINDOW), mark=("shared", 5)),
     ),
     "loss_grad": (
-        Rule("FOR_VECTORS(block, margin)", _loss(2 * REACH)),
+        Rule("FOR_VECTORS(block, margin, ROWS)", _loss(2 * REACH)),
         Rule("for (int tap = taps.x; tap < taps.y;", _loss(2 * REACH, WINDOW), mark=("global", 5)),
-        Rule("FOR_VECTORS(block, 0)", _loss(0)),
+        Rule("FOR_VECTORS(block, 0, LINES)", _loss(0)),
     ),
     "project_step": (
         Rule(

@@ -10,12 +10,14 @@ from clsplat.config.marking import FRESH, UNWANTED, USELESS
 TILE = 16
 """Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
-LOSS_COLUMNS, LOSS_GROUP_COLUMNS = 1024, 32
-"""Most columns of a block of the loss, where a group is one item and where it has several: local memory holds five of
-its rows, or of as many as sixteen, in 32 KiB."""
+LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_COLUMNS = 2, 640, 32
+"""Rows of a block of the loss that a group of one item has under way, as their windows share pixels; most columns of
+a block where a group is one item and where it has several: local memory holds five of these rows, or of as many as
+sixteen, in 32 KiB."""
 
 LOSS_RING = 16
-"""Rows of derivatives that a group of one item keeps: a power of two, at least the window's 11."""
+"""Rows of derivatives that a group of one item keeps: a power of two, at least the window's 11 and all but one of
+LOSS_ROWS, up to a multiple of LOSS_ROWS."""
 
 POSE_ROWS = 64
 """Gaussians whose part in the gradient by a camera's pose is added up one behind the other."""
@@ -113,7 +115,8 @@ WIDEST_SLOTS = SlotFields(absolute=True, contributions=True, nearness=True)
 def header() -> str:
     """The declarations as OpenCL C."""
     lines = [f"#define TILE {TILE}", f"#define LOSS_RING {LOSS_RING}"]
-    lines += [f"#define LOSS_COLUMNS {LOSS_COLUMNS}", f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}"]
+    lines += [f"#define LOSS_ROWS {LOSS_ROWS}", f"#define LOSS_COLUMNS {LOSS_COLUMNS}"]
+    lines.append(f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}")
     lines.append(f"#define POSE_ROWS {POSE_ROWS}u")
     lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
     layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK, "DEEP": DEEP}
