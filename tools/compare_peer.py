@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A training step beside that of OpenSplat 1.2.0 (CPU), measured elsewhere, on the scenes that it was measured on.
 
-    python tools/compare_peer.py fox banana sceaux_castle --limit './limit 400000' [--device DEVICE] [--json]
+    python tools/compare_peer.py fox banana sceaux_castle --limit './limit 20000' [--device DEVICE] [--json]
     python tools/compare_peer.py fox --limit-gpairs 3.55
 
 The arguments are the scenes' folders (docs/quality.md says whence), with the sizes and starting points that the
@@ -11,10 +11,11 @@ does; the median of steps 3 to 30, wall time from an idle device to an idle devi
 
 The peer's seconds are carried over by what limits both machines: the (Gaussian, pixel) pairs a second that blending's
 arithmetic allows with everything in registers. It was 5.09 Gpairs/s where the peer was measured, on two cores with
-vectors of 16 lanes. --limit is a program that prints `... N Gpairs/s` for this machine, with its arguments; the best of
-three runs just before each scene counts. Build it for the vectors that the machine has: with wider ones it is too slow,
-and the peer would look slower than it is. For the same reason clsplat's own kernel of that limit is measured too, and
-counts where it is the faster. --limit-gpairs is a figure known already, and is taken as it is.
+vectors of 16 lanes. --limit is a program that prints `... N Gpairs/s` for this machine, with its arguments; it runs
+behind every other step, and the median counts, as of the steps: so neighbours on the machine slow both. Short runs do
+(20000 repetitions of limit.c). Build it for the vectors that the machine has: with wider ones it is too slow, and the
+peer would look slower than it is. For the same reason clsplat's own kernel of that limit is measured too, and counts
+where it is the faster. --limit-gpairs is a figure known already, and is taken as it is.
 """
 
 from __future__ import annotations
@@ -60,7 +61,6 @@ PEERS = {
 PEER_GPAIRS = 5.09
 """The limit where the peer was measured, 10^9 pairs a second."""
 FIRST, LAST = 3, 30
-LIMIT_RUNS = 3
 
 
 def open_scene(folder: Path) -> tuple[Scene, Peer]:
@@ -78,41 +78,43 @@ def open_scene(folder: Path) -> tuple[Scene, Peer]:
     return scene, peer
 
 
-def step_ms(scene: Scene, device: Device) -> float:
-    """Median milliseconds of a training step."""
+def step_and_limit(scene: Scene, device: Device, program: str | None) -> tuple[float, float | None]:
+    """Median milliseconds of a training step, and of the limit that the program prints between the steps, in Gpairs/s.
+    Raises InputError."""
     trainer = Trainer(scene, TrainConfig(warmup=()), device)
     for index in range(len(trainer.views)):
         trainer.photographs.load(index, 1)
-    times = [device.timed(trainer.train_step)[1] for _ in range(LAST)]
-    return statistics.median(times[FIRST - 1 :])
+    times, limits = [], []
+    for step in range(LAST):
+        times.append(device.timed(trainer.train_step)[1])
+        if program is not None and step % 2:
+            limits.append(limit_of(program))
+    return statistics.median(times[FIRST - 1 :]), statistics.median(limits) if limits else None
 
 
 def limit_of(program: str) -> float:
-    """Limit of this machine that the program prints, in Gpairs/s, the best of LIMIT_RUNS. Raises InputError."""
-    found = []
-    for _ in range(LIMIT_RUNS):
-        try:
-            done = subprocess.run(shlex.split(program), capture_output=True, text=True, check=True)
-        except (OSError, subprocess.CalledProcessError, ValueError, IndexError) as error:
-            raise InputError(f"--limit {program}: cannot be run ({error})") from None
-        match = re.search(r"([\d.]+) Gpairs/s", done.stdout)
-        require(match is not None, f"--limit {program}: printed {done.stdout.strip()!r}, expected N Gpairs/s in it")
-        assert match is not None
-        found.append(float(match[1]))
-    return max(found)
+    """Limit of this machine that the program prints, in Gpairs/s. Raises InputError."""
+    try:
+        done = subprocess.run(shlex.split(program), capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError, ValueError, IndexError) as error:
+        raise InputError(f"--limit {program}: cannot be run ({error})") from None
+    match = re.search(r"([\d.]+) Gpairs/s", done.stdout)
+    require(match is not None, f"--limit {program}: printed {done.stdout.strip()!r}, expected N Gpairs/s in it")
+    assert match is not None
+    return float(match[1])
 
 
 def measure(folder: Path, device: Device, program: str | None, known: float | None) -> Result:
     """A row of the table; seconds but for `ms`, limits in Gpairs/s."""
     scene, peer = open_scene(folder)
+    ms, printed = step_and_limit(scene, device, program)
     limits: dict[str, float] = {}
     if known is not None:
         limits["given"] = known
-    elif program is not None:
-        limits["program"] = limit_of(program)
+    elif printed is not None:
+        limits["program"] = printed
         limits["kernel"] = 1e-9 * measure_limits(device, copy_bytes=2**20).pairs_per_second
     limit = max(limits.values())
-    ms = step_ms(scene, device)
     scaled = peer.seconds * PEER_GPAIRS / limit
     return {
         "scene": scene.name,
@@ -162,6 +164,8 @@ def run(arguments: list[str]) -> int:
         require(0 < known < math.inf, f"--limit-gpairs {known}: expected more than 0")
     for folder in options.scenes:
         open_scene(folder)
+    if options.limit is not None:
+        limit_of(options.limit)  # a program that does not run is told before anything is measured
     device = open_device(options.device)
     rows = []
     for folder in options.scenes:

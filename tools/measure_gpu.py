@@ -42,8 +42,36 @@ LIMIT = 8 * 60
 STEPS = 7000
 PACK_LIMIT = 55_000_000
 """Bytes of an archive."""
-LEFT_OUT = ("pycolmap", "pocl-binary-distribution", "intel-opencl-rt")
-"""Packages that an archive goes without: structure from motion, and drivers for CPUs."""
+LEFT_OUT = (
+    *("pycolmap", "pocl-binary-distribution", "intel-opencl-rt"),
+    *("imageio", "markdown-it-py", "networkx", "pillow", "pygments", "tifffile", "zstandard"),
+)
+"""Packages that an archive goes without: structure from motion, drivers for CPUs, and what the parts never import: it
+serves formats that are not measured, and what else rich and scikit-image can do."""
+PARTS_USED = {
+    "scipy": (
+        "_lib",
+        "constants",
+        "fft",
+        "interpolate",
+        "linalg",
+        "ndimage",
+        "optimize",
+        "sparse",
+        "spatial",
+        "special",
+    ),
+    "skimage": ("_shared", "_vendored", "exposure", "metrics", "util"),
+}
+"""Folders of large packages that the parts import; an archive goes without the others."""
+IMPORTS = (
+    "clsplat.api",
+    "clsplat.cli.train",
+    "clsplat.evaluation.metrics",
+    "clsplat.bench.stages",
+    "clsplat.images.writing",
+)
+"""Modules that a whole archive can import, before it is written."""
 LIBRARIES = {
     "the GPU's own driver": ("libnvidia-opencl.so*", "libamdocl64.so*", "libigdrcl.so*"),
     "PoCL": ("libpocl.so*",),
@@ -287,8 +315,11 @@ def pack(archive: Path, scenes: Sequence[Path]) -> int:
             _copy_package(package, top / "packages")
         for scene in scenes:
             shutil.copytree(scene, top / "scenes" / scene.name)
-        stripped = [str(path) for path in (top / "packages").rglob("*.so*")]
+        libraries = (top / "packages").rglob("*.so*")
+        # those that a wheel brings beside its modules have been moved about in: strip makes them unreadable
+        stripped = [str(path) for path in libraries if not path.parent.name.endswith(".libs")]
         subprocess.run(["strip", "--strip-unneeded", *stripped], check=False, capture_output=True)
+        check_imports(top)
         version = sysconfig.get_python_version()
         (top / "measure").write_text(starter(version))
         subprocess.run(["tar", "-cJf", str(archive.resolve()), "-C", folder, "clsplat"], check=True)
@@ -298,6 +329,17 @@ def pack(archive: Path, scenes: Sequence[Path]) -> int:
         print(f"measure_gpu: {archive} is larger than {PACK_LIMIT / 1e6:g} MB: name smaller scenes", file=sys.stderr)
         return 1
     return 0
+
+
+def check_imports(top: Path) -> None:
+    """Raise RuntimeError where what an archive holds cannot be imported without anything else."""
+    words = f"import {', '.join(IMPORTS)}"
+    alone = {**os.environ, "PYTHONPATH": f"{top / 'packages'}{os.pathsep}{top}"}
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", words], env=alone, cwd=top, capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise RuntimeError(f"the packages of the archive are not enough: {done.stderr.strip().splitlines()[-1]}")
 
 
 def _packages(name: str) -> set[str]:
@@ -324,7 +366,13 @@ def _packages(name: str) -> set[str]:
 
 def _copy_package(name: str, target: Path) -> None:
     for entry in metadata.files(name) or ():
-        if ".." in entry.parts or "tests" in entry.parts or entry.suffix in (".pyi", ".pyc"):
+        used = PARTS_USED.get(entry.parts[0]) if len(entry.parts) > 2 else None
+        if (
+            ".." in entry.parts
+            or "tests" in entry.parts
+            or entry.suffix == ".pyc"
+            or (used and entry.parts[1] not in used)
+        ):
             continue
         source = Path(str(entry.locate()))
         if source.is_file():
@@ -346,7 +394,11 @@ def main(words: Sequence[str] | None = None) -> int:
         if not scene.is_dir():
             parser.error(f"{scene}: no such folder, expected a scene")
     if options.pack is not None:
-        return pack(options.pack, scenes)
+        try:
+            return pack(options.pack, scenes)
+        except RuntimeError as error:
+            print(f"measure_gpu: {error}", file=sys.stderr)
+            return 1
     if options.file is None:
         parser.error("the name of the JSON file is missing")
     if not options.file.parent.is_dir():

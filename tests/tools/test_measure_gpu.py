@@ -129,3 +129,9 @@ def test_the_script_of_an_archive(scenes: tuple[str, ...], words: tuple[str, ...
     folder, path, *got = done.stdout.strip().split("|")
     assert (folder, path, done.stderr) == (str(called_in), f"{top}/packages:{top}", "")
     assert got[-1 if "--scenes" in words else 1] == wanted.format(top=top) and "gpu.json" in got
+
+
+def test_an_archive_that_lacks_a_package_is_told(tmp_path: Path) -> None:
+    (tmp_path / "packages").mkdir()
+    with pytest.raises(RuntimeError, match=r"packages of the archive are not enough: .*No module named 'clsplat'"):
+        measure_gpu.check_imports(tmp_path)
