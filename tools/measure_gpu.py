@@ -12,7 +12,8 @@ bench-235k, bench-1m, bench-3m, and for each scene train-NAME (7000 steps, held-
 gsplat-NAME, where gsplat is installed.
 
 --pack makes an archive for a machine without a package index: this checkout, the packages that are installed here
-without pycolmap, tests and debugging symbols, and the scenes. There: tar xf gpu.tar.xz && sh clsplat/measure gpu.json.
+without tests and debugging symbols, in place of pycolmap one for pinhole cameras alone, and the scenes. There:
+tar xf gpu.tar.xz && sh clsplat/measure gpu.json.
 Exit status 0: all parts are there, 1: a part failed, 2: the call is wrong.
 """
 
@@ -315,6 +316,7 @@ def pack(archive: Path, scenes: Sequence[Path]) -> int:
             _copy_package(package, top / "packages")
         for scene in scenes:
             shutil.copytree(scene, top / "scenes" / scene.name)
+        shutil.copy2(ROOT / "tools" / "pinhole_pycolmap.py", top / "packages" / "pycolmap.py")
         libraries = (top / "packages").rglob("*.so*")
         # those that a wheel brings beside its modules have been moved about in: strip makes them unreadable
         stripped = [str(path) for path in libraries if not path.parent.name.endswith(".libs")]

@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import measure_gpu
+import numpy as np
+import pinhole_pycolmap
+import pycolmap
 import pytest
 from measure_gpu import Setting, find, libraries, measure, parts_of, starter
 
@@ -135,3 +138,21 @@ def test_an_archive_that_lacks_a_package_is_told(tmp_path: Path) -> None:
     (tmp_path / "packages").mkdir()
     with pytest.raises(RuntimeError, match=r"packages of the archive are not enough: .*No module named 'clsplat'"):
         measure_gpu.check_imports(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"), [("PINHOLE", (50.0, 60.0, 31.0, 23.5)), ("SIMPLE_PINHOLE", (55.0, 33.0, 24.0))]
+)
+def test_an_archives_cameras_are_those_of_pycolmap(model: str, params: tuple[float, ...]) -> None:
+    given = {"model": model, "width": 64, "height": 48, "params": list(params)}
+    here, there = pinhole_pycolmap.Camera(**given), pycolmap.Camera(**given)
+    for name in ("focal_length_x", "focal_length_y", "principal_point_x", "principal_point_y"):
+        assert getattr(here, name) == getattr(there, name)
+    for name in ("focal_length_idxs", "principal_point_idxs", "extra_params_idxs"):
+        assert list(getattr(here, name)()) == list(getattr(there, name)())
+    assert int(pinhole_pycolmap.CameraModelId[model]) == int(pycolmap.CameraModelId.__members__[model])
+    points = np.array([[0.3, -0.2, 2.0], [0.1, 0.4, -1.0], [-1.0, 0.5, 0.7]])
+    # the same divisions and products in another order: some roundings of float64
+    np.testing.assert_allclose(here.img_from_cam(points), there.img_from_cam(points), rtol=1e-14)
+    with pytest.raises(ValueError, match="OPENCV: an archive without pycolmap has pinhole cameras alone"):
+        pinhole_pycolmap.Camera("OPENCV", 64, 48, [])
