@@ -61,14 +61,17 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
         asked = camera_of_settings(stage)
         known = asked in [str(camera.GetPath()) for camera in cameras]
         camera = _find(path, cameras, prim or (asked if known else None))
-        where = f"{path}: {camera.GetPath()}"
+        place = camera.GetPath()
+        where = f"{path}: {place}"
         settings = read_settings(path, stage, camera)
         codes, authored = _time_codes(where, stage, camera)
         picture = _size(path, size, settings, _aperture(where, camera, codes[0]))
         per_second = float(stage.GetTimeCodesPerSecond())
 
         def moment(time: float) -> Camera:
-            return _camera(f"{where} at {time:g}", camera, time, picture, settings)
+            with readable(path):
+                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # the stage has to live as long as this function
+                return _camera(f"{where} at {time:g}", prim, time, picture, settings)
 
         frames = numbered(map(moment, codes), codes[0], None if len(codes) == 1 or per_second <= 0 else per_second)
         rate = per_second if 0 < per_second < math.inf else 0.0
