@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a stage says of a job's pictures, where no flag of `clsplat render` does."""
+"""A stage's part of a job's pictures, where no flag of `clsplat render` goes before it."""
 
 from __future__ import annotations
 

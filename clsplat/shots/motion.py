@@ -26,7 +26,7 @@ _SCALARS = ("fx", "fy", "cx", "cy", "near", "far")
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Cameras at the times that a frame is looked at, as its source has them: for processes without the source.
+    """Cameras of a frame, each at a time when it is looked at, taken from the source: for processes without it.
 
     first: the camera at the first time; times (T,): in frames from the frame, rising; values (T, 18): what differs from
     time to time, `_SCALARS`, rotation and translation.

@@ -39,7 +39,7 @@ class Optics:
         return replace(self, shutter=(0.0, 0.0), f_stop=0.0)
 
     def named(self) -> Iterator[str]:
-        """What of it would change a picture, by USD's names and with its values."""
+        """USD's names, with the values, of those that would change a picture."""
         if self.f_stop:
             yield f"fStop ({self.f_stop:g})"
             if self.focus:

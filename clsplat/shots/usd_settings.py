@@ -20,7 +20,7 @@ WHOLE = (0.0, 0.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class Settings:
-    """What a stage says of pictures. resolution: pixels, None where it is not authored; pixel_aspect: a pixel's width
+    """A stage's pictures. resolution: pixels, None where it is not authored; pixel_aspect: a pixel's width
     over its height; policy: of POLICIES; window: left, bottom, right and top of the pixels that are wanted, in frames
     from its lower left corner; instantaneous: the shutter closes as it opens; unapplied: what else is authored.
 
