@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from glob import escape, glob
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -222,6 +223,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
+    made += ("far",) if task.camera.far < inf else ()  # older frames of such a camera show what is beyond it
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
     return digest_of(cameras, made, encoding, colour, pictures.framing, used)
 
