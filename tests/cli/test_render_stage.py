@@ -118,6 +118,7 @@ def test_shake_with_eight_samples_a_frame(model: Path, tmp_path: Path) -> None:
     assert np.abs(still - whole).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_the_stages_lens_is_that_of_the_flags(model: Path, tmp_path: Path) -> None:
     """37.5 tenths of a unit at f/1 are a radius of 1.875 units."""
     stage = write_stage(tmp_path / "shot.usda", LENS)

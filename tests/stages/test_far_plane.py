@@ -30,7 +30,9 @@ def camera_of(kind: str) -> Camera:
     return replace(STRAIGHT, **KINDS[kind])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow if " " in kind or "equi" in kind else ()) for kind in KINDS]
+)
 def test_what_is_beyond_it_is_left_out(default_device: Device, kind: str) -> None:
     camera, renderer = camera_of(kind), Renderer(default_device)
     gaussians = replace(CLOUD, by_rays=camera.by_rays)
@@ -51,7 +53,7 @@ def test_what_is_beyond_it_is_left_out(default_device: Device, kind: str) -> Non
     np.testing.assert_array_equal(twin.image, of_kept.image)
 
 
-@pytest.mark.parametrize("kind", ["perspective", "fisheye"])
+@pytest.mark.parametrize("kind", ["perspective", pytest.param("fisheye", marks=pytest.mark.slow)])
 def test_without_one_no_bit_is_another(default_device: Device, kind: str) -> None:
     """Of a plane beyond what float32 has, too."""
     camera, renderer = camera_of(kind), Renderer(default_device)
