@@ -24,13 +24,21 @@ def with_stage(
 ) -> tuple[RenderOptions, tuple[str, ...]]:
     """The options with the stage's data window and the first frame's shutter and lens; and what of the stage they do
     not apply. Raises InputError for a data window without a pixel."""
-    pictures, unapplied = options.pictures, _lens_unapplied(options, tasks)
+    pictures, unapplied = options.pictures, (*_lens_unapplied(options, tasks), *_shape_unsaid(tasks[0]))
     if pictures.framing.region == "" and pictures.framing.overscan == "0" and shot.window not in (None, WHOLE):
         assert shot.window is not None
         changes = _framing(source, shot.window, tasks[0].camera.width, tasks[0].camera.height)
         unapplied += window_named(shot.window) if changes is None else ()
         pictures = replace(pictures, framing=replace(pictures.framing, **(changes or {})))
     return replace(options, pictures=replace(pictures, sampling=tasks[0].sampling or pictures.sampling)), unapplied
+
+
+def _shape_unsaid(task: Task) -> tuple[str, ...]:
+    """The shape of a stage's pixels where the file cannot say it, and is shown with square ones."""
+    shape, kind = task.camera.fy / task.camera.fx, task.path.suffix.lower()
+    if task.optics is None or kind == ".exr" or abs(shape - 1) < _SAME:
+        return ()
+    return (f"pixelAspectRatio ({shape:g}) in {kind} files, which show square pixels",)
 
 
 def _framing(

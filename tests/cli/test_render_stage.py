@@ -215,6 +215,13 @@ def test_one_warning_of_what_is_not_applied(model: Path, tmp_path: Path, capsys:
     assert warnings_of(capsys, model, unfocused, "--aperture 0") == []
 
 
+def test_pixels_that_a_file_shows_as_squares(model: Path, tmp_path: Path, capsys: Capture) -> None:
+    stage = write_stage(tmp_path / "shot.usda", settings="float pixelAspectRatio = 2")
+    assert warnings_of(capsys, model, stage) == []
+    (line,) = warnings_of(capsys, model, stage, f"-o {tmp_path}/c.####.png")
+    assert line.endswith(": not applied: pixelAspectRatio (2) in .png files, which show square pixels")
+
+
 def test_the_plan_and_errors(model: Path, tmp_path: Path, capsys: Capture) -> None:
     stage = write_stage(tmp_path / "shot.usda", LENS + SHUTTER)
     words = ["render", str(model), "--cameras", str(stage), "-o", str(tmp_path / "b.####.exr"), "--samples", "7"]
