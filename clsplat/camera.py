@@ -93,8 +93,8 @@ class Camera:
     projection, and what a pixel is a multiple of there (docs/cameras.md has the equations): perspective, x/z and y/z;
     orthographic, x and y, so 1 / fx is world units a pixel; fisheye (equidistant), the angle from the axis in radians;
     equirectangular, longitude and latitude in radians. near, far: depths in world units between which something is
-    seen; depth is z, for fisheye and equirectangular the distance. A near of NEAR, the default,
-    stands for the model's (`Gaussians.near`). Nothing applies `far` yet.
+    seen, by their means; depth is z, for fisheye and equirectangular the distance. A near of NEAR, the default,
+    stands for the model's (`Gaussians.near`).
 
     radial: k1 to k4 of a fisheye (Kannala and Brandt; OpenCV's and COLMAP's OPENCV_FISHEYE): the angle t from the axis
     is t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from it; 0 for the equidistant one.

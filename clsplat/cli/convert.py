@@ -301,7 +301,7 @@ def _thinned(verb: Convert, services: Services, gaussians: Gaussians) -> Gaussia
         keep("prune-opacity", edit.opaque(gaussians, verb.prune_opacity))
     if verb.prune_contribution is not None and verb.cameras is not None:
         shot = choose_shot(verb.cameras)
-        for text in shot.warnings:
+        for text in shot.told(verb.cameras):
             warn(text)
         contributions = largest_contributions(gaussians, shot.cameras, verb.device.trusted(services))
         keep("prune-contribution", contributions >= verb.prune_contribution)

@@ -196,6 +196,7 @@ def _read_job(verb: Render) -> Job:
     """All that can be checked without rendering. Raises InputError and DeviceError; writes nothing."""
     import clsplat
     from clsplat.cli.render_job import Job, check_pictures, resizer
+    from clsplat.cli.render_stage import with_stage
     from clsplat.gaussians import Gaussians
     from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
     from clsplat.images.frame_files import VIDEO
@@ -213,15 +214,16 @@ def _read_job(verb: Render) -> Job:
     resize = resizer(verb.width, verb.height, verb.scale)
     devices = _devices(verb)
     whole, gaussians = _whole_shot(verb)
+    whole = whole.without_optics() if verb.deep else whole
     chosen = whole if verb.frames is None else whole.only(verb.frames)
-    sampling = options.pictures.sampling
-    tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
+    tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, options.pictures.sampling)
+    options, unapplied = with_stage(options, verb.cameras, whole, tasks)
     check_pictures(tasks, options)
     existing.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
         check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
     _warn_of_unused(verb, options.channels)
-    for text in chosen.warnings:
+    for text in chosen.told(verb.cameras, *unapplied):
         warn(text)
     model = model_file(verb.model)
     gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else ()
@@ -299,7 +301,7 @@ def _options(verb: Render) -> RenderOptions:
     from clsplat.sequence.task import RenderOptions
 
     pictures = PictureConfig(for_workers(verb.colour), verb.framing, verb.sampling)
-    pictures.check()
+    pictures.check(whole=False)
     video = Path(verb.output).suffix.lower() == VIDEO
     channels = parse_channels(f"{verb.channels},alpha" if verb.alpha or verb.deep else verb.channels)
     check_format(verb.output, channels, video=True)

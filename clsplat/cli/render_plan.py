@@ -22,7 +22,7 @@ from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import held_sh
 from clsplat.sequence import workers
-from clsplat.sequence.task import picture_camera
+from clsplat.sequence.task import picture_camera, sampling_of
 from clsplat.shots.frame_numbers import ranges
 from clsplat.stages.deep import DEEP_FLOATS
 
@@ -67,7 +67,7 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
         "deep_bins": options.deep.bins if options.deep else 0,
         "model_colorspace": model,
         "colorspace": output,
-        "samples": options.pictures.sampling.samples if options.pictures.sampling.on else 1,
+        "samples": max(own.samples if own.on else 1 for own in (sampling_of(task, options) for task in tasks)),
         "supersample": options.pictures.framing.supersample,
         **({"fps": job.video.fps or FPS} if job.is_video else {}),
         "frames": frames,
@@ -147,7 +147,7 @@ def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _samples(job: Job) -> str:
-    sampling, framing = job.options.pictures.sampling, job.options.pictures.framing
+    sampling, framing = sampling_of(job.tasks[0], job.options), job.options.pictures.framing
     words = [f"{sampling.samples} frames for one" if sampling.on else ""]
     if sampling.moves:
         opens, closes = sampling.shutter

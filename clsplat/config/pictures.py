@@ -17,6 +17,8 @@ STRIP_PIXELS = 1 << 24
 """Pixels that are on the host at once, before filtering: about a gigabyte with every layer."""
 DEEP_STRIP_FLOATS = 1 << 26
 """Floats for the slices of a deep picture's strip: 256 MiB."""
+SENSOR_WIDTH = 36.0
+"""Millimetres of a picture's width, where nothing says otherwise."""
 _MOST_SUPERSAMPLES = 64
 _MOST_SAMPLES = 4096
 _MOST_BINS = 256
@@ -91,9 +93,9 @@ class SamplingConfig:
     samples: int = 16
     """Pictures that are rendered and averaged for each frame with motion blur or depth of field; more are smoother and
     take as much longer."""
-    shutter_angle: float = 0.0
+    shutter_angle: float | None = None
     """Motion blur: how long the shutter is open, half before the frame and half after it, in degrees of which 360 are
-    from frame to frame; 0 is none."""
+    from frame to frame; 0 is none. If not given: the shutter of a USD stage, else none."""
     shutter_open: float | None = None
     """Opening of the shutter, in frames from the frame, such as -0.25; in place of --shutter-angle, with
     --shutter-close."""
@@ -101,23 +103,27 @@ class SamplingConfig:
     """Closing of the shutter, in frames from the frame, such as 0.25."""
     f_stop: float | None = None
     """Depth of field: the f-number of a lens, such as 2.8, its focal length that of the camera on a sensor of
-    --sensor-width. If neither this nor --aperture is given, everything is in focus. Wants --focus."""
-    aperture: float = 0.0
+    --sensor-width. If neither this nor --aperture is given: the lens of a USD stage, else everything is in focus.
+    Wants --focus."""
+    aperture: float | None = None
     """Depth of field: the radius of the lens in the scene's units, in place of --f-stop; 0 is none. Wants --focus."""
-    focus: float = 0.0
-    """Depth that is in focus, along the camera's axis in the scene's units, for --f-stop and --aperture."""
-    sensor_width: float = 36.0
-    """Millimetres that the picture's width is on the sensor, for --f-stop."""
-    metres: float = 1.0
-    """Metres that a unit of the scene is, for --f-stop."""
+    focus: float | None = None
+    """Depth that is in focus, along the camera's axis in the scene's units, for --f-stop and --aperture; if not given
+    that of a USD stage."""
+    sensor_width: float | None = None
+    """Millimetres that the picture's width is on the sensor, for --f-stop; if not given that of a USD stage, else
+    36."""
+    metres: float | None = None
+    """Metres that a unit of the scene is, for --f-stop; if not given that of a USD stage, else 1."""
 
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
+    def check(self, *, whole: bool = True) -> None:
+        """Raise InputError naming the first setting whose value makes no sense. whole: False for flags that a stage
+        may add the focus to."""
         rules: tuple[Rule, ...] = (
             (("samples",), lambda value: 1 <= value <= _MOST_SAMPLES, f"1 to {_MOST_SAMPLES}"),
-            (("shutter_angle",), lambda value: 0 <= value <= 3600, "0 to 3600 degrees"),
+            (("shutter_angle",), lambda value: value is None or 0 <= value <= 3600, "0 to 3600 degrees"),
             (("f_stop", "sensor_width", "metres"), lambda value: value is None or 0 < value < inf, "a number above 0"),
-            (("aperture",), lambda value: 0 <= value < inf, "a radius of at least 0"),
+            (("aperture",), lambda value: value is None or 0 <= value < inf, "a radius of at least 0"),
         )
         check_rules(self, "--", rules)
         if self.shutter_open is not None or self.shutter_close is not None:
@@ -126,21 +132,23 @@ class SamplingConfig:
             if (
                 self.shutter_open is None
                 or self.shutter_close is None
-                or not (-inf < self.shutter_open < self.shutter_close < inf)
+                or not (-inf < self.shutter_open <= self.shutter_close < inf)
+                or (self.shutter_open == self.shutter_close and not whole)
             ):
                 times = f"--shutter-open {self.shutter_open} --shutter-close {self.shutter_close}"
                 raise InputError(f"{times}: expected two times, the second after the first")
         if self.aperture and self.f_stop is not None:
             raise InputError("--aperture and --f-stop exclude each other: both are the size of the lens")
-        if self.has_lens and not 0 < self.focus < inf:
-            raise InputError(f"--focus {self.focus}: expected the depth that is in focus, above 0")
+        if self.has_lens and not (0 < (self.focus or 0.0) < inf) and (whole or self.focus is not None):
+            raise InputError(f"--focus {self.focus or 0.0}: expected the depth that is in focus, above 0")
 
     @property
     def shutter(self) -> tuple[float, float]:
         """Opening and closing of the shutter, in frames from the frame."""
         if self.shutter_open is not None and self.shutter_close is not None:
             return self.shutter_open, self.shutter_close
-        return -self.shutter_angle / 720, self.shutter_angle / 720
+        half = (self.shutter_angle or 0.0) / 720
+        return -half, half
 
     @property
     def middle(self) -> float:
@@ -156,7 +164,7 @@ class SamplingConfig:
     @property
     def has_lens(self) -> bool:
         """True if the camera is more than a pinhole."""
-        return self.aperture > 0 or self.f_stop is not None
+        return bool(self.aperture) or self.f_stop is not None
 
     @property
     def on(self) -> bool:
@@ -172,10 +180,10 @@ class PictureConfig:
     framing: FramingConfig = field(default_factory=FramingConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
 
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
+    def check(self, *, whole: bool = True) -> None:
+        """Raise InputError naming the first setting whose value makes no sense. whole: as of `SamplingConfig.check`."""
         self.framing.check()
-        self.sampling.check()
+        self.sampling.check(whole=whole)
 
     def check_deep(self) -> None:
         """Raise InputError for what deep pictures have not."""

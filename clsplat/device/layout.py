@@ -32,9 +32,9 @@ _ROUNDED = (*_TRANSFORM, *("XMIN", "XMAX", "YMIN", "YMAX"), *("PX", "PY", "PZ"))
 
 _LENS = ("K1", "K2", "K3", "K4", "FOLD", "FOLD_RADIUS")
 
-CAMERA = (*_ROUNDED, "NEAR", "HAND", "WINDOW_X", "WINDOW_Y", *_LENS, *(f"{name}_LOW" for name in _ROUNDED))
-"""A camera: `cam_from_world`, intrinsics, the limits of x/z and y/z in the Jacobian, its centre; near plane; 1, or -1
-where its rotation is a reflection; the first pixel in its frame (`Camera.window`); a fisheye's
+CAMERA = (*_ROUNDED, "NEAR", "FAR", "HAND", "WINDOW_X", "WINDOW_Y", *_LENS, *(f"{name}_LOW" for name in _ROUNDED))
+"""A camera: `cam_from_world`, intrinsics, the limits of x/z and y/z in the Jacobian, its centre; near and far plane;
+1, or -1 where its rotation is a reflection; the first pixel in its frame (`Camera.window`); a fisheye's
 coefficients, and the angle and the distance from the axis that it shows; and what the rounding of them to
 float32 left, so that a mean's place on the image is good to 1e-6 pixels, and a needle's ellipse to 1e-4."""
 

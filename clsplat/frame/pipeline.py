@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import PictureConfig
+from clsplat.config.pictures import PictureConfig, SamplingConfig
 from clsplat.frame.draw import Draw, Planes, drawn_by
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.gaussians import Gaussians
@@ -43,36 +43,38 @@ class FramePipeline:
         self._renderer, self._gaussians, self._background = renderer, gaussians, background
 
     def draw(
-        self, at: Callable[[float], Camera], after: Camera | None = None
+        self, at: Callable[[float], Camera], after: Camera | None = None, sampling: SamplingConfig | None = None
     ) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a camera that says size and window, of the picture or a strip of it; and the conversion that
         makes its planes the file's, which needs no device.
 
         at: the camera of the whole frame, in its final size, at a time in frames from the frame: 0 if nothing moves;
-        after: that of the next frame, for motion.
+        after: that of the next frame, for motion; sampling: of this frame, else that of all.
         """
+        sampling = sampling or self.config.sampling
         config, colours, space = self.config, self.colours, self.colours.model
         draw = drawn_by(self._renderer, self._gaussians, self._background, after)
-        if config.sampling.on or config.framing.supersample > 1:
+        if sampling.on or config.framing.supersample > 1:
             space, drawn = colours.light, draw
 
             def in_light(camera: Camera, names: Collection[str]) -> Planes:
                 return converted(drawn(camera, names), colours, colours.model, colours.light)
 
             draw = supersampled(in_light, config.framing)
-        if config.sampling.on:
-            draw = sampled(draw, *sample_cameras(at, config.sampling))
+        if sampling.on:
+            draw = sampled(draw, *sample_cameras(at, sampling))
         return draw, lambda planes: converted(planes, colours, space, colours.output)
 
-    def is_blank(self, planes: Planes) -> bool | None:
+    def is_blank(self, planes: Planes, sampling: SamplingConfig | None = None) -> bool | None:
         """True if planes of `draw`, not converted, show nothing but the background, None where none of them tells."""
+        sampling = sampling or self.config.sampling
         for name in ("alpha", "count", "depth"):
             if name in planes:
                 return not planes[name].any()
         if "rgb" not in planes:
             return None
         behind = np.array(self._background, np.float32).reshape(1, 1, 3)
-        if self.config.sampling.on or self.config.framing.supersample > 1:
+        if sampling.on or self.config.framing.supersample > 1:
             behind = self.colours.convert(behind, None, self.colours.model, self.colours.light)
         return bool(np.abs(planes["rgb"] - behind).max() <= UNSEEN)
 

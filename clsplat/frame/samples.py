@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
-from clsplat.config.pictures import Filter, FramingConfig, SamplingConfig
+from clsplat.config.pictures import SENSOR_WIDTH, Filter, FramingConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, in_two
+from clsplat.frame.times import shutter_times
 from clsplat.frame.window import crop, reframed
 
 _RADII: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
@@ -80,16 +81,6 @@ def supersampled(draw: Draw, config: FramingConfig) -> Draw:
     return in_two(filtered, draw)
 
 
-def sample_times(count: int) -> Float64:
-    """`count` times in (0, 1), each in an interval of its own, in an order that has nothing to do with the lens's
-    (ranks of van der Corput's sequence)."""
-    index, radical, digit = np.arange(count), np.zeros(count), 0.5
-    while index.any():
-        radical += digit * (index & 1)
-        index, digit = index >> 1, digit / 2
-    return np.asarray((np.argsort(np.argsort(radical)) + 0.5) / count)
-
-
 def lens_points(count: int) -> Float64:
     """(count, 2) on the unit disc, each for as much of its area (Vogel's spiral)."""
     index = np.arange(count)
@@ -100,8 +91,8 @@ def lens_points(count: int) -> Float64:
 def lens_radius(camera: Camera, config: SamplingConfig) -> float:
     """Radius of the lens in the scene's units; camera: of a whole frame."""
     if config.f_stop is None:
-        return config.aperture
-    focal_length = camera.fx * config.sensor_width / camera.width / 1000 / config.metres
+        return config.aperture or 0.0
+    focal_length = camera.fx * (config.sensor_width or SENSOR_WIDTH) / camera.width / 1000 / (config.metres or 1.0)
     return focal_length / (2 * config.f_stop)
 
 
@@ -123,15 +114,14 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
 
     at: the camera at a time in frames from the frame, such as `Shot.at` gives; one sample is the middle itself.
     """
-    begin, end = config.shutter
     middle = at(config.middle)
     if not config.on or config.samples == 1:
         return middle, [middle]
-    times = begin + (end - begin) * sample_times(config.samples)
-    cameras = [at(float(time)) for time in times] if config.moves else [middle] * config.samples
+    cameras = [at(time) for time in shutter_times(config)] if config.moves else [middle] * config.samples
     if config.has_lens:
+        focus = config.focus or 0.0
         cameras = [
-            through_lens(camera, lens_radius(camera, config) * x, lens_radius(camera, config) * y, config.focus)
+            through_lens(camera, lens_radius(camera, config) * x, lens_radius(camera, config) * y, focus)
             for camera, (x, y) in zip(cameras, lens_points(config.samples).tolist(), strict=True)
         ]
     return middle, cameras

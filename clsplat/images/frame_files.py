@@ -43,13 +43,15 @@ VIDEO = ".mp4"
 @dataclass(frozen=True, eq=False)
 class Header:
     """Contents of a file beside pixels; window: None where the picture is the display window; chromaticities: x and y
-    of red, green, blue and white, none where they are not known; is_srgb: True if the colours are sRGB's."""
+    of red, green, blue and white, none where they are not known; is_srgb: True if the colours are sRGB's; typed:
+    attributes of EXR, with OpenImageIO's names of their types."""
 
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
     matrices: Mapping[str, Float64] = field(default_factory=dict)
     window: Window | None = None
     chromaticities: Sequence[float] = ()
     is_srgb: bool = True
+    typed: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
@@ -283,6 +285,8 @@ def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[An
         spec.alpha_channel = names.index("A")
     for name, matrix in header.matrices.items():
         spec.attribute(name, oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
+    for name, (kind, value) in header.typed.items():
+        spec.attribute(name, oiio.TypeDesc(kind), value)
     return spec
 
 

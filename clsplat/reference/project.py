@@ -225,7 +225,11 @@ def project(
         colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]))
 
         visible = (
-            (z > max(camera.near, 0.0)) & (opacities > ALPHA_MIN) & (det > 0) & (colors < COLOUR_LIMIT).all(axis=1)
+            (z > max(camera.near, 0.0))
+            & (z < camera.far)
+            & (opacities > ALPHA_MIN)
+            & (det > 0)
+            & (colors < COLOUR_LIMIT).all(axis=1)
         )
         for values in (means2d, whitening, conics, half_extents, colors):
             visible &= np.isfinite(values).all(axis=1)

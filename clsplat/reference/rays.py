@@ -104,7 +104,8 @@ def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
         opacities = opacities * compensation(np.linalg.det(plain), np.linalg.det(covariances))
     basis = sh_basis(view_directions(means, camera)[0], gaussians.sh_degree)
     colors = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, arrays["sh"][:, : basis.shape[1]]))
-    visible = ((p[:, 2] if camera.kind.flat else depths) > camera.near) & (opacities > ALPHA_MIN)
+    along = p[:, 2] if camera.kind.flat else depths
+    visible = (along > camera.near) & (along < camera.far) & (opacities > ALPHA_MIN)
     if any(camera.radial):
         visible &= np.arctan2(np.hypot(p[:, 0], p[:, 1]), p[:, 2]) < camera.fold[0]
     rays = np.nan_to_num(cam_from_pixel(camera, pixel_grid(camera))[1])

@@ -22,7 +22,7 @@ from clsplat.models.edit import exposed
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, RAYS
 from clsplat.selftest.trust import require
-from clsplat.sequence.task import RenderOptions, Task, camera_after, header, picture_camera
+from clsplat.sequence.task import RenderOptions, Task, camera_after, header, picture_camera, sampling_of
 
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
@@ -85,21 +85,22 @@ class FrameRenderer:
             above = header(task, options)
             empty = write_deep(task.path, *model, camera, options.deep, encoding, above, pipeline.colours)
             return RenderedFrame(None, time.monotonic() - start, measured={"blank": empty})
-        draw, finish = pipeline.draw(task.at, camera_after(task, options))
+        sampling = sampling_of(task, options)
+        draw, finish = pipeline.draw(task.at, camera_after(task, options), sampling)
         rows = self._rows(camera)
         if rows < camera.height and not task.is_video:
             blanks: list[bool | None] = []
 
             def finished(strip: Camera, names: Collection[str]) -> Planes:
                 planes = draw(strip, names)
-                blanks.append(pipeline.is_blank(planes))
+                blanks.append(pipeline.is_blank(planes, sampling))
                 return finish(planes)
 
             write_in_strips(task.path, finished, camera, names, rows, encoding, header(task, options))
             nothing = None if None in blanks else all(blanks)
             return RenderedFrame(None, time.monotonic() - start, measured={"blank": nothing})
         planes = in_strips(draw, rows)(camera, names)
-        blank = pipeline.is_blank(planes)
+        blank = pipeline.is_blank(planes, sampling)
         return RenderedFrame(planes, time.monotonic() - start, finish, {"blank": blank})
 
     def _trust(self, camera: Camera) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from glob import escape, glob
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,16 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.files import digest, is_file
+from clsplat.frame.times import shutter_times
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.images.frame_files import VIDEO, Header, camera_matrices
 from clsplat.shots import Shot
 from clsplat.shots.frame_numbers import output_paths
+from clsplat.shots.motion import Moments, continued, moments, stretches
 from clsplat.shots.motion import camera_after as following
-from clsplat.shots.motion import stretches
+from clsplat.shots.optics import Optics, headers, settled
 
 SETTINGS = "clsplat:settings"
 """The attribute of EXR and PNG files that holds it."""
@@ -60,7 +63,8 @@ class Record:
 class Task:
     """A frame to be rendered. number, name: as `shots.Frame`; camera: of the whole frame, in its final size; after: the
     camera that motion goes to, of the same size, where motion is asked for; stretch: where the camera is while the
-    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`.
+    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`; sampling: shutter and
+    lens, None for those of all; optics: what a stage has of them.
     """
 
     number: int
@@ -68,8 +72,10 @@ class Task:
     camera: Camera
     path: Path
     after: Camera | None = None
-    stretch: Shot | None = None
+    stretch: Shot | Moments | None = None
     before: tuple[int, ...] | None = None
+    sampling: SamplingConfig | None = None
+    optics: Optics | None = None
 
     def at(self, time: float) -> Camera:
         """The camera of the whole frame at a time in frames from the frame."""
@@ -107,17 +113,41 @@ def make_tasks(
         paths = [Path(pattern)] * len(chosen.frames)
     else:
         paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
-    stretch = stretches(whole, resize, *sampling.shutter, motion=motion) if sampling.moves else lambda number: None
+    moves = sampling.moves and whole.moment is None
+    stretch = stretches(whole, resize, *sampling.shutter, motion=motion) if moves else lambda number: None
     tasks = []
     for frame, path in zip(chosen.frames, paths, strict=True):
         camera = resize(frame.camera)
-        if sampling.has_lens and camera.projection != "perspective":
+        own = settled(sampling, frame.optics, camera)
+        own.check()
+        if own.has_lens and camera.projection != "perspective":
             raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
         after = None
         if motion:
             after = resize(following(whole, indices[frame.number])).resized(camera.width, camera.height)
-        tasks.append(Task(frame.number, frame.name, camera, path, after, stretch(frame.number)))
+        looked_at: Shot | Moments | None = stretch(frame.number)
+        if whole.moment is not None and own.shutter != (0.0, 0.0):
+            times = [own.middle, *own.shutter, *(shutter_times(own) if own.moves else ())]
+            looked_at = moments(whole, resize, frame.number, times)
+            if motion:
+                after = _after_middle(whole, resize, frame.number, own.middle)
+        more = (own, frame.optics) if frame.optics is not None else ()
+        tasks.append(Task(frame.number, frame.name, camera, path, after, looked_at, None, *more))
     return tasks
+
+
+def _after_middle(shot: Shot, resize: Callable[[Camera], Camera], number: int, middle: float) -> Camera:
+    """The camera a frame after the middle of the shutter; after the shot's last frame it goes on as it did."""
+    assert shot.moment is not None
+    time = number + middle
+    if time + 1 <= shot.frames[-1].number or len(shot.frames) == 1:
+        return resize(shot.moment(time + 1))
+    return continued(resize(shot.moment(time - 1)), resize(shot.moment(time)))
+
+
+def sampling_of(task: Task, options: RenderOptions) -> SamplingConfig:
+    """Shutter and lens of a frame."""
+    return task.sampling or options.pictures.sampling
 
 
 @dataclass(frozen=True)
@@ -143,13 +173,14 @@ def picture_camera(task: Task, options: RenderOptions) -> Camera:
 
     Raises InputError for a region that is not in the frame.
     """
-    return framed(task.at(options.pictures.sampling.middle), options.pictures.framing)
+    return framed(task.at(sampling_of(task, options).middle), options.pictures.framing)
 
 
 def camera_after(task: Task, options: RenderOptions) -> Camera | None:
     """The camera of the whole frame that motion goes to: a frame later than the middle of the shutter."""
-    middle = options.pictures.sampling.middle
-    return task.after if middle == 0 or task.after is None else task.at(middle + 1)
+    middle = sampling_of(task, options).middle
+    still = middle == 0 or task.after is None or isinstance(task.stretch, Moments)
+    return task.after if still else task.at(middle + 1)
 
 
 def plain(value: Any) -> Any:
@@ -179,19 +210,22 @@ def digest_of(*parts: Any) -> str:
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
     """Digest of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer."""
-    pictures = options.pictures
+    pictures, sampling = options.pictures, sampling_of(task, options)
     encoding = {name: getattr(options.encoding, name) for name in _ENCODED.get(task.path.suffix.lower(), ())}
-    cameras = [picture_camera(task, options)]
+    cameras: list[Camera | Moments] = [picture_camera(task, options)]
     if "motion" in options.channels and (after := camera_after(task, options)) is not None:
         cameras.append(after)
-    if pictures.sampling.moves:
-        opens, closes = pictures.sampling.shutter
+    if sampling.moves and isinstance(task.stretch, Moments):
+        cameras.append(task.stretch)
+    elif sampling.moves:
+        opens, closes = sampling.shutter
         cameras += [task.at(opens + (closes - opens) * part / 4) for part in range(5)]
-    sampling = pictures.sampling if pictures.sampling.on else None
+    used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
+    made += ("far",) if task.camera.far < inf else ()  # older frames of such a camera show what is beyond it
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
-    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling)
+    return digest_of(cameras, made, encoding, colour, pictures.framing, used)
 
 
 def _content(source: str) -> str:
@@ -234,4 +268,6 @@ def header(task: Task, options: RenderOptions) -> Header:
         return Header(attributes, matrices, is_srgb=space == SRGB)
     if "clsplat:colorspace" in attributes and (name := INTEROP.get(space)):
         attributes["colorInteropID"] = name
-    return Header(attributes, matrices, camera.window, chromaticities=CHROMATICITIES.get(space, ()))
+    sampling = sampling_of(task, options)
+    typed = headers(task.at(sampling.middle), task.number, task.optics, sampling)
+    return Header(attributes, matrices, camera.window, chromaticities=CHROMATICITIES.get(space, ()), typed=typed)

@@ -29,7 +29,7 @@ from clsplat.images.video import VideoWriter, frame_planes, video_writer
 from clsplat.sequence.existing import MOST_WRITERS
 from clsplat.sequence.frame_renderer import RenderedFrame, RenderFrame
 from clsplat.sequence.sharing import FrameQueue, Sharing
-from clsplat.sequence.task import Record, RenderOptions, Task, header, picture_camera
+from clsplat.sequence.task import Record, RenderOptions, Task, header, picture_camera, sampling_of
 
 YuvPlanes = NDArray[np.uint8]
 Result = tuple[Record, YuvPlanes | None]
@@ -68,7 +68,7 @@ def frame_bytes(task: Task, options: RenderOptions) -> int:
     if options.deep is not None:
         return COPIES * 4 * min(len(DEEP) * options.deep.bins * pixels, DEEP_STRIP_FLOATS)
     floats = sum(len(CHANNELS[name].names) for name in options.channels)
-    light = 4 if options.pictures.sampling.on or finer > 1 else 0
+    light = 4 if sampling_of(task, options).on or finer > 1 else 0
     return 4 * pixels * (COPIES * floats + light * (finer if finer > 1 else 2))
 
 

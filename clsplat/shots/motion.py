@@ -1,19 +1,78 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of a shot around a frame's own: the next frame's, and those around the shutter's time."""
+"""Cameras of a shot around a frame's own: the next frame's, and those of the shutter's time."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import ceil
+from typing import Any
 
+import numpy as np
+
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.shots import Frame, Shot
 
 AROUND = 2
 """Frames on each side of a time that say where the camera is then: a segment's end, and what its tangent looks at."""
+
+
+_SCALARS = ("fx", "fy", "cx", "cy", "near", "far")
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Cameras of a frame, each at a time when it is looked at, taken from the source: for processes without it.
+
+    first: the camera at the first time; times (T,): in frames from the frame, rising; values (T, 18): what differs from
+    time to time, `_SCALARS`, rotation and translation.
+    """
+
+    first: Camera
+    times: Float64
+    values: Float64
+
+    @classmethod
+    def of(cls, moment: Callable[[float], Camera], times: Iterable[float]) -> Moments:
+        """The camera at each of the times. Raises InputError where they are of several projections."""
+        rising = np.unique(np.array(list(times), np.float64))
+        cameras = [moment(float(time)) for time in rising]
+        for time, camera in zip(rising, cameras, strict=True):
+            if camera.projection != cameras[0].projection:
+                raise InputError(
+                    f"an open shutter: the camera is {cameras[0].projection} {rising[0]:g} frames from the frame and "
+                    f"{camera.projection} {time:g} frames from it, expected one camera"
+                )
+        return cls(cameras[0], rising, np.array([_values(camera) for camera in cameras]))
+
+    @cached_property
+    def _rows(self) -> dict[float, int]:
+        return {float(time): row for row, time in enumerate(self.times)}
+
+    def at(self, time: float) -> Camera:
+        """The camera at one of the times. Raises KeyError for another."""
+        values = self.values[self._rows[time]]
+        scalars: dict[str, Any] = dict(zip(_SCALARS, values[:6].tolist(), strict=True))
+        return replace(self.first, **scalars, rotation=values[6:15].reshape(3, 3), translation=values[15:])
+
+
+def _values(camera: Camera) -> Float64:
+    return np.concatenate([[getattr(camera, name) for name in _SCALARS], camera.rotation.ravel(), camera.translation])
+
+
+def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, times: Iterable[float]) -> Moments:
+    """The cameras of a shot that has one for each moment, at those times in frames from the frame of that number, and
+    at the times between the first and the last of them that the source has values for."""
+    assert shot.moment is not None
+    moment, wanted = shot.moment, list(times)
+    begin = bisect_left(shot.authored, number + min(wanted))
+    end = bisect_right(shot.authored, number + max(wanted))
+    wanted += [time - number for time in shot.authored[begin:end]]
+    return Moments.of(lambda time: resize(moment(number + time)), wanted)
 
 
 def camera_after(shot: Shot, index: int) -> Camera:

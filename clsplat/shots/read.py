@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from clsplat.camera import Camera
@@ -20,6 +18,7 @@ from clsplat.shots.generated import PATHS
 from clsplat.shots.nerfstudio import read_camera_path
 from clsplat.shots.shot import MOST_FRAMES, Frame, Shot, named, numbered
 from clsplat.shots.usd import read_usd
+from clsplat.shots.usd_settings import window_named
 from clsplat.shots.viewpoints import COLMAP_UP
 
 COUNT = 120
@@ -82,11 +81,9 @@ def choose_shot(
             raise InputError(
                 f"{cameras}: its cameras are {first.projection}, --path needs perspective or orthographic ones"
             )
-        shot = Shot(_path(path, shot.cameras, count), shot.warnings, unapplied=shot.unapplied)
-    far = min(frame.camera.far for frame in shot.frames)
-    unapplied = (*((f"far plane ({far:g})",) if far < math.inf else ()), *shot.unapplied)
-    if unapplied:
-        shot = replace(shot, warnings=(*shot.warnings, f"{cameras}: not applied: {', '.join(unapplied)}"))
+        shot = shot.without_optics()
+        unapplied = (*shot.unapplied, *window_named(shot.window))
+        shot = Shot(_path(path, shot.cameras, count), shot.warnings, unapplied=unapplied)
     return shot
 
 

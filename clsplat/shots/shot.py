@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import ceil, floor, isfinite
@@ -12,6 +12,7 @@ from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.shots.frame_numbers import parse_frames, ranges
 from clsplat.shots.keys import Key, interpolate
+from clsplat.shots.optics import Optics
 
 MOST_FRAMES = 100_000
 """Most frames of a shot: over an hour at 24 a second. More are a slip of the keyboard, and would be
@@ -21,23 +22,29 @@ gigabytes of cameras from a file of few lines."""
 @dataclass(frozen=True, eq=False)
 class Frame:
     """number: what `--frames` and `####` mean; name: what `{name}` means, a picture's path or the number in four
-    digits; time: seconds from the first frame, where the source has any."""
+    digits; time: seconds from the first frame, where the source has any; optics: of a stage, shutter and lens."""
 
     number: int
     camera: Camera
     name: str
     time: float | None = None
+    optics: Optics | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
     """frames: numbers rise; warnings: a line each, for the user; fps: frames a second, where the source says it;
-    unapplied: what the source has and no frame shows."""
+    unapplied: what the source has and no frame shows; moment: the camera at a time in frames, where the source has one
+    for each; authored: the times, rising, that it has values for; window: part of the frame that it wants, as
+    `usd_settings.Settings`."""
 
     frames: tuple[Frame, ...]
     warnings: tuple[str, ...] = ()
     fps: float | None = None
     unapplied: tuple[str, ...] = ()
+    moment: Callable[[float], Camera] | None = None
+    authored: tuple[float, ...] = ()
+    window: tuple[float, float, float, float] | None = None
 
     @property
     def cameras(self) -> list[Camera]:
@@ -60,6 +67,19 @@ class Shot:
         if missing:
             warnings += (f"--frames {text}: {len(missing)} of these frames do not exist; {have}",)
         return replace(self, frames=tuple(frame for frame in self.frames if frame.number in asked), warnings=warnings)
+
+    def without_optics(self) -> Shot:
+        """The frames without the stage's shutter and lens, which are among what is not applied."""
+        named = [name for frame in self.frames if frame.optics for name in frame.optics.named()]
+        found = {name.partition(" ")[0]: name for name in reversed(named)}  # of each the first value
+        frames = tuple(replace(frame, optics=frame.optics.still) if frame.optics else frame for frame in self.frames)
+        return replace(self, frames=frames, unapplied=(*self.unapplied, *reversed(found.values())))
+
+    def told(self, source: object, *more: str) -> tuple[str, ...]:
+        """The warnings, a line each: the last names all that the source has and is not applied. more: of it that this
+        call does not apply."""
+        unapplied = (*self.unapplied, *more)
+        return (*self.warnings, f"{source}: not applied: {', '.join(unapplied)}") if unapplied else self.warnings
 
     def check(self, channels: Iterable[str] = ()) -> None:
         """Raises InputError where these channels are not defined: motion from one projection to another."""

@@ -9,19 +9,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError, examples
 from clsplat.models.formats.usd import open_stage, readable, survive
 from clsplat.scenes.transforms import opengl_pose, short
+from clsplat.shots.optics import Optics
 from clsplat.shots.shot import Shot, numbered, whole_frames
+from clsplat.shots.usd_settings import Settings, camera_of_settings, read_settings
 
-ORTHOGRAPHIC_UNIT = 0.1
-"""USD measures apertures in tenths of a world unit; only of an orthographic camera that is more than a ratio."""
+TENTH = 0.1
+"""World units of a unit of apertures and focal lengths, in USD."""
 
 PINHOLES = ("", "perspective", "orthographic", "pinhole")
 """Projections that a camera may name; others bend, and are refused."""
@@ -30,14 +34,16 @@ PINHOLES = ("", "perspective", "orthographic", "pinhole")
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
     """The frames of a stage's camera, from its start time code to its end, or the samples' where it has no range.
 
-    Its rate is the stage's timeCodesPerSecond, for which USD takes framesPerSecond where that alone is authored. What
-    is authored and not applied is in the shot's `unapplied`.
+    Its rate is the stage's timeCodesPerSecond, for which USD takes framesPerSecond where that alone is authored. Frames
+    have the shutter and the lens of their time code; `Shot.moment` has the camera of any time, with USD's own values
+    between its samples. What is authored and not applied is in the shot's `unapplied`.
 
-    size: width and height in pixels; one follows from the other by the first frame's aperture; if neither is given
-    they are the stage's render settings'. The horizontal aperture fills the width, pixels are square. prim: path or
-    name of the camera, if the stage has several. What USD warns of becomes the shot's warnings. Raises InputError for a
-    stage that cannot be opened or has no such camera, no size, or values that cannot be; and where usd-core is not
-    installed.
+    size: width and height in pixels; one follows from the other by the resolution of the stage's render settings, or
+    without one by the first frame's aperture; if neither is given they are that resolution. How the aperture is fitted
+    to them, and the pixels' shape, is the render settings' too; without any its width fills the picture's, and pixels
+    are square. prim: path or name of the camera, if the stage has several and its render settings name none. What USD
+    warns of becomes the shot's warnings. Raises InputError for a stage that cannot be opened or has no such camera, no
+    size, or values that cannot be; and where usd-core is not installed.
     """
     survive(path, "clsplat.shots.usd:read_here", size=size, prim=prim)
     return read_here(path, size, prim)
@@ -51,33 +57,77 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     stage = open_stage(path, path)
     with readable(path):
-        camera = _find(path, [UsdGeom.Camera(item) for item in stage.Traverse() if item.IsA(UsdGeom.Camera)], prim)
-        where = f"{path}: {camera.GetPath()}"
-        codes = _time_codes(where, stage, camera)
-        horizontal, vertical = _aperture(where, camera, codes[0])
-        width, height = _size(path, stage, size, horizontal / vertical)
+        cameras = [UsdGeom.Camera(item) for item in stage.Traverse() if item.IsA(UsdGeom.Camera)]
+        asked = camera_of_settings(stage)
+        known = asked in [str(camera.GetPath()) for camera in cameras]
+        camera = _find(path, cameras, prim or (asked if known else None))
+        place = camera.GetPath()
+        where = f"{path}: {place}"
+        settings = read_settings(path, stage, camera)
+        codes, authored = _time_codes(where, stage, camera)
+        picture = _size(path, size, settings, _aperture(where, camera, codes[0]))
         per_second = float(stage.GetTimeCodesPerSecond())
-        cameras = [_camera(f"{where} at {code}", camera, code, width, height) for code in codes]
-        frames = numbered(cameras, codes[0], None if len(codes) == 1 or per_second <= 0 else per_second)
+
+        def moment(time: float) -> Camera:
+            with readable(path):
+                prim = UsdGeom.Camera(stage.GetPrimAtPath(place))  # the stage has to live as long as this function
+                return _camera(f"{where} at {time:g}", prim, time, picture, settings)
+
+        frames = numbered(map(moment, codes), codes[0], None if len(codes) == 1 or per_second <= 0 else per_second)
+        rate = per_second if 0 < per_second < math.inf else 0.0
+        metres = float(UsdGeom.GetStageMetersPerUnit(stage))
+        frames = tuple(
+            replace(frame, optics=_optics(f"{where} at {frame.number}", camera, frame.number, settings, metres, rate))
+            for frame in frames
+        )
+    lost = () if known or not asked else (f"camera ({asked}, which is not there)",)
+    unapplied = (*_unapplied(camera, codes), *settings.unapplied, *lost)
     # without the end of the line, where USD has the stage's address in memory
-    unapplied = _unapplied(stage, camera, codes)
     lines = [message.commentary.split(" (instantiating")[0] for message in diagnostics.TakeUncoalescedDiagnostics()]
     warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in lines[:3])
-    return Shot(frames, warnings, per_second if 0 < per_second < math.inf else None, unapplied)
+    return Shot(frames, warnings, rate or None, unapplied, moment, authored, settings.window)
 
 
-def _unapplied(stage: Any, camera: Any, codes: list[int]) -> tuple[str, ...]:
-    """Attributes of the camera and of the stage's render settings that are authored, would change a frame and are not
-    applied: their names, with the first value."""
-    from pxr import UsdGeom, UsdRender
+def _unapplied(camera: Any, codes: list[int]) -> tuple[str, ...]:
+    """Attributes of the camera that are authored, would change a frame and are not applied: their names, with the first
+    value."""
+    from pxr import UsdGeom
 
-    usual: dict[str, Any] = dict.fromkeys(("fStop", "focusDistance", "shutter:open", "shutter:close", "exposure"), 0.0)
+    usual: dict[str, Any] = {"exposure": 0.0, "exposure:iso": 100.0}
+    usual |= dict.fromkeys(("exposure:time", "exposure:fStop", "exposure:responsivity"), 1.0)
     usual |= {"clippingPlanes": (), "stereoRole": UsdGeom.Tokens.mono}
-    authored = [_authored(camera.GetPrim(), name, value, codes) for name, value in usual.items()]
-    if settings := UsdRender.Settings.GetStageRenderSettings(stage):
-        usual = {"pixelAspectRatio": 1.0, "aspectRatioConformPolicy": None, "dataWindowNDC": (0, 0, 1, 1)}
-        authored += [_authored(settings.GetPrim(), name, value, codes) for name, value in usual.items()]
-    return tuple(filter(None, authored))
+    return tuple(filter(None, (_authored(camera.GetPrim(), name, value, codes) for name, value in usual.items())))
+
+
+def _optics(where: str, camera: Any, code: int, settings: Settings, metres: float, fps: float) -> Optics:
+    """Shutter and lens at a time code. Raises InputError for values that cannot be."""
+    opens, closes = (
+        _number(where, attribute, code) for attribute in (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr())
+    )
+    if closes < opens:
+        raise InputError(
+            f"{where}: shutter:open is {opens:g} and shutter:close {closes:g}, expected two times in frames from the "
+            "frame, the second not before the first"
+        )
+    if settings.instantaneous:
+        closes = opens
+    lens = {}
+    for attribute in (camera.GetFStopAttr(), camera.GetFocusDistanceAttr()):
+        lens[attribute.GetName()] = value = _number(where, attribute, code)
+        if value < 0:
+            raise InputError(f"{where}: {attribute.GetName()} is {value:g}, expected at least 0")
+    if not 0 < metres < math.inf:
+        raise InputError(f"{where.partition(': ')[0]}: metersPerUnit is {metres:g}, expected a number above 0")
+    scale = _pose(where, camera, code)[2]
+    focal = _number(where, camera.GetFocalLengthAttr(), code) * TENTH * scale
+    return Optics(
+        (opens, closes) if settings.motion_blur else (0.0, 0.0),
+        lens["fStop"] if settings.depth_of_field else 0.0,
+        lens["focusDistance"] * scale,
+        focal,
+        metres,
+        fps,
+    )
 
 
 def _authored(prim: Any, name: str, usual: Any, codes: list[int]) -> str:
@@ -117,28 +167,32 @@ def _moved(camera: Any) -> Iterator[Any]:
         prim = prim.GetParent()
 
 
-def _time_codes(where: str, stage: Any, camera: Any) -> list[int]:
+def _time_codes(where: str, stage: Any, camera: Any) -> tuple[list[int], tuple[float, ...]]:
     """The whole time codes of the stage's range, or from the first to the last at which the camera, or something that
-    moves it, has values."""
-    timed = (*camera.GetPrim().GetAttributes(), *_moved(camera))
-    samples = sorted({time for source in timed for time in source.GetTimeSamples()})
+    moves it, has values; and the times of all these values, each of which is read once, whole frame or not."""
+    attributes = camera.GetPrim().GetAttributes()
+    ops = [op for moved in _moved(camera) for op in moved.GetOrderedXformOps()]
+    for source in (*attributes, *ops):
+        for time in source.GetTimeSamples():
+            source.Get(time)
+    samples = sorted({float(time) for source in (*attributes, *_moved(camera)) for time in source.GetTimeSamples()})
     if stage.HasAuthoredTimeCodeRange():
         begin, end = float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())
     elif samples:
         begin, end = samples[0], samples[-1]
     else:
         begin = end = 1.0
-    return whole_frames(where, "time code", begin, end)
+    return whole_frames(where, "time code", begin, end), tuple(samples)
 
 
-def _number(where: str, attribute: Any, code: int) -> float:
+def _number(where: str, attribute: Any, code: float) -> float:
     value = attribute.Get(code)
     if value is None or not math.isfinite(value):
         raise InputError(f"{where}: {attribute.GetName()} is {value}, expected a number")
     return float(value)
 
 
-def _aperture(where: str, camera: Any, code: int) -> tuple[float, float]:
+def _aperture(where: str, camera: Any, code: float) -> tuple[float, float]:
     """Its width and height."""
     horizontal = _number(where, camera.GetHorizontalApertureAttr(), code)
     vertical = _number(where, camera.GetVerticalApertureAttr(), code)
@@ -147,16 +201,15 @@ def _aperture(where: str, camera: Any, code: int) -> tuple[float, float]:
     return horizontal, vertical
 
 
-def _size(path: Path, stage: Any, size: tuple[int | None, int | None], aspect: float) -> tuple[int, int]:
-    from pxr import UsdRender
-
+def _size(
+    path: Path, size: tuple[int | None, int | None], settings: Settings, aperture: tuple[float, float]
+) -> tuple[int, int]:
     width, height = size
+    aspect = settings.aspect(aperture)
     if width is None and height is None:
-        settings = UsdRender.Settings.GetStageRenderSettings(stage)
-        attribute = settings.GetResolutionAttr() if settings else None
-        if attribute is None or not attribute.HasAuthoredValue():
+        if settings.resolution is None:
             raise InputError(f"{path}: a USD camera has no size in pixels, expected --width or --height")
-        width, height = (int(side) for side in attribute.Get())
+        width, height = settings.resolution
     if width is None:
         width = max(1, round((height or 0) * aspect))
     if height is None:
@@ -166,7 +219,7 @@ def _size(path: Path, stage: Any, size: tuple[int | None, int | None], aspect: f
     return width, height
 
 
-def _check_projection(where: str, camera: Any, code: int) -> None:
+def _check_projection(where: str, camera: Any, code: float) -> None:
     """Raise InputError for a lens that is neither pinhole nor orthographic, in USD's words or in Omniverse's."""
     for name in ("projection", "cameraProjectionType", "omni:lensdistortion:model"):
         attribute = camera.GetPrim().GetAttribute(name)
@@ -178,7 +231,7 @@ def _check_projection(where: str, camera: Any, code: int) -> None:
             )
 
 
-def _check_turns(where: str, camera: Any, code: int) -> None:
+def _check_turns(where: str, camera: Any, code: float) -> None:
     """Raise InputError for a quaternion without a length, of the camera or of what it is in: USD takes it for none."""
     from pxr import UsdGeom
 
@@ -191,31 +244,35 @@ def _check_turns(where: str, camera: Any, code: int) -> None:
                 )
 
 
-def _camera(where: str, camera: Any, code: int, width: int, height: int) -> Camera:
+def _pose(where: str, camera: Any, code: float) -> tuple[Float64, Float64, float]:
+    # USD's vectors are rows, so its matrices are the transposes of ours
+    matrix = np.array(camera.ComputeLocalToWorldTransform(code), np.float64).T
+    return opengl_pose(matrix, where, "transform")
+
+
+def _camera(where: str, camera: Any, code: float, size: tuple[int, int], settings: Settings) -> Camera:
     from pxr import UsdGeom
 
     _check_projection(where, camera, code)
     _check_turns(where, camera, code)
-    # USD's vectors are rows, so its matrices are the transposes of ours
-    matrix = np.array(camera.ComputeLocalToWorldTransform(code), np.float64).T
-    rotation, translation, scale = opengl_pose(matrix, where, "transform")
-    aperture, _ = _aperture(where, camera, code)
+    rotation, translation, scale = _pose(where, camera, code)
+    width, height = size
+    across, down = settings.conformed(_aperture(where, camera, code), size)
     focal = _number(where, camera.GetFocalLengthAttr(), code)
     right = _number(where, camera.GetHorizontalApertureOffsetAttr(), code)
     up = _number(where, camera.GetVerticalApertureOffsetAttr(), code)
-    pixels = width / aperture  # a unit of the aperture
+    to_x, to_y = width / across, height / down  # pixels a unit of the aperture
     near, far = 0.01, math.inf
     clipping = camera.GetClippingRangeAttr()
     if clipping.HasAuthoredValue():
         near, far = (scale * float(value) for value in clipping.Get(code))
     if not 0 < near < far:
         raise InputError(f"{where}: clippingRange {near:g} to {far:g}, expected 0 < near < far")
-    cx, cy = width / 2 - right * pixels, height / 2 + up * pixels
+    cx, cy = width / 2 - right * to_x, height / 2 + up * to_y
     if camera.GetProjectionAttr().Get(code) == UsdGeom.Tokens.orthographic:
         # the camera's own unit is `scale` of the world's
-        fx = pixels / (ORTHOGRAPHIC_UNIT * scale)
-        return Camera(width, height, fx, fx, cx, cy, rotation, translation, near, far, "orthographic")
+        unit = TENTH * scale
+        return Camera(width, height, to_x / unit, to_y / unit, cx, cy, rotation, translation, near, far, "orthographic")
     if not focal > 0:
         raise InputError(f"{where}: focalLength is {focal:g}, expected more than 0")
-    fx = focal * pixels
-    return Camera(width, height, fx, fx, cx, cy, rotation, translation, near, far)
+    return Camera(width, height, focal * to_x, focal * to_y, cx, cy, rotation, translation, near, far)

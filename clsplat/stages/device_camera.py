@@ -12,6 +12,8 @@ from clsplat.errors import InputError
 
 _NAMES = tuple(name for name in CAMERA if not name.endswith("_LOW"))
 assert CAMERA[len(_NAMES) :] == tuple(f"{name}_LOW" for name in _NAMES[: len(CAMERA) - len(_NAMES)])
+FARTHEST_PLANE = float(np.finfo(np.float32).max)
+"""World units: the far plane of a camera that has none; infinity would leave NaN when rounded in two parts."""
 _TRANSLATION, _POSITION = ("T0", "T1", "T2"), ("PX", "PY", "PZ")
 _ROTATION = tuple(tuple(f"R{row}{column}" for column in range(3)) for row in range(3))
 
@@ -32,6 +34,7 @@ def pack_camera(camera: Camera) -> NDArray[np.float32]:
         "CX": camera.cx,
         "CY": camera.cy,
         "NEAR": max(camera.near, 0.0),  # what is behind has no place in the order of depth
+        "FAR": min(camera.far, FARTHEST_PLANE),
         "HAND": float(np.copysign(1.0, np.linalg.det(camera.rotation))),
         "XMIN": -camera.cx / camera.fx - window.clamp * half_w,
         "XMAX": (window.width - camera.cx) / camera.fx + window.clamp * half_w,

@@ -196,7 +196,7 @@ static inline int project_gaussians(const uint *row, __global const float *means
   p->lx = in_x.low;
   p->ly = in_y.low;
   p->lz = in_z.low;
-  p->valid = p->z > camera[CAMERA_NEAR];
+  p->valid = (p->z > camera[CAMERA_NEAR]) & (p->z < camera[CAMERA_FAR]);
   if (!ANYL(p->valid)) return 0;
 
   floatL raw[4], norm2 = (floatL)(0.0f);

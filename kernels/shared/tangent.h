@@ -76,7 +76,8 @@ static inline int project_ray(size_t i, __global const float *means, __global co
   const Double in_x = CAMERA_ROW(0), in_y = CAMERA_ROW(1), in_z = CAMERA_ROW(2);
   const float at[3] = {in_x.high, in_y.high, in_z.high};
   const float distance = sqrt(fma1(at[0], at[0], fma1(at[1], at[1], at[2] * at[2])));
-  if (!((RAYS == 3 ? at[2] : distance) > camera[CAMERA_NEAR] && distance < 1e15f)) return 0;
+  const float depth = RAYS == 3 ? at[2] : distance;
+  if (!(depth > camera[CAMERA_NEAR] && depth < camera[CAMERA_FAR] && distance < 1e15f)) return 0;
   p->distance = distance;
   for (int k = 0; k < 3; ++k) p->f[k] = at[k] / distance;
 #ifdef KANNALA_BRANDT // beyond the fold-over a lens shows nothing

@@ -342,10 +342,11 @@ def test_motion_stays_in_a_projection(tmp_path: Path) -> None:
         mixed.check(["rgb", "motion"])
 
 
-def test_a_far_plane_is_told_of(tmp_path: Path) -> None:
+def test_a_far_plane_is_the_cameras(tmp_path: Path) -> None:
     path = write(tmp_path / "shot.json", own(far=20))
-    assert choose_shot(path).warnings == (f"{path}: not applied: far plane (20)",)
-    assert choose_shot(write(path, own())).warnings == ()
+    assert choose_shot(path).told(path) == ()
+    assert {camera.far for camera in choose_shot(path).cameras} == {20}
+    assert choose_shot(write(path, own())).cameras[0].far == float("inf")
 
 
 def test_the_examples_of_the_documentation(tmp_path: Path) -> None:

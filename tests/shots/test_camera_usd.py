@@ -85,24 +85,7 @@ def test_animated_camera_with_lens_shift(stage: Path) -> None:
     # neither metersPerUnit nor upAxis touches the world
     np.testing.assert_allclose([camera.position for camera in shot.cameras], [[1 + x, 2, 3] for x in (0, 2, 4, 6, 8)])
     assert_as_usd_projects(stage, "/rig/shot", 1920, 1280)
-    assert choose_shot(stage, size=(90, 60)).warnings == (f"{stage}: not applied: far plane (500)",)
-
-
-def test_what_is_authored_and_not_applied_is_one_warning(stage: Path) -> None:
-    """fStop 0 is USD's own word for no depth of field."""
-    lens = "float2 clippingRange = (0.5, 500)"
-    more = "float fStop = 2.8\nfloat focusDistance = 5\ndouble shutter:open = -0.25\ndouble shutter:close = 0.25\n"
-    text = STAGE.replace("(\n    start", '(\n    renderSettingsPrimPath = "/Render"\n    start', 1)
-    text += 'def RenderSettings "Render"\n{\n    float pixelAspectRatio = 2\n    int2 resolution = (90, 60)\n'
-    stage.write_text(text.replace(lens, more + lens) + '    token aspectRatioConformPolicy = "cropAperture"\n}\n')
-    wanted = "far plane (500), fStop (2.8), focusDistance (5), shutter:open (-0.25), shutter:close (0.25), "
-    wanted += "pixelAspectRatio (2), aspectRatioConformPolicy (cropAperture)"
-    assert choose_shot(stage).warnings == (f"{stage}: not applied: {wanted}",)
-    assert choose_shot(stage, path="turntable").warnings == (f"{stage}: not applied: {wanted}",)
-    usual = "float fStop = 0\ndouble shutter:open = 0\nfloat2 clippingRange = (0.5, inf)"
-    plain = text.replace(lens, usual).replace("AspectRatio = 2", "AspectRatio = 1") + "}\n"
-    stage.write_text(plain)
-    assert choose_shot(stage).warnings == ()
+    assert choose_shot(stage, size=(90, 60)).told(stage) == ()
 
 
 @pytest.mark.parametrize(
